@@ -1,0 +1,1 @@
+"""What every process shares: configuration, bus, inbox, pacing, real-time priority, health."""

@@ -1,0 +1,115 @@
+"""Messages to bytes and back. What cannot be trusted raises `BadMessage`, with a reason that can be counted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from protocol import messages as m
+from protocol.topics import Topic
+
+Reason = Literal["oversized", "malformed", "not finite", "wrong size"]
+M = TypeVar("M", bound=m.Message)
+
+
+class BadMessage(ValueError):
+    """A payload that must not be obeyed. `reason` is for counting, the text is for a person."""
+
+    def __init__(self, topic: str, reason: Reason, detail: str):
+        super().__init__(f"{topic}: {reason}: {detail}")
+        self.topic = topic
+        self.reason: Reason = reason
+        self.detail = detail
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoders: dict[type, msgspec.msgpack.Decoder] = {}
+
+
+def encode(message: m.Message) -> bytes:
+    """Deterministic msgpack: the same message is the same bytes, in every process."""
+    return _encoder.encode(message)
+
+
+def decode_as(kind: type[M], payload: bytes) -> M:
+    """Decode with the schema alone. Raises `msgspec.DecodeError` (its `ValidationError` included)."""
+    decoder = _decoders.get(kind)
+    if decoder is None:
+        decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
+    return decoder.decode(payload)
+
+
+def decode(topic: Topic, payload: bytes) -> m.Message:
+    """Decode a payload from the bus: size limit, schema, finiteness.
+
+    Raises:
+        BadMessage: with the reason; never anything else, whatever the bytes.
+    """
+    if len(payload) > topic.max_bytes:
+        raise BadMessage(topic.name, "oversized", f"{len(payload)} bytes, at most {topic.max_bytes}")
+    try:
+        message = decode_as(topic.type, payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
+        raise BadMessage(topic.name, "malformed", str(error)) from error
+    field = first_non_finite(message)
+    if field is not None:
+        raise BadMessage(topic.name, "not finite", f"field {field}")
+    return message
+
+
+def first_non_finite(value: object, path: str = "") -> str | None:
+    """Name of the first field that holds a NaN or an infinity, or None. msgspec lets both pass."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else path or "value"
+    if isinstance(value, m.Array):
+        if value.dtype in ("<f4", "<f8"):
+            if not np.isfinite(np.frombuffer(value.data, value.dtype)).all():
+                return path or "array"
+        return None
+    children: Iterable[tuple[object, object]]
+    if isinstance(value, msgspec.Struct):
+        children = ((name, getattr(value, name)) for name in value.__struct_fields__)
+    elif isinstance(value, dict):
+        children = value.items()
+    elif isinstance(value, list):
+        children = enumerate(value)
+    else:
+        return None
+    for name, child in children:
+        found = first_non_finite(child, f"{path}.{name}" if path else str(name))
+        if found is not None:
+            return found
+    return None
+
+
+def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) -> None:
+    """Raise `BadMessage` when a vector's length is not the plant's: d states, m_inputs inputs."""
+
+    def expect(name: str, values: list[float] | None, length: int) -> None:
+        if values is not None and len(values) != length:
+            raise BadMessage(topic.name, "wrong size", f"{name} has {len(values)} entries, the plant has {length}")
+
+    match message:
+        case m.PlantState():
+            expect("x", message.x, d)
+            expect("applied", message.applied, m_inputs)
+        case m.Command():
+            expect("u", message.u, m_inputs)
+            for i, entry in enumerate(message.plan):
+                expect(f"plan[{i}]", entry, m_inputs)
+            if not message.plan:
+                raise BadMessage(topic.name, "wrong size", "the plan is empty")
+            if not 0.0 < message.period < 3600.0:
+                raise BadMessage(topic.name, "wrong size", f"period {message.period} s")
+        case m.Samples():
+            for sample in message.samples:
+                expect("x", sample.x, d)
+                expect("u", sample.u, m_inputs)
+                expect("h", sample.h, d)
+        case m.OutputWeights():
+            if len(message.K.shape) != 2 or message.K.shape[1] != d:
+                raise BadMessage(topic.name, "wrong size", f"K is {message.K.shape}, the plant has {d} states")

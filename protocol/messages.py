@@ -1,0 +1,218 @@
+"""Every message that travels, as strict msgspec Structs carried in msgpack.
+
+Each message names the process incarnation that wrote it (`run_id`) and counts up from there (`seq`), because
+a restarted process counts from zero again. Vectors are lists of floats, so that a generic tool can plot them;
+weights are `Array`s of bytes. Lengths are not checked here but by `protocol.codec.check_dimensions`, since
+only the configuration knows how many states and inputs the plant has.
+
+Units are those of the plant's own equations (for the compressor: dimensionless flow, pressure and throttle,
+seconds for time), and are listed by name in `RunInfo.units`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Sequence = Annotated[int, msgspec.Meta(ge=-1)]
+"""A sequence number; -1 stands for "none yet"."""
+RunId = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Digest = Annotated[str, msgspec.Meta(max_length=64)]
+
+InputSource = Literal["hold", "command", "plan", "safe"]
+"""What drove the plant: held at x0, a fresh command, the rest of the last plan, the local safe input."""
+CommandMode = Literal["solver", "shifted_plan", "feedback"]
+StateVerdict = Literal["fresh", "stale", "missing"]
+ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
+
+
+class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every message carries: who wrote it, and its place in that writer's sequence."""
+
+    run_id: RunId
+    seq: Sequence
+
+
+class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A dense array: little-endian, row-major. No object dtypes, no pickle."""
+
+    dtype: Literal["<f4", "<f8", "<i8", "|u1"]
+    shape: list[Count]
+    data: bytes
+
+    def __post_init__(self) -> None:
+        expected = math.prod(self.shape) * np.dtype(self.dtype).itemsize
+        if expected != len(self.data):
+            raise ValueError(
+                f"array of shape {self.shape} and dtype {self.dtype} needs {expected} bytes, has {len(self.data)}"
+            )
+
+    @classmethod
+    def of(cls, values: np.ndarray, dtype: Literal["<f4", "<f8", "<i8", "|u1"] = "<f8") -> Array:
+        packed = np.asarray(values).astype(dtype, order="C", copy=False)
+        return cls(dtype, list(packed.shape), packed.tobytes())
+
+    def numpy(self) -> np.ndarray:
+        """A fresh writable copy, in this machine's byte order."""
+        return np.frombuffer(self.data, dtype=self.dtype).reshape(self.shape).astype(self.dtype[1:])
+
+
+class PlantState(Message):
+    """One sample of the plant, x(t), and the input that really acted since the sample before."""
+
+    t: float
+    """Seconds on the plant's own monotonic clock."""
+    x: list[float]
+    applied: list[float] | None
+    """Time average of the input over the last period; None where that period was not a whole one."""
+    source: InputSource
+    command_seq: Sequence
+    """Tick of the last command received, -1 before the first."""
+
+
+class Command(Message):
+    """The input for now and the whole remaining plan; `seq` is the tick."""
+
+    state_run_id: str
+    state_seq: Sequence
+    """The `PlantState` that this command answers; -1 when it answers none (follows the shifted plan)."""
+    period: float
+    """Seconds between the entries of `plan`."""
+    mode: CommandMode
+    u: list[float]
+    plan: list[list[float]]
+    """Inputs for this period and the following ones; plan[0] is u."""
+
+
+class HiddenWeights(Message):
+    """W_1..W_{L-1} after one training; `seq` is the version and rises within a trainer's run."""
+
+    for_run: RunId
+    """The controller run whose samples and output weights this was trained on."""
+    trained_on: Sequence
+    """T_k: the tick of the output weights K_{T_k} held fixed in this training."""
+    base_sha256: Digest
+    """Hash of the hidden weights that the controller held at T_k."""
+    samples: Count
+    loss_before: float
+    loss_after: float
+    network_sha256: Digest
+    sha256: Digest
+    layers: list[Array]
+    """Hidden layer i as (1 + n_{i-1}, n_i); the first row is the bias."""
+
+
+class Tick(Message):
+    """All that one control step depends on: the latched inputs and every verdict that depended on time."""
+
+    slot: Count
+    """Slots since the loop began; seq + the slots skipped so far."""
+    t: float
+    """Planned time of the slot, seconds since the loop began."""
+    skipped: Count
+    """Slots missed immediately before this one."""
+    lateness: float
+    """Seconds between the planned and the real start."""
+    late: bool
+    state_verdict: StateVerdict
+    state: PlantState | None
+    weights: HiddenWeights | None
+    """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
+
+
+class TickResult(Message):
+    """What one control step concluded; a pure function of the ticks up to this one."""
+
+    x: list[float]
+    u: list[float]
+    mode: CommandMode
+    status: str
+    iterations: Count
+    slack: float
+    """Largest state-constraint violation of the nominal plan, in units of that constraint's row."""
+    h: list[float] | None
+    """Measured h(x_{t-1}, u_{t-1}) = x_t - A x_{t-1} - B u_{t-1}, in deviation coordinates."""
+    h_hat: list[float] | None
+    """The oracle's estimate of the same, from before this tick's adaptation."""
+    prediction_error: float | None
+    """|h_hat - h|, Euclidean."""
+    oracle_norms: list[float]
+    """Norm of each column of K_t (dnn), else empty."""
+    hidden_version: Sequence
+    hidden_sha256: Digest
+    weights_verdict: str
+    """"none", "adopted", or "refused: <reason>"."""
+
+
+class TickTiming(Message):
+    """What one control step cost on this machine; never part of a replay comparison."""
+
+    solve_ms: float
+    tick_ms: float
+    lateness_ms: float
+    state_age_ms: float
+
+
+class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One labelled pair: x_t, the input applied from t to t+1, and h(x_t, u_t); deviation coordinates."""
+
+    seq: Count
+    x: list[float]
+    u: list[float]
+    h: list[float]
+
+
+class Samples(Message):
+    """A batch of samples in ascending order; `seq` is that of the last one."""
+
+    samples: list[Sample]
+
+
+class OutputWeights(Message):
+    """K_t after the adaptation of tick `seq`, and which hidden weights it belongs to."""
+
+    hidden_version: Sequence
+    hidden_sha256: Digest
+    K: Array
+    """(1 + n_L, d), first row the bias; scaled outputs."""
+
+
+class HiddenSnapshot(Message):
+    """The hidden weights that the controller holds, for a trainer that joins late; `run_id` is the controller's."""
+
+    hidden_version: Sequence
+    hidden_sha256: Digest
+    description: str
+    """The `NetworkDescription`, as JSON."""
+    layers: list[Array]
+
+
+class Keyframe(Message):
+    """The controller's whole memory after tick `seq` (-1: before the first)."""
+
+    arrays: dict[str, Array]
+
+
+class RunInfo(Message):
+    """What a log needs to be understood and replayed on its own."""
+
+    process: str
+    config: str
+    """The resolved configuration, as JSON."""
+    versions: dict[str, str]
+    seed: int
+    units: dict[str, str]
+    unix_time: float
+
+
+class Health(Message):
+    """How one process is, about twice a second and at every change."""
+
+    process: str
+    status: ProcessStatus
+    counters: dict[str, int]
+    note: str

@@ -1,0 +1,78 @@
+"""The one table of topics: what is published, on which lane, how large it may be.
+
+`control` is dropped rather than queued, sent at once, and never waits behind anything. `bulk` blocks, on a
+session and a thread of its own. Everything is logged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from protocol import messages as m
+
+Lane = Literal["control", "bulk"]
+PREFIX = "tandem"
+PROCESSES = ("router", "plant", "controller", "trainer", "recorder")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic; `name` is its key below `tandem/<plant>/`."""
+
+    name: str
+    type: type[m.Message]
+    lane: Lane
+    writer: str
+    max_bytes: int = 64 * 1024
+
+    def key(self, plant: str) -> str:
+        return f"{PREFIX}/{plant}/{self.name}"
+
+
+WEIGHTS_LIMIT = 16 * 1024 * 1024
+
+PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant")
+COMMAND = Topic("controller/command", m.Command, "control", "controller", 256 * 1024)
+TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT)
+RESULT = Topic("controller/result", m.TickResult, "bulk", "controller")
+TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller")
+SAMPLES = Topic("controller/samples", m.Samples, "bulk", "controller", 1024 * 1024)
+OUTPUT_WEIGHTS = Topic("controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT)
+KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
+HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
+RUN_INFO = {name: Topic(f"{name}/run_info", m.RunInfo, "bulk", name) for name in PROCESSES}
+HEALTH = {name: Topic(f"{name}/health", m.Health, "bulk", name) for name in PROCESSES}
+
+ALL: tuple[Topic, ...] = (
+    PLANT_STATE,
+    COMMAND,
+    TICK,
+    RESULT,
+    TIMING,
+    SAMPLES,
+    OUTPUT_WEIGHTS,
+    KEYFRAME,
+    HIDDEN_WEIGHTS,
+    *RUN_INFO.values(),
+    *HEALTH.values(),
+)
+BY_NAME = {topic.name: topic for topic in ALL}
+
+OUTBOX_QUERY = "controller/outbox"
+"""Queryable: `?run=RUN;since=SEQ;last=K` answers with `Samples` batches."""
+HIDDEN_QUERY = "controller/hidden"
+"""Queryable: answers with the controller's current `HiddenSnapshot`."""
+
+
+def everything(plant: str) -> str:
+    """The key expression that covers all of a plant's topics."""
+    return f"{PREFIX}/{plant}/**"
+
+
+def topic_of(key: str) -> Topic | None:
+    """The topic a full key belongs to, or None for a stranger's key."""
+    parts = key.split("/", 2)
+    if len(parts) != 3 or parts[0] != PREFIX:
+        return None
+    return BY_NAME.get(parts[2])
