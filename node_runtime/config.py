@@ -1,27 +1,33 @@
 """Configuration: typed, strict, one tree for all processes, read from TOML.
 
-A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file and the
-nearest right key or the allowed values. Defaults are the paper's experiment as `../shared/paper` settles it.
+A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file and
+the nearest right key or the allowed values. Defaults are the paper's experiment, with settled values for what
+the paper leaves out.
 """
 
 from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
+import tomli_w
 
-from protocol.network import Activation
+from node_runtime import config_words
+from node_runtime.choices import OracleName, Strategy, TighteningName
+from protocol.codec import first_non_finite
+from protocol.network import BOUNDED, Activation, Width
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
-OracleName = Literal["linear", "l2nw", "dnn"]
-TighteningName = Literal["none", "first_step", "tube"]
-Strategy = Literal["fifo", "reservoir", "novelty"]
+
+
+Fail = Callable[[str, str], NoReturn]
 
 
 class ConfigError(ValueError):
@@ -32,7 +38,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """A table of the configuration file."""
 
 
-class PlantConfig(Section):
+class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
@@ -40,7 +46,7 @@ class PlantConfig(Section):
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
 
-class SolverConfig(Section):
+class SolverConfig(Section, frozen=True):
     max_iterations: PositiveInt = 10
     tolerance: Positive = 1e-6
     """Converged when no input of the plan moves by more than this (input units)."""
@@ -48,7 +54,7 @@ class SolverConfig(Section):
     """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
 
 
-class ControllerConfig(Section):
+class ControllerConfig(Section, frozen=True):
     horizon: PositiveInt = 60
     oracle: OracleName = "dnn"
     tightening: TighteningName = "first_step"
@@ -67,8 +73,8 @@ class ControllerConfig(Section):
     solver: SolverConfig = SolverConfig()
 
 
-class NetworkConfig(Section):
-    hidden: list[Annotated[int, msgspec.Meta(ge=1, le=4096)]] = msgspec.field(default_factory=lambda: [32, 32])
+class NetworkConfig(Section, frozen=True):
+    hidden: list[Width] = msgspec.field(default_factory=lambda: [64, 64])
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
     output_scale: Positive = 0.01
@@ -76,16 +82,16 @@ class NetworkConfig(Section):
     max_layer_norm: Positive = 100.0
 
 
-class AdaptationConfig(Section):
-    gamma: Unit = 0.5
+class AdaptationConfig(Section, frozen=True):
+    gamma: Unit = 0.8
     """Learning rate of the last layer, 0 < gamma < 1."""
     column_bound: Positive = 0.05
     """Bound on the norm of each column of K, in units of h."""
-    initial_scale: NonNegative = 1e-3
+    initial_scale: NonNegative = 3e-4
     """Standard deviation of the entries of K_0, in units of h."""
 
 
-class L2nwConfig(Section):
+class L2nwConfig(Section, frozen=True):
     window: PositiveInt = 100
     bandwidth: Positive = 0.5
     regularisation: Positive = 1e-3
@@ -93,24 +99,24 @@ class L2nwConfig(Section):
     """Names of the states and inputs the kernel sees; None: the plant's own choice."""
 
 
-class TrainerConfig(Section):
+class TrainerConfig(Section, frozen=True):
     enabled: bool = True
     """False: hidden layers are never trained (last layer only)."""
     capacity: PositiveInt = 2000
     """p_max of the replay buffer."""
     strategy: Strategy = "fifo"
-    train_every: PositiveInt = 20
+    train_every: PositiveInt = 10
     """New samples between two trainings."""
     min_samples: PositiveInt = 20
     batch: PositiveInt = 512
     """M, the samples drawn at random from the buffer for one training."""
-    steps: PositiveInt = 200
+    steps: PositiveInt = 300
     """Adam steps in one training, each on all M samples."""
     learning_rate: Positive = 1e-3
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
-class BusConfig(Section):
+class BusConfig(Section, frozen=True):
     endpoint: str = "tcp/127.0.0.1:7447"
     """Where the router listens; nodes are its clients."""
     lease_ms: PositiveInt = 1500
@@ -118,25 +124,25 @@ class BusConfig(Section):
     """Seconds of silence after which another process incarnation may take over a topic."""
 
 
-class LogConfig(Section):
+class LogConfig(Section, frozen=True):
     path: str = "run.mcap"
     chunk_bytes: PositiveInt = 256 * 1024
     flush_ms: PositiveInt = 500
 
 
-class RealtimeConfig(Section):
+class RealtimeConfig(Section, frozen=True):
     priority: Annotated[int, msgspec.Meta(ge=0, le=99)] = 50
     """SCHED_FIFO priority of controller and plant; 0: leave the scheduler alone."""
 
 
-class Config(Section):
+class Config(Section, frozen=True):
     """The whole tree; `rate` is the one sampling rate of plant, model and controller."""
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")] = "jet1"
     """The plant's name, part of every key."""
     rate: Positive = 20.0
     """Samples a second (Hz)."""
-    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
     plant: PlantConfig = PlantConfig()
     controller: ControllerConfig = ControllerConfig()
     network: NetworkConfig = NetworkConfig()
@@ -159,36 +165,58 @@ def load(path: str | Path | None = None, overrides: list[str] | None = None) -> 
     Raises:
         ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
     """
-    where = str(path) if path is not None else "the defaults"
-    tree: dict[str, Any] = {}
-    if path is not None:
-        try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    for override in overrides or []:
-        _apply(tree, override)
-        where = f"{path or 'defaults'} with {override}" if overrides and len(overrides) == 1 else where
-    return from_tree(tree, where)
+    tree = load_tree(path)
+    origins = {apply_override(tree, text): f"--set {text}" for text in overrides or []}
+    return from_tree(tree, str(path) if path is not None else "configuration", origins)
 
 
-def from_tree(tree: dict[str, Any], where: str = "configuration") -> Config:
-    """Convert a plain tree to a `Config`. Raises `ConfigError`."""
-    _reject_unknown(tree, Config, where, "")
+def load_tree(path: str | Path | None) -> dict[str, Any]:
+    """What a TOML file gives, unchecked; {} for None. Raises `ConfigError` for a file that cannot be read."""
+    if path is None:
+        return {}
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+
+
+def from_tree(
+    tree: dict[str, Any], where: str = "configuration", origins: Mapping[str, str] | None = None
+) -> Config:
+    """Convert a plain tree to a `Config`. Raises `ConfigError`.
+
+    where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
+    """
+
+    def fail(key: str, text: str) -> NoReturn:
+        place = key.split("[")[0]
+        given = [origin for name, origin in (origins or {}).items() if f"{name}.".startswith(f"{place}.")]
+        raise ConfigError(f"{given[-1] if given else where}: {text}")
+
+    _reject_unknown(tree, Config, fail, "")
     try:
         config = msgspec.convert(tree, Config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {_readable(str(error))}") from error
-    from protocol.network import BOUNDED
-
-    if config.network.activation not in BOUNDED:
-        raise ConfigError(
-            f"{where}: network.activation = {config.network.activation!r} is unbounded; one of {', '.join(BOUNDED)}"
+        key, text = config_words.explain(str(error), tree, Config)
+        fail(key, text)
+    infinite = first_non_finite(config)
+    if infinite is not None:
+        fail(infinite, f"{infinite} is not a finite number")
+    activation = config.network.activation
+    if activation not in BOUNDED:
+        fail(
+            "network.activation",
+            f"network.activation = {activation!r} is unbounded, and the last layer must be bounded; "
+            f"one of {', '.join(BOUNDED)}",
         )
     if config.trainer.min_samples > config.trainer.capacity:
-        raise ConfigError(f"{where}: trainer.min_samples exceeds trainer.capacity ({config.trainer.capacity})")
+        fail(
+            "trainer.min_samples",
+            f"trainer.min_samples = {config.trainer.min_samples} exceeds trainer.capacity = "
+            f"{config.trainer.capacity}: the first training would never come",
+        )
     return config
 
 
@@ -212,55 +240,64 @@ def to_tree(config: Config) -> dict[str, Any]:
     return msgspec.to_builtins(config)
 
 
+def to_toml(config: Config) -> str:
+    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out."""
+    return tomli_w.dumps(_without_none(to_tree(config)))
+
+
 def override(config: Config, assignments: list[str]) -> Config:
     """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
     tree = to_tree(config)
-    for assignment in assignments:
-        _apply(tree, assignment)
-    return from_tree(tree, " ".join(assignments) or "configuration")
+    origins = {apply_override(tree, text): f"--set {text}" for text in assignments}
+    return from_tree(tree, "configuration", origins)
 
 
-def _apply(tree: dict[str, Any], assignment: str) -> None:
+def apply_override(tree: dict[str, Any], assignment: str) -> str:
+    """Put one `section.key=value` into a plain tree; returns the key. Raises `ConfigError`.
+
+    The value is read as TOML (`0.5`, `[32, 32]`, `true`), and as a bare string where it is not.
+    """
     key, separator, text = assignment.partition("=")
-    if not separator or not key.strip():
+    key = key.strip()
+    if not separator or not key:
         raise ConfigError(f"{assignment!r}: an override is written section.key=value")
     try:
         value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         value = text.strip()
-    *tables, last = key.strip().split(".")
+    *tables, last = key.split(".")
     for table in tables:
         child = tree.setdefault(table, {})
         if not isinstance(child, dict):
             raise ConfigError(f"{assignment!r}: {table} is a value, not a table")
         tree = child
     tree[last] = value
+    return key
 
 
-def _sections(kind: type) -> dict[str, type]:
+def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
     return {
-        f.name: f.type
-        for f in msgspec.structs.fields(kind)
-        if isinstance(f.type, type) and issubclass(f.type, msgspec.Struct)
+        key: _without_none(value) if isinstance(value, dict) else value
+        for key, value in tree.items()
+        if value is not None
     }
 
 
-def _reject_unknown(tree: dict[str, Any], kind: type, where: str, path: str) -> None:
+def _reject_unknown(
+    tree: dict[str, Any], kind: type, fail: Callable[[str, str], NoReturn], path: str
+) -> None:
     """msgspec would reject unknown keys too, but cannot say which key was meant."""
-    known = [f.name for f in msgspec.structs.fields(kind)]
-    sections = _sections(kind)
+    fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
     for key, value in tree.items():
         full = f"{path}.{key}" if path else key
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean {(path + '.' if path else '') + near[0]!r}?" if near else f"known: {', '.join(known)}"
-            raise ConfigError(f"{where}: unknown key {full!r}; {hint}")
-        if key in sections and isinstance(value, dict):
-            _reject_unknown(value, sections[key], where, full)
-
-
-def _readable(text: str) -> str:
-    """msgspec says "Expected `int` >= 1 - at `$.trainer.batch`"; put the key first."""
-    message, _, place = text.partition(" - at `$")
-    key = place.rstrip("`").lstrip(".") or "the file"
-    return f"{key}: {message[:1].lower()}{message[1:]}"
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
+            hint = (
+                f"did you mean {(path + '.' if path else '') + near[0]!r}?"
+                if near
+                else f"known: {', '.join(fields)}"
+            )
+            fail(full, f"unknown key {full!r}; {hint}")
+        section = fields[key]
+        if isinstance(value, dict) and isinstance(section, type) and issubclass(section, msgspec.Struct):
+            _reject_unknown(value, section, fail, full)

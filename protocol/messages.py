@@ -61,7 +61,7 @@ class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.frombuffer(self.data, dtype=self.dtype).reshape(self.shape).astype(self.dtype[1:])
 
 
-class PlantState(Message):
+class PlantState(Message, frozen=True):
     """One sample of the plant, x(t), and the input that really acted since the sample before."""
 
     t: float
@@ -74,7 +74,7 @@ class PlantState(Message):
     """Tick of the last command received, -1 before the first."""
 
 
-class Command(Message):
+class Command(Message, frozen=True):
     """The input for now and the whole remaining plan; `seq` is the tick."""
 
     state_run_id: str
@@ -88,7 +88,7 @@ class Command(Message):
     """Inputs for this period and the following ones; plan[0] is u."""
 
 
-class HiddenWeights(Message):
+class HiddenWeights(Message, frozen=True):
     """W_1..W_{L-1} after one training; `seq` is the version and rises within a trainer's run."""
 
     for_run: RunId
@@ -106,7 +106,7 @@ class HiddenWeights(Message):
     """Hidden layer i as (1 + n_{i-1}, n_i); the first row is the bias."""
 
 
-class Tick(Message):
+class Tick(Message, frozen=True):
     """All that one control step depends on: the latched inputs and every verdict that depended on time."""
 
     slot: Count
@@ -124,7 +124,7 @@ class Tick(Message):
     """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
 
 
-class TickResult(Message):
+class TickResult(Message, frozen=True):
     """What one control step concluded; a pure function of the ticks up to this one."""
 
     x: list[float]
@@ -134,6 +134,8 @@ class TickResult(Message):
     iterations: Count
     slack: float
     """Largest state-constraint violation of the nominal plan, in units of that constraint's row."""
+    slack_row: str
+    """Which row that is, as "y at step 3"; empty when none."""
     h: list[float] | None
     """Measured h(x_{t-1}, u_{t-1}) = x_t - A x_{t-1} - B u_{t-1}, in deviation coordinates."""
     h_hat: list[float] | None
@@ -148,7 +150,7 @@ class TickResult(Message):
     """"none", "adopted", or "refused: <reason>"."""
 
 
-class TickTiming(Message):
+class TickTiming(Message, frozen=True):
     """What one control step cost on this machine; never part of a replay comparison."""
 
     solve_ms: float
@@ -166,13 +168,13 @@ class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     h: list[float]
 
 
-class Samples(Message):
+class Samples(Message, frozen=True):
     """A batch of samples in ascending order; `seq` is that of the last one."""
 
     samples: list[Sample]
 
 
-class OutputWeights(Message):
+class OutputWeights(Message, frozen=True):
     """K_t after the adaptation of tick `seq`, and which hidden weights it belongs to."""
 
     hidden_version: Sequence
@@ -181,7 +183,7 @@ class OutputWeights(Message):
     """(1 + n_L, d), first row the bias; scaled outputs."""
 
 
-class HiddenSnapshot(Message):
+class HiddenSnapshot(Message, frozen=True):
     """The hidden weights that the controller holds, for a trainer that joins late; `run_id` is the controller's."""
 
     hidden_version: Sequence
@@ -191,13 +193,13 @@ class HiddenSnapshot(Message):
     layers: list[Array]
 
 
-class Keyframe(Message):
+class Keyframe(Message, frozen=True):
     """The controller's whole memory after tick `seq` (-1: before the first)."""
 
     arrays: dict[str, Array]
 
 
-class RunInfo(Message):
+class RunInfo(Message, frozen=True):
     """What a log needs to be understood and replayed on its own."""
 
     process: str
@@ -209,7 +211,7 @@ class RunInfo(Message):
     unix_time: float
 
 
-class Health(Message):
+class Health(Message, frozen=True):
     """How one process is, about twice a second and at every change."""
 
     process: str

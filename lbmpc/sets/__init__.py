@@ -1,0 +1,1 @@
+"""Polytopes, disturbance tubes and invariant sets."""

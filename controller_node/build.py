@@ -1,0 +1,93 @@
+"""From a configuration to the objects of the science."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbmpc.controller import Controller
+from lbmpc.model import Model, ModelError, build_model
+from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle
+from lbmpc.plants import Plant, get_plant
+from lbmpc.problem import build_problem
+from lbmpc.sets.polytope import EmptySetError
+from lbmpc.solver import Solver
+from node_runtime.config import Config, ConfigError
+from protocol.network import NetworkDescription
+
+
+def build_plant(config: Config) -> Plant:
+    """The plant named by the configuration. Raises `ConfigError`."""
+    try:
+        return get_plant(config.plant.model)
+    except KeyError as error:
+        raise ConfigError(f"plant.model: {error.args[0]}") from error
+
+
+def initial_state(config: Config, plant: Plant) -> np.ndarray:
+    """x0 in the plant's own units, (d,). Raises `ConfigError`."""
+    if config.plant.x0 is None:
+        return plant.x0.copy()
+    if len(config.plant.x0) != plant.d:
+        raise ConfigError(f"plant.x0 has {len(config.plant.x0)} entries, {plant.name} has {plant.d} states")
+    return np.array(config.plant.x0, dtype=float)
+
+
+def describe_network(config: Config, plant: Plant) -> NetworkDescription:
+    """The network of the configuration for this plant; inputs are scaled by the half-widths of X and U."""
+    half_widths = np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
+    return NetworkDescription(
+        states=plant.d,
+        inputs=plant.m,
+        hidden=config.network.hidden,
+        activations=[config.network.activation] * len(config.network.hidden),
+        input_scale=half_widths.tolist(),
+        output_scale=[config.network.output_scale] * plant.d,
+        max_layer_norm=config.network.max_layer_norm,
+    )
+
+
+def build_oracle(config: Config, plant: Plant) -> Oracle:
+    """The oracle named by the configuration. Raises `ConfigError`."""
+    if config.controller.oracle == "linear":
+        return LinearOracle(plant.d, plant.m)
+    if config.controller.oracle == "l2nw":
+        names = (*plant.states, *plant.inputs)
+        chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)
+        unknown = [name for name in chosen if name not in names]
+        if unknown or not chosen:
+            raise ConfigError(f"l2nw.variables: {unknown or 'empty'}; choose from {', '.join(names)}")
+        indices = tuple(names.index(name) for name in chosen)
+        settings = config.l2nw
+        return L2nwOracle(plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation)
+    try:
+        description = describe_network(config, plant)
+    except ValueError as error:
+        raise ConfigError(f"network: {error}") from error
+    adaptation = config.adaptation
+    return DnnOracle(description, adaptation.gamma, adaptation.column_bound, adaptation.initial_scale)
+
+
+def build_controller(config: Config) -> Controller:
+    """Everything a controller is, built once. Raises `ConfigError`."""
+    plant = build_plant(config)
+    settings = config.controller
+    try:
+        model = _model(config, plant)
+        problem = build_problem(
+            model,
+            build_oracle(config, plant),
+            settings.horizon,
+            settings.tightening,
+            None if settings.W is None else np.array(settings.W, dtype=float),
+            settings.solver.penalty,
+        )
+    except (ModelError, EmptySetError) as error:
+        raise ConfigError(f"controller: {error}") from error
+    return Controller(problem, Solver(problem, settings.solver.max_iterations, settings.solver.tolerance))
+
+
+def _model(config: Config, plant: Plant) -> Model:
+    settings = config.controller
+    Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
+    R = None if settings.R is None else np.array(settings.R, dtype=float)
+    return build_model(plant, config.period, Q, R)

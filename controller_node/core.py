@@ -1,0 +1,185 @@
+"""The controller between messages: a Tick in, its Command and everything else that it implies out.
+
+Deterministic: the outputs are a function of the configuration, the keyframe and the ticks, and of nothing else. The
+live node, the lock-step simulation and the replay all call `step` and differ only in where the ticks come from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from dataclasses import dataclass
+from importlib import metadata
+
+import msgspec
+import numpy as np
+
+from controller_node.build import build_controller
+from lbmpc.controller import ControllerState, HiddenSet, Observation, StepResult
+from lbmpc.oracles import DnnOracle
+from node_runtime.config import Config, to_json
+from protocol import messages as m
+from protocol.network import hash_layers
+
+PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Everything one tick produces; `sample` and `output_weights` are None where there is none."""
+
+    command: m.Command
+    result: m.TickResult
+    sample: m.Sample | None
+    output_weights: m.OutputWeights | None
+
+
+class ControllerCore:
+    """A controller with its memory.
+
+    Args:
+        config: the resolved configuration.
+        run_id: stamped on every message; a replay gives the recorded one.
+
+    Raises:
+        ConfigError: the configuration admits no controller, and why.
+    """
+
+    def __init__(self, config: Config, run_id: str):
+        self.config, self.run_id = config, run_id
+        self.controller = build_controller(config)
+        self.plant = self.controller.model.plant
+        self.state: ControllerState = self.controller.initial_state(config.seed)
+        oracle = self.controller.oracle
+        self._dnn = oracle if isinstance(oracle, DnnOracle) else None
+        self.description = self._dnn.description if self._dnn else None
+        self._hidden_hash = self._hash_hidden()
+
+    def step(self, tick: m.Tick) -> Outputs:
+        """One control step. Never raises for what a tick may hold."""
+        seen = self._observe(tick)
+        self.state, result = self.controller.step(self.state, seen)
+        if result.verdict == "adopted":
+            self._hidden_hash = self._hash_hidden()
+        command = self._command(tick, result)
+        return Outputs(command, self._result(tick, command, result), self._sample(tick, result), self._weights(tick))
+
+    def keyframe(self, seq: int) -> m.Keyframe:
+        """The whole memory after tick `seq`, -1 before the first."""
+        kinds = {"i": "<i8", "f": "<f8"}
+        arrays = {name: m.Array.of(a, kinds[a.dtype.kind]) for name, a in self.state.to_arrays().items()}
+        return m.Keyframe(run_id=self.run_id, seq=seq, arrays=arrays)
+
+    def restore(self, keyframe: m.Keyframe) -> None:
+        """Take over a keyframe's memory.
+
+        Raises:
+            ValueError: the keyframe does not fit this configuration; the text names the array.
+        """
+        arrays = {name: array.numpy() for name, array in keyframe.arrays.items()}
+        expected = self.state.to_arrays()
+        for name in sorted(expected.keys() | arrays.keys()):
+            if name not in arrays or name not in expected or arrays[name].shape != expected[name].shape:
+                raise ValueError(f"the keyframe of tick {keyframe.seq} does not fit this configuration: array {name}")
+        self.state = ControllerState.from_arrays(arrays)
+        self._hidden_hash = self._hash_hidden()
+
+    def hidden_snapshot(self, seq: int) -> m.HiddenSnapshot | None:
+        """The hidden weights in force, for a trainer that joins late; None without a network."""
+        if self._dnn is None or self.description is None:
+            return None
+        layers = [m.Array.of(layer, "<f4") for layer in self._dnn.hidden(self.state.oracle)]
+        return m.HiddenSnapshot(
+            run_id=self.run_id,
+            seq=seq,
+            hidden_version=self._version(),
+            hidden_sha256=self._hidden_hash,
+            description=msgspec.json.encode(self.description).decode(),
+            layers=layers,
+        )
+
+    def run_info(self, unix_time: float) -> m.RunInfo:
+        """What a log needs to be replayed on its own."""
+        versions = {"python": platform.python_version(), "machine": platform.machine()}
+        versions |= {name: metadata.version(name) for name in PACKAGES}
+        return m.RunInfo(
+            run_id=self.run_id,
+            seq=0,
+            process="controller",
+            config=to_json(self.config),
+            versions=versions,
+            seed=self.config.seed,
+            units=dict(self.plant.units),
+            unix_time=unix_time,
+        )
+
+    def _observe(self, tick: m.Tick) -> Observation:
+        state = tick.state if tick.state_verdict == "fresh" else None
+        hidden = None
+        if tick.weights is not None:
+            layers = [array.numpy().astype(float) for array in tick.weights.layers]
+            hidden = HiddenSet(tick.weights.seq, layers, tick.weights.sha256, tick.weights.network_sha256)
+        if state is None:
+            return Observation(None, None, 0, -1, hidden)
+        applied = None if state.applied is None else np.array(state.applied) - self.plant.u_e
+        source = int.from_bytes(hashlib.sha256(state.run_id.encode()).digest()[:7], "little")
+        return Observation(np.array(state.x) - self.plant.x_e, applied, source, state.seq, hidden)
+
+    def _command(self, tick: m.Tick, result: StepResult) -> m.Command:
+        plan = result.plan + self.plant.u_e
+        return m.Command(
+            run_id=self.run_id,
+            seq=tick.seq,
+            state_run_id=tick.state.run_id if tick.state else "",
+            state_seq=tick.state.seq if tick.state and tick.state_verdict == "fresh" else -1,
+            period=self.config.period,
+            mode=result.mode,
+            u=plan[0].tolist(),
+            plan=plan.tolist(),
+        )
+
+    def _result(self, tick: m.Tick, command: m.Command, result: StepResult) -> m.TickResult:
+        solution, label = result.solution, result.label
+        state = self.state.oracle
+        return m.TickResult(
+            run_id=self.run_id,
+            seq=tick.seq,
+            x=list(tick.state.x) if tick.state else [],
+            u=command.u,
+            mode=result.mode,
+            status=str(solution.status) if solution else f"no solve: state {tick.state_verdict}",
+            iterations=solution.iterations if solution else 0,
+            slack=solution.slack if solution else 0.0,
+            slack_row=solution.slack_row if solution else "",
+            h=label.h.tolist() if label else None,
+            h_hat=label.h_hat.tolist() if label else None,
+            prediction_error=float(np.linalg.norm(label.h_hat - label.h)) if label else None,
+            oracle_norms=np.linalg.norm(state["K"], axis=0).tolist() if self._dnn else [],
+            hidden_version=self._version(),
+            hidden_sha256=self._hidden_hash,
+            weights_verdict=result.verdict,
+        )
+
+    def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:
+        label = result.label
+        if label is None:
+            return None
+        # The label of tick t is complete at tick t + 1.
+        return m.Sample(tick.seq - 1, label.x.tolist(), label.u.tolist(), label.h.tolist())
+
+    def _weights(self, tick: m.Tick) -> m.OutputWeights | None:
+        if self._dnn is None:
+            return None
+        return m.OutputWeights(
+            run_id=self.run_id,
+            seq=tick.seq,
+            hidden_version=self._version(),
+            hidden_sha256=self._hidden_hash,
+            K=m.Array.of(self.state.oracle["K"]),
+        )
+
+    def _version(self) -> int:
+        return int(self.state.oracle["version"][0]) if self._dnn else -1
+
+    def _hash_hidden(self) -> str:
+        return hash_layers(self._dnn.hidden(self.state.oracle)) if self._dnn else ""

@@ -1,0 +1,270 @@
+"""`tandem controller`: the live shell around `ControllerCore`. Latch, step, publish; nothing else."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+
+from controller_node.core import ControllerCore, Outputs
+from controller_node.outbox import Outbox
+from node_runtime import clock
+from node_runtime.bus import Bus, OpenInterrupted
+from node_runtime.config import Config, ConfigError
+from node_runtime.health import HealthPublisher
+from node_runtime.inbox import Inbox, Received
+from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.pacer import Grid, Pacer, Slot
+from node_runtime.realtime import GarbageCollection, one_blas_thread, punctual
+from protocol import codec, topics
+from protocol import messages as m
+
+log = logging.getLogger(__name__)
+
+SAMPLES_BATCH = 5
+# A state older than this share of a period belongs to an earlier slot.
+OLDEST_STATE = 0.8
+# How long a slot waits for its state, as a share of a period.
+STATE_PATIENCE = 0.25
+LONGEST_PHASE = 0.5
+COUNTS = (
+    "ticks",
+    "late ticks",
+    "skipped slots",
+    "states missing",
+    "states stale",
+    "weights adopted",
+    "weights refused",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Latched:
+    """The plant's state as one slot found it."""
+
+    verdict: m.StateVerdict
+    received: Received[m.PlantState] | None
+    age: float
+    """Seconds since the sample, as far as that can be known."""
+
+    @property
+    def state(self) -> m.PlantState | None:
+        return None if self.received is None else self.received.message
+
+
+class ControllerNode:
+    """One controller on the bus. `run` is its loop; the query thread only reads what the loop leaves."""
+
+    def __init__(self, core: ControllerCore, bus: Bus, health: HealthPublisher, counts: dict[str, int]):
+        """`counts`: this node's own figures, kept up to date here."""
+        self._core = core
+        self._bus = bus
+        self._health = health
+        self._counts = counts
+        self._settings = core.config.controller
+        self._period = core.config.period
+        self._phase = self._settings.phase_ms * 1e-3
+        self._run_id = core.run_id
+        self._states: Inbox[m.PlantState] = Inbox(
+            bus, topics.PLANT_STATE, states=core.plant.d, inputs=core.plant.m, sent=lambda state: state.t
+        )
+        self._trainers: Inbox[m.HiddenWeights] = Inbox(bus, topics.HIDDEN_WEIGHTS, capacity=8)
+        self._grid = Grid(self._period, clock.now())
+        self._first: Received[m.PlantState] | None = None
+        self._followed = ""
+        self._began: float | None = None
+        self._seq = -1
+        self._missing = 0
+        self._keyframe_seq = -1
+        self._weights: m.HiddenWeights | None = None
+        self._outbox = Outbox(core.run_id)
+        self._unsent: list[m.Sample] = []
+        self._hidden: list[bytes] = []
+        self._remember_hidden()
+        bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
+        bus.serve(topics.HIDDEN_QUERY, lambda _parameters: self._hidden)
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop` is set."""
+        pacer = Pacer(self._grid, stop)
+        garbage = GarbageCollection()
+        garbage.begin()
+        self._bus.publish(topics.KEYFRAME, self._core.keyframe(-1))
+        while self._find_plant(stop):
+            while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:
+                slot, lateness = turn
+                latched = self._latch(slot)
+                self._tick(slot, lateness, latched)
+                self._follow_phase(slot, latched)
+                self._take_weights()
+                garbage.idle()
+        self._send_samples()
+        if self._keyframe_seq < self._seq:
+            self._bus.publish(topics.KEYFRAME, self._core.keyframe(self._seq))
+
+    # -- before the step ---------------------------------------------------------------------------------
+
+    def _find_plant(self, stop: threading.Event) -> bool:
+        """Wait for a state and put the next slot `phase_ms` behind its arrival; False when told to stop.
+
+        After an outage longer than the plan there is nothing left to say, so the loop comes back here.
+        """
+        self._send_samples()
+        self._health.set("ready", "no plant: waiting for its states")
+        while not stop.is_set():
+            self._first = self._states.wait(0.1)
+            if self._first is not None:
+                self._missing = 0
+                self._followed = self._first.message.run_id
+                self._grid.reanchor(self._states.undelayed(self._first) + self._phase)
+                self._health.set("running")
+                return True
+        return False
+
+    def _latch(self, slot: Slot) -> Latched:
+        """The newest state; where none of this slot is here yet, wait a little for it."""
+        received, self._first = self._first or self._states.take(), None
+        deadline = slot.time + STATE_PATIENCE * self._period
+        oldest = OLDEST_STATE * self._period
+        while True:
+            now = clock.now()
+            age = 0.0 if received is None else self._states.age(received, now)
+            if received is not None and age <= oldest:
+                return Latched("fresh", received, age)
+            newer = self._states.wait(deadline - now) if now < deadline else None
+            if newer is None:
+                return Latched("missing" if received is None else "stale", received, age)
+            received = newer
+
+    def _follow_phase(self, slot: Slot, latched: Latched) -> None:
+        """Keep the slots `phase_ms` behind the arrival of the plant's states."""
+        if latched.verdict != "fresh" or latched.received is None:
+            return
+        received = latched.received
+        arrived = self._states.undelayed(received)
+        if received.message.run_id == self._followed:
+            self._grid.slew(arrived, self._phase)
+            return
+        # Another plant process, another phase.
+        self._followed = received.message.run_id
+        after = arrived + self._phase + self._period
+        self._grid.reanchor(after if after - slot.time > 0.5 * self._period else after + self._period)
+
+    def _take_weights(self) -> None:
+        """Decode hidden weights after the step, where there is time; the next tick carries them."""
+        for received in self._trainers.take_all():
+            weights = received.message
+            if weights.for_run != self._run_id:
+                detail = f"version {weights.seq} of {weights.run_id} is for {weights.for_run}"
+                self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "for another run", detail)
+                continue
+            self._weights = weights
+
+    # -- the step and what follows from it ---------------------------------------------------------------
+
+    def _tick(self, slot: Slot, lateness: float, latched: Latched) -> None:
+        woken = slot.time + lateness
+        self._began = slot.time if self._began is None else self._began
+        self._seq += 1
+        tick = m.Tick(
+            run_id=self._run_id,
+            seq=self._seq,
+            slot=slot.index,
+            t=max(0.0, slot.time - self._began),
+            skipped=slot.skipped,
+            lateness=lateness,
+            late=lateness > self._settings.late_fraction * self._period,
+            state_verdict=latched.verdict,
+            state=latched.state,
+            weights=self._weights,
+        )
+        self._weights = None
+        before = clock.now()
+        outputs = self._core.step(tick)
+        after = clock.now()
+        self._bus.publish(topics.COMMAND, outputs.command)
+        sent = clock.now()
+        timing = m.TickTiming(
+            run_id=self._run_id,
+            seq=self._seq,
+            solve_ms=(after - before) * 1e3,
+            tick_ms=(sent - woken) * 1e3,
+            lateness_ms=lateness * 1e3,
+            state_age_ms=latched.age * 1e3,
+        )
+        self._bus.publish(topics.TICK, tick)
+        self._bus.publish(topics.RESULT, outputs.result)
+        self._bus.publish(topics.TIMING, timing)
+        self._publish_learning(outputs)
+        self._count(tick, outputs, overrun=sent > slot.time + self._period)
+
+    def _publish_learning(self, outputs: Outputs) -> None:
+        """Everything else that a tick leaves: samples, output weights, keyframes."""
+        if outputs.sample is not None:
+            self._outbox.add(outputs.sample)
+            self._unsent.append(outputs.sample)
+            if len(self._unsent) >= SAMPLES_BATCH:
+                self._send_samples()
+        if outputs.output_weights is not None:
+            self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
+        if outputs.result.weights_verdict == "adopted":
+            self._remember_hidden()
+        if (self._seq + 1) % self._settings.keyframe_every == 0:
+            self._keyframe_seq = self._seq
+            self._bus.publish(topics.KEYFRAME, self._core.keyframe(self._seq))
+
+    def _count(self, tick: m.Tick, outputs: Outputs, overrun: bool) -> None:
+        self._missing = 0 if tick.state_verdict == "fresh" else self._missing + 1
+        counts = self._counts
+        counts["ticks"] += 1
+        counts["late ticks"] += tick.late or overrun
+        counts["skipped slots"] += tick.skipped
+        counts["states missing"] += tick.state_verdict == "missing"
+        counts["states stale"] += tick.state_verdict == "stale"
+        verdict = outputs.result.weights_verdict
+        counts["weights adopted"] += verdict == "adopted"
+        if verdict.startswith("refused"):
+            counts["weights refused"] += 1
+            self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", verdict)
+
+    def _send_samples(self) -> None:
+        for batch in self._outbox.batches(self._unsent):
+            self._bus.publish(topics.SAMPLES, batch)
+        self._unsent = []
+
+    def _remember_hidden(self) -> None:
+        snapshot = self._core.hidden_snapshot(self._seq)
+        self._hidden = [] if snapshot is None else [codec.encode(snapshot)]
+
+
+def main(config: Config, stop: threading.Event | None = None) -> int:
+    """`tandem controller`. 0 when told to stop, 2 for a configuration that admits no controller."""
+    run_id = new_run_id("controller")
+    counts = dict.fromkeys(COUNTS, 0)
+    with stopped_by_signals(stop) as stopping, one_blas_thread():
+        try:
+            _check_phase(config)
+            core = ControllerCore(config, run_id)
+        except ConfigError as error:
+            log.error("%s", error)
+            return 2
+        with punctual(config.realtime.priority) as note:
+            try:
+                with (
+                    Bus(config, "controller", run_id, stopping) as bus,
+                    HealthPublisher(bus, core.run_info(time.time()), lambda: counts, note) as health,
+                ):
+                    ControllerNode(core, bus, health, counts).run(stopping)
+            except OpenInterrupted:
+                log.info("stopped before there was a router")
+    return 0
+
+
+def _check_phase(config: Config) -> None:
+    longest = LONGEST_PHASE * config.period * 1e3
+    if config.controller.phase_ms > longest:
+        raise ConfigError(
+            f"controller.phase_ms = {config.controller.phase_ms} is more than {LONGEST_PHASE} of a period; "
+            f"at rate = {config.rate} Hz at most {longest:g} ms"
+        )

@@ -1,0 +1,180 @@
+"""One control step, pure: the same function live, in lock-step simulation and in replay.
+
+Within a step the order is what makes a swap of hidden weights correct: first the label of the previous input is
+learned with the features it was applied under, phi_j, then new hidden weights may come in, then the problem is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.model import Model
+from lbmpc.oracles.base import OracleState
+from lbmpc.oracles.dnn import DnnOracle
+from lbmpc.problem import Problem
+from lbmpc.solver import Solution, Solver
+
+Mode = Literal["solver", "shifted_plan", "feedback"]
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenSet:
+    """A trained set of hidden layers on offer."""
+
+    version: int
+    layers: list[np.ndarray]
+    sha256: str
+    """Of the layers."""
+    network_sha256: str
+    """Of the description that they were trained for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What a step may depend on. x (d,) and applied (m,) are deviations; None where there was none."""
+
+    x: np.ndarray | None
+    applied: np.ndarray | None
+    """Mean input over the period that ended with x."""
+    source: int
+    """Which incarnation of the plant sent x; labels never span two."""
+    sequence: int
+    """Its sample number; a label needs two consecutive ones."""
+    hidden: HiddenSet | None
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerState:
+    """All of the controller's memory. Flat, so that it can be frozen into a keyframe and thawed."""
+
+    plan: Plan
+    """Shifted solution: warm start of the next solve and fallback."""
+    pending_x: np.ndarray
+    """x_t whose label is still to come, (d,)."""
+    pending: tuple[int, int]
+    """Its (source, sequence); sequence -1 when none is pending."""
+    oracle: OracleState
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "plan.v": self.plan.v,
+            "plan.left": np.array([self.plan.left], dtype=np.int64),
+            "pending.x": self.pending_x,
+            "pending": np.array(self.pending, dtype=np.int64),
+            **{f"oracle.{name}": array for name, array in self.oracle.items()},
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
+        """Raises KeyError when an array is missing."""
+        source, sequence = (int(value) for value in arrays["pending"])
+        prefix = "oracle."
+        oracle = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
+        return cls(plan, arrays["pending.x"], (source, sequence), oracle)
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """One labelled sample: x_t, the input applied until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
+
+    x: np.ndarray
+    u: np.ndarray
+    h: np.ndarray
+    h_hat: np.ndarray
+    """The oracle's estimate before it learned this sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """What a step decided and found, in deviation coordinates. plan is (N, m) with plan[0] the input for now."""
+
+    plan: np.ndarray
+    mode: Mode
+    solution: Solution | None
+    label: Label | None
+    verdict: str
+    """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
+
+
+class Controller:
+    """LBMPC with an oracle that learns.
+
+    Args:
+        problem: the optimisation problem.
+        solver: solves it.
+    """
+
+    def __init__(self, problem: Problem, solver: Solver):
+        self.problem, self.solver = problem, solver
+        self.model: Model = problem.model
+        self.oracle = problem.oracle
+
+    def initial_state(self, seed: int) -> ControllerState:
+        """Nothing known, nothing planned; the oracle's random start from the seed."""
+        oracle = self.oracle.initial_state(np.random.default_rng(seed))
+        plan = empty_plan(self.problem.horizon, self.model.m)
+        return ControllerState(plan, np.zeros(self.model.d), (0, -1), oracle)
+
+    def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
+        """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
+        if seen.x is not None and not np.isfinite(seen.x).all():
+            seen = replace(seen, x=None)
+        label, oracle = self._learn(state, seen)
+        oracle, verdict = self._adopt(oracle, seen.hidden)
+        plan, mode, solution = self._plan(state.plan, oracle, seen.x)
+        pending_x, pending = (
+            (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
+        )
+        after = ControllerState(self._shifted(plan, solution), pending_x, pending, oracle)
+        return after, StepResult(plan.v, mode, solution, label, verdict)
+
+    def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
+        source, sequence = state.pending
+        follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
+        if seen.x is None or seen.applied is None or not follows:
+            return None, state.oracle
+        x, u = state.pending_x, seen.applied
+        h = self.model.label(x, u, seen.x)
+        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u))
+        return label, self.oracle.learn(state.oracle, x, u, h)
+
+    def _adopt(self, oracle: OracleState, hidden: HiddenSet | None) -> tuple[OracleState, str]:
+        if hidden is None:
+            return oracle, "none"
+        if not isinstance(self.oracle, DnnOracle):
+            return oracle, f"refused: the oracle {self.oracle.name} has no hidden layers"
+        return self.oracle.adopt(oracle, hidden.version, hidden.layers, hidden.sha256, hidden.network_sha256)
+
+    def _plan(
+        self, plan: Plan, oracle: OracleState, x: np.ndarray | None
+    ) -> tuple[Plan, Mode, Solution | None]:
+        horizon = self.problem.horizon
+        solution = None
+        if x is not None:
+            solution = self.solver.solve(x, self.oracle.theta(oracle), plan.v)
+            if solution.usable:
+                return Plan(solution.v, horizon), "solver", solution
+        if plan.left > 0:
+            return plan, "shifted_plan", solution
+        if x is None:
+            # Neither a plan nor a state: the equilibrium input is all that is left.
+            return Plan(np.zeros((horizon, self.model.m)), 0), "feedback", solution
+        return Plan(feedback_plan(self.model, x, horizon), 0), "feedback", solution
+
+    def _shifted(self, plan: Plan, solution: Solution | None) -> Plan:
+        end = solution.zbar[-1] if solution is not None and solution.usable else np.zeros(self.model.d)
+        return shift(plan, self.model.K @ end)
+
+
+def same_memory(a: ControllerState, b: ControllerState) -> str | None:
+    """Name of the first array that differs between two states, bit for bit, or None."""
+    left, right = a.to_arrays(), b.to_arrays()
+    for name in sorted(left.keys() | right.keys()):
+        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
+            return name
+    return None

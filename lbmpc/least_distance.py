@@ -1,0 +1,88 @@
+"""Least-distance problems with few active rows out of many: min |w|^2 / 2, lower <= y + M w <= upper.
+
+DAQP solves them; it is shown only the rows that some iterate violated, which in MPC are few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import daqp
+import numpy as np
+
+# DAQP's own default, 1e-6, moves the first input by 5e-6.
+PRIMAL_TOLERANCE = 1e-9
+SOFT = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Penalty:
+    """Soft rows pay weight (e + e^2 / 2), e = violation / scale; exact for multipliers up to weight / scale."""
+
+    soft: np.ndarray
+    """Which rows are soft, (rows,) of bool."""
+    scale: np.ndarray
+    """Violation that counts as 1, (rows,)."""
+    weight: float
+
+    def cost(self, violation: np.ndarray) -> float:
+        """Sum over the soft rows; violation is (rows,), zero where kept."""
+        e = violation[self.soft] / self.scale[self.soft]
+        return self.weight * float(np.sum(e + 0.5 * e * e))
+
+
+def violation(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """How far each row is outside its bounds, zero inside; (rows,)."""
+    return np.maximum(np.maximum(lower - values, values - upper), 0.0)
+
+
+def least_distance(
+    y: np.ndarray, M: np.ndarray, lower: np.ndarray, upper: np.ndarray, penalty: Penalty | None
+) -> np.ndarray | None:
+    """The minimiser w, (n,), or None when hard rows contradict each other or the numbers are unusable.
+
+    Args:
+        y: row values at w = 0, (rows,).
+        M: how they move with w, (rows, n).
+        lower, upper: bounds, (rows,).
+        penalty: None when every row is hard.
+    """
+    n = M.shape[1]
+    identity, zero = np.eye(n), np.zeros(n)
+    seen: np.ndarray = np.zeros(0, dtype=np.intp)
+    unseen = np.ones(len(y), dtype=bool)
+    w = zero
+    # Each round adds a row at least, so the rows themselves bound the rounds.
+    for _ in range(len(y) + 1):
+        outside = violation(y + M @ w, lower, upper)
+        new = np.flatnonzero((outside > PRIMAL_TOLERANCE) & unseen)
+        if new.size == 0:
+            return w
+        unseen[new] = False
+        seen = np.concatenate([seen, new])
+        rows = M[seen]
+        norms = np.sqrt((rows * rows).sum(axis=1))
+        if not (norms > 1e-12).all():
+            return None
+        soft = penalty.soft[seen] if penalty is not None else np.zeros(len(seen), dtype=bool)
+        model = daqp.Model()
+        model.settings = {"primal_tol": PRIMAL_TOLERANCE}
+        # Rows of length 1, so that DAQP's tolerances and weights mean distances.
+        flag, _time = model.setup(
+            identity,
+            zero,
+            rows / norms[:, None],
+            (upper[seen] - y[seen]) / norms,
+            (lower[seen] - y[seen]) / norms,
+            np.where(soft, SOFT, 0).astype(np.intc),
+        )
+        if flag < 0:
+            return None
+        if penalty is not None:
+            unit = norms / penalty.scale[seen]
+            linear, quadratic = penalty.weight * unit, 1.0 / (penalty.weight * unit * unit)
+            model.soft_weights(quadratic, quadratic, linear, linear)
+        w, _value, flag, _info = model.solve()
+        if flag <= 0 or not np.isfinite(w).all():
+            return None
+    return None

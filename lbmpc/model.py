@@ -1,0 +1,117 @@
+"""The nominal model: linearisation about the equilibrium, exact discretisation, feedback K and terminal cost P.
+
+Everything from here on is in deviation coordinates: x - x_e and u - u_e.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
+from scipy.signal import place_poles
+
+from lbmpc.plants.base import Plant
+
+
+class ModelError(ValueError):
+    """The plant's equations and the chosen period give no usable model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """x+ = A x + B u + h(x, u) with everything known but h.
+
+    Shapes: A (d, d), B (d, m), K (m, d), P (d, d), Q (d, d), R (m, m).
+    """
+
+    plant: Plant
+    period: float
+    A: np.ndarray
+    B: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    K: np.ndarray
+    P: np.ndarray
+
+    @property
+    def d(self) -> int:
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        return self.B.shape[1]
+
+    @property
+    def closed_loop(self) -> np.ndarray:
+        """A + BK, Schur stable."""
+        return self.A + self.B @ self.K
+
+    def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
+        """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, with the input that really was applied; (d,)."""
+        return x_next - self.A @ x - self.B @ u
+
+
+def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Continuous-time Jacobians of the plant's own equations at (x_e, u_e): (d, d) and (d, m)."""
+    f = plant.function()
+    x, u = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m)
+    dx = f(x, u)
+    jacobian = ca.Function("jacobian", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
+    residual, a, b = (np.array(value) for value in jacobian(plant.x_e, plant.u_e))
+    if np.abs(residual).max() > 1e-5:
+        raise ModelError(
+            f"{plant.name}: (x_e, u_e) is not an equilibrium: dx/dt there is {residual.ravel().tolist()}"
+        )
+    return a, b
+
+
+def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Exact zero-order hold: exp([[a, b], [0, 0]] T)."""
+    d, m = b.shape
+    block = np.zeros((d + m, d + m))
+    block[:d, :d], block[:d, d:] = a, b
+    exponential = expm(block * period)
+    return exponential[:d, :d], exponential[:d, d:]
+
+
+def build_model(
+    plant: Plant, period: float, Q: np.ndarray | None = None, R: np.ndarray | None = None
+) -> Model:
+    """The model at a sampling period (seconds), with diagonal weights Q (d,) and R (m,), ones by default.
+
+    K places the plant's own closed-loop poles, mapped by exp(p T), or is the LQR gain when it names none. P solves
+    (A+BK)' P (A+BK) - P = -(Q + K'RK).
+
+    Raises:
+        ModelError: no equilibrium, not stabilisable, or weights of the wrong length.
+    """
+    a, b = discretise(*linearise(plant), period)
+    q = np.diag(_weights("Q", Q, plant.d))
+    r = np.diag(_weights("R", R, plant.m))
+    try:
+        if plant.poles is not None:
+            k = -place_poles(a, b, [_real(np.exp(p * period)) for p in plant.poles]).gain_matrix
+        else:
+            s = solve_discrete_are(a, b, q, r)
+            k = -np.linalg.solve(r + b.T @ s @ b, b.T @ s @ a)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(f"{plant.name}: no stabilising K at a period of {period} s: {error}") from error
+    closed = a + b @ k
+    radius = float(np.abs(np.linalg.eigvals(closed)).max())
+    if radius >= 1.0:
+        raise ModelError(f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})")
+    p = solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
+    return Model(plant, period, a, b, q, r, k, 0.5 * (p + p.T))
+
+
+def _weights(name: str, given: np.ndarray | None, length: int) -> np.ndarray:
+    weights = np.ones(length) if given is None else np.asarray(given, dtype=float)
+    if weights.shape != (length,):
+        raise ModelError(f"{name} has {weights.size} weights, the plant needs {length}")
+    return weights
+
+
+def _real(value: complex) -> complex | float:
+    return value.real if abs(value.imag) < 1e-15 else value

@@ -1,0 +1,62 @@
+"""All constraint rows of a problem over (v, zbar) as one block: inputs first, then states step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbmpc.least_distance import Penalty, violation
+from lbmpc.problem import Problem
+
+
+class Rows:
+    """The rows' bounds, their values, their slopes, and what their violation costs."""
+
+    def __init__(self, problem: Problem):
+        n, m, d = problem.horizon, problem.model.m, problem.model.d
+        self.n, self.m, self.d = n, m, d
+        if not all(part.is_box for part in problem.inputs):
+            raise ValueError("input constraints must be boxes: they are kept by clipping, exactly")
+        self.input_rows = problem.inputs[0].F
+        self.state_rows = problem.states[0].F
+        common = len(self.state_rows)
+        last = problem.states[-1]
+        # The last step may carry the rows of a terminal set behind the rows that all steps share.
+        self.terminal_rows = last.F[common:]
+        parts = [*problem.inputs, *problem.states]
+        self.lower = np.concatenate([part.lower for part in parts])
+        self.upper = np.concatenate([part.upper for part in parts])
+        self.count_inputs = len(self.input_rows) * n
+        width = self.upper - self.lower
+        scale = np.where(np.isfinite(width), 0.5 * width, np.maximum(np.abs(self.upper), 1e-3))
+        # The scale of a row is that of its plain set: tightening must not make a violation weigh more.
+        plain = np.tile(scale[self.count_inputs + common :][:common] if n > 1 else scale[-common:], n)
+        scale[self.count_inputs : self.count_inputs + common * n] = plain
+        soft = np.arange(len(self.lower)) >= self.count_inputs
+        self.penalty = Penalty(soft, scale, problem.penalty)
+        self.names = [f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names]
+
+    def clip(self, v: np.ndarray) -> np.ndarray:
+        """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""
+        shape = (self.n, self.m)
+        return np.clip(v, self.lower[: v.size].reshape(shape), self.upper[: v.size].reshape(shape))
+
+    def values(self, v: np.ndarray, zbar: np.ndarray) -> np.ndarray:
+        """Row values of inputs v (m, n) and nominal states zbar (d, n)."""
+        parts = [(self.input_rows @ v).T.ravel(), (self.state_rows @ zbar).T.ravel()]
+        return np.concatenate([*parts, self.terminal_rows @ zbar[:, -1]])
+
+    def slopes(self, mv: np.ndarray, mz: np.ndarray) -> np.ndarray:
+        """Row slopes from those of v (m n, k) and zbar (d n, k)."""
+        k = mv.shape[1]
+        parts = [
+            np.matmul(self.input_rows, mv.reshape(self.n, self.m, k)).reshape(-1, k),
+            np.matmul(self.state_rows, mz.reshape(self.n, self.d, k)).reshape(-1, k),
+            self.terminal_rows @ mz[-self.d :],
+        ]
+        return np.concatenate(parts)
+
+    def slack(self, values: np.ndarray) -> tuple[float, str]:
+        outside = violation(values, self.lower, self.upper)[self.count_inputs :]
+        worst = int(np.argmax(outside))
+        slack = float(outside[worst])
+        return (slack, self.names[worst]) if slack > 1e-9 else (0.0, "")

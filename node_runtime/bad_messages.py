@@ -1,0 +1,41 @@
+"""What arrived and must not be obeyed: counted by topic and reason, named once in the log."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+log = logging.getLogger(__name__)
+
+# A hostile sender must not fill the memory with reasons; the counters travel in every Health message.
+MAX_KINDS = 200
+
+
+class BadMessages:
+    """Counts per (topic, reason); the first of each is logged with its detail, the rest are only counted."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def count(self, topic: str, reason: str, detail: str = "") -> None:
+        """Count one message. `reason` is one of a few fixed texts; `detail` is only logged, for a person."""
+        key = f"bad {topic}: {reason}"
+        with self._lock:
+            if key not in self._counts and len(self._counts) >= MAX_KINDS:
+                key = "bad, other"
+            seen = self._counts.get(key, 0)
+            self._counts[key] = seen + 1
+        if seen == 0:
+            log.warning("%s (%s); ignored, further ones are only counted", key, detail[:300] or "no detail")
+
+    def counters(self) -> dict[str, int]:
+        """Keys like "bad plant/state: not finite"."""
+        with self._lock:
+            return dict(self._counts)
+
+    @property
+    def total(self) -> int:
+        """Bad messages of every kind so far."""
+        with self._lock:
+            return sum(self._counts.values())

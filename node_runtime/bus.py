@@ -1,0 +1,426 @@
+"""The bus: raw payloads between processes, over Zenoh.
+
+Two client sessions to one router. *Control* (states, commands) is dropped rather than queued, sent at once,
+at real-time priority. *Bulk* (weights, logs) blocks when the link is full, so it has a session and a thread
+of its own, and a full link never delays a command. Receiving threads only copy the payload into a bounded
+mailbox: a slow reader loses its own oldest messages and stalls nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
+from typing import Any
+
+import zenoh
+
+from node_runtime import clock
+from node_runtime.bad_messages import BadMessages
+from node_runtime.config import Config
+from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
+from protocol import codec, topics
+from protocol.messages import Message
+from protocol.topics import Topic
+
+log = logging.getLogger(__name__)
+
+BULK_MESSAGES = 2000
+BULK_BYTES = 256 * 1024 * 1024
+PENDING_QUERIES = 32
+LARGEST = max(topic.max_bytes for topic in topics.ALL)
+
+Handler = Callable[[dict[str, str]], list[bytes]]
+
+__all__ = ["Bus", "Delivery", "Handler", "Latest", "Mailbox", "OpenInterrupted", "session_config"]
+
+
+class OpenInterrupted(RuntimeError):
+    """The process was told to stop while it still waited for the router."""
+
+
+def session_config(mode: str, endpoint: str, lease_ms: int) -> zenoh.Config:
+    """Zenoh's configuration for a session of `mode` "client" or "router".
+
+    An explicit endpoint, no scouting, no shared memory.
+
+    Raises:
+        ValueError: `endpoint` is not one that Zenoh understands, e.g. `tcp/127.0.0.1:7447`.
+    """
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Messages above 3 kB vanish without an error where the receiver's memlock limit is small.
+        "transport/shared_memory/enabled": False,
+        # A frozen process or a cut link is noticed after the lease; the default is 10 s.
+        "transport/link/tx/lease": lease_ms,
+        "transport/link/tx/keep_alive": 4,
+    }
+    if mode == "client":
+        settings |= {
+            "listen/endpoints": [],
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": -1,
+            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2.0},
+        }
+    else:
+        settings |= {"listen/endpoints": [endpoint], "connect/endpoints": [], "listen/exit_on_failure": True}
+    config = zenoh.Config()
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise ValueError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
+    return config
+
+
+def _discard(opened: Future[zenoh.Session]) -> None:
+    if opened.exception() is None:
+        opened.result().close()
+
+
+class Bus:
+    """One process's place on the bus of one plant. A context manager; `open` waits for the router.
+
+    Everything may be called from any thread. Nothing here raises because of what arrives.
+    """
+
+    def __init__(self, config: Config, process: str, run_id: str, stop: threading.Event | None = None):
+        """`stop`: when set, a pending `open` gives up with `OpenInterrupted`."""
+        self.config = config
+        self.process = process
+        self.run_id = run_id
+        self.bad = BadMessages()
+        """Where this process counts what it does not obey, and the bus what it does not deliver."""
+        self._stop = stop or threading.Event()
+        self._control: zenoh.Session | None = None
+        self._bulk: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._lock = threading.Lock()
+        self._outgoing: queue.SimpleQueue[tuple[Topic, bytes] | None] = queue.SimpleQueue()
+        self._outgoing_count = 0
+        self._outgoing_bytes = 0
+        self._idle = threading.Condition(self._lock)
+        self._counts: dict[str, int] = {}
+        self._boxes: list[Mailbox] = []
+        self._threads: list[threading.Thread] = []
+        self._queries: queue.Queue[tuple[zenoh.Query, str, Handler] | None] = queue.Queue(PENDING_QUERIES)
+        self._entities: list[Any] = []
+        self._closed = False
+
+    # -- opening and closing -----------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Connect to the router at `config.bus.endpoint`, waiting for it for ever.
+
+        Raises:
+            OpenInterrupted: the stop event was set first.
+            ValueError: the endpoint is not a Zenoh endpoint.
+        """
+        if self._control is not None:
+            raise RuntimeError("this bus is open already")
+        control = self._connect()
+        try:
+            self._bulk = self._connect()
+        except (OpenInterrupted, ValueError):
+            control.close()
+            raise
+        self._control = control
+        for topic in topics.ALL:
+            if topic.writer == self.process:
+                self._publisher(topic)
+        self._start(self._send_bulk, "bulk")
+        self._start(self._answer, "queries")
+
+    def _connect(self) -> zenoh.Session:
+        """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
+        bus = self.config.bus
+        config = session_config("client", bus.endpoint, bus.lease_ms)
+        result: Future[zenoh.Session] = Future()
+
+        def connect() -> None:
+            try:
+                result.set_result(zenoh.open(config))
+            except zenoh.ZError as error:
+                result.set_exception(error)
+
+        threading.Thread(target=connect, name="connect", daemon=True).start()
+        told = False
+        started = clock.now()
+        while not wait_for([result], timeout=0.05).done:
+            if self._stop.is_set():
+                result.add_done_callback(_discard)
+                raise OpenInterrupted(f"stopped while waiting for the router at {bus.endpoint}")
+            if not told and clock.now() - started > 2.0:
+                told = True
+                log.warning(
+                    "no router at %s yet; waiting for it (start it with `tandem router`)", bus.endpoint
+                )
+        try:
+            return result.result()
+        except zenoh.ZError as error:
+            raise ValueError(f"bus.endpoint = {bus.endpoint!r} cannot be used: {error}") from error
+
+    def close(self, drain_s: float = 2.0) -> None:
+        """Send what is left of the bulk lane, for at most `drain_s`, and leave. Safe to call twice."""
+        if self._closed or self._control is None or self._bulk is None:
+            self._closed = True
+            return
+        self.flush(drain_s)
+        with self._lock:
+            self._closed = True
+        self._outgoing.put(None)
+        with contextlib.suppress(queue.Full):
+            self._queries.put_nowait(None)
+        sessions = (self._control, self._bulk)
+
+        def leave() -> None:
+            for session in sessions:
+                session.close()
+
+        # Leaving a link that is full and dead could take long, and the process must end nevertheless.
+        leaving = threading.Thread(target=leave, name="leave", daemon=True)
+        leaving.start()
+        leaving.join(drain_s)
+        for thread in self._threads:
+            thread.join(0.5)
+
+    def __enter__(self) -> Bus:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether both sessions have the router at this moment."""
+        return all(s is not None and bool(list(s.info.routers_zid())) for s in (self._control, self._bulk))
+
+    # -- publishing --------------------------------------------------------------------------------------
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        """Send one message: control at once, bulk by the bulk thread. Never waits for a reader."""
+        payload = codec.encode(message)
+        if len(payload) > topic.max_bytes:
+            self._count(f"not sent, oversized {topic.name}")
+            return
+        if topic.lane == "control":
+            self._put(topic, payload)
+        else:
+            self._enqueue(topic, payload)
+
+    def matched(self, topic: Topic) -> bool:
+        """Whether somebody is subscribed to this topic; a message sent before that reaches nobody."""
+        status: Any = self._publisher(topic).matching_status  # the stub says bool, the object says more
+        return bool(status.matching)
+
+    def flush(self, timeout_s: float) -> bool:
+        """Wait until the bulk lane is empty; False when it is not after `timeout_s`."""
+        with self._idle:
+            return self._idle.wait_for(lambda: self._outgoing_count == 0, timeout_s)
+
+    def _put(self, topic: Topic, payload: bytes) -> None:
+        try:
+            self._publisher(topic).put(payload)
+        except zenoh.ZError as error:
+            if not self._closed and self._count(f"not sent, error {topic.name}") == 1:
+                log.warning("%s could not be sent: %s", topic.name, error)
+            return
+        self._count(f"sent {topic.lane}")
+
+    def _enqueue(self, topic: Topic, payload: bytes) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            if self._outgoing_count >= BULK_MESSAGES or self._outgoing_bytes + len(payload) > BULK_BYTES:
+                self._counts["bulk overflow"] = self._counts.get("bulk overflow", 0) + 1
+                return
+            self._outgoing_count += 1
+            self._outgoing_bytes += len(payload)
+        self._outgoing.put((topic, payload))
+
+    def _send_bulk(self) -> None:
+        while (item := self._outgoing.get()) is not None:
+            topic, payload = item
+            self._put(topic, payload)
+            with self._idle:
+                self._outgoing_count -= 1
+                self._outgoing_bytes -= len(payload)
+                self._idle.notify_all()
+
+    def _publisher(self, topic: Topic) -> zenoh.Publisher:
+        publisher = self._publishers.get(topic.name)
+        if publisher is not None:
+            return publisher
+        control = topic.lane == "control"
+        session = self._session(topic)
+        with self._lock:
+            if topic.name not in self._publishers:
+                self._publishers[topic.name] = session.declare_publisher(
+                    topic.key(self.config.name),
+                    congestion_control=zenoh.CongestionControl.DROP
+                    if control
+                    else zenoh.CongestionControl.BLOCK,
+                    priority=zenoh.Priority.REAL_TIME if control else zenoh.Priority.DATA,
+                    express=control,
+                )
+            return self._publishers[topic.name]
+
+    def _session(self, topic: Topic | None = None) -> zenoh.Session:
+        session = self._control if topic is not None and topic.lane == "control" else self._bulk
+        if session is None:
+            raise RuntimeError("the bus is not open; call open() first")
+        return session
+
+    # -- receiving ---------------------------------------------------------------------------------------
+
+    def latest(self, topic: Topic) -> Latest:
+        """Follow a topic's newest message only."""
+        latest = Latest(topic.name)
+        self._subscribe(self._session(topic), topic.key(self.config.name), latest.put)
+        return latest
+
+    def queue(self, topic: Topic, capacity: int = 1000) -> Mailbox:
+        """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
+        mailbox = self._mailbox(topic.name, capacity)
+        self._subscribe(self._session(topic), topic.key(self.config.name), mailbox.put)
+        return mailbox
+
+    def everything(self, capacity: int = 100_000) -> Mailbox:
+        """Follow all that is published below `tandem/<plant>/`, this process's own messages included."""
+        mailbox = self._mailbox("everything", capacity)
+        self._subscribe(self._session(), topics.everything(self.config.name), mailbox.put)
+        return mailbox
+
+    def _mailbox(self, name: str, capacity: int) -> Mailbox:
+        mailbox = Mailbox(name, capacity)
+        with self._lock:
+            self._boxes.append(mailbox)
+        return mailbox
+
+    def _subscribe(self, session: zenoh.Session, key: str, sink: Sink) -> None:
+        bad = self.bad
+
+        # Runs on the link's receiving thread, so it must be short: a stamp, a copy, an append.
+        def arrived(sample: zenoh.Sample) -> None:
+            received_ns = time.monotonic_ns()
+            key = str(sample.key_expr)
+            topic = topics.topic_of(key)
+            limit = LARGEST if topic is None else topic.max_bytes
+            payload = sample.payload
+            size = len(payload)
+            if size > limit:
+                name = "unknown topic" if topic is None else topic.name
+                bad.count(name, "oversized", f"{size} bytes, at most {limit}")
+            elif sample.kind == zenoh.SampleKind.PUT:
+                sink(Delivery(key, payload.to_bytes(), received_ns))
+
+        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        self._entities.append(session.declare_subscriber(key, callback))
+
+    # -- questions and answers ---------------------------------------------------------------------------
+
+    def serve(self, name: str, handler: Handler) -> None:
+        """Answer queries at `tandem/<plant>/<name>`: `handler(parameters)` gives the payloads to send back.
+
+        The handler runs in the bus's own query thread, one query at a time. A `ValueError` from it is the
+        asker's fault: counted, named once, answered with the text. Queries beyond a few pending ones go
+        unanswered.
+        """
+        key = f"{topics.PREFIX}/{self.config.name}/{name}"
+
+        def arrived(query: zenoh.Query) -> None:
+            try:
+                self._queries.put_nowait((query, key, handler))
+            except queue.Full:
+                self.bad.count(name, "too many queries")
+                query.drop()
+
+        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        self._entities.append(self._session().declare_queryable(key, callback, complete=True))
+
+    def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
+        """Payloads of all answers to a query at `tandem/<plant>/<name>`; [] when nobody answers in time."""
+        key = f"{topics.PREFIX}/{self.config.name}/{name}"
+        answers = Mailbox(f"answers from {name}", capacity=10_000)
+        done = threading.Event()
+
+        def arrived(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                error = reply.err
+                detail = "" if error is None else error.payload.to_bytes()[:300].decode(errors="replace")
+                self.bad.count(name, "answered with an error", detail)
+            elif len(reply.ok.payload) > LARGEST:
+                self.bad.count(name, "oversized", f"{len(reply.ok.payload)} bytes, at most {LARGEST}")
+            else:
+                answers.put(
+                    Delivery(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), time.monotonic_ns())
+                )
+
+        try:
+            self._session().get(
+                zenoh.Selector(key, parameters),
+                zenoh.handlers.Callback(arrived, done.set, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA,
+            )
+        except zenoh.ZError as error:
+            if self._count(f"not asked {name}") == 1:
+                log.warning("%s could not be asked: %s", name, error)
+            return []
+        deadline = clock.now() + timeout_s + 0.2
+        while not done.wait(min(0.1, max(0.0, deadline - clock.now()))):
+            if self._stop.is_set() or clock.now() >= deadline:
+                break
+        return [delivery.payload for delivery in answers.drain()]
+
+    def _answer(self) -> None:
+        while (item := self._queries.get()) is not None:
+            query, key, handler = item
+            pairs: Any = query.parameters  # the stub lacks that it converts to a dict
+            parameters: dict[str, str] = dict(pairs)
+            with query:
+                try:
+                    payloads = handler(parameters)
+                except ValueError as error:
+                    self.bad.count(key.split("/", 2)[2], "bad query", str(error))
+                    query.reply_err(str(error))
+                    continue
+                try:
+                    for payload in payloads:
+                        query.reply(key, payload)
+                except zenoh.ZError:
+                    self._count("answers not sent")
+
+    # -- figures -----------------------------------------------------------------------------------------
+
+    def counters(self) -> dict[str, int]:
+        """What was sent, what was lost here and why, bad messages included; for `Health`."""
+        with self._lock:
+            counts = dict(self._counts)
+            boxes = list(self._boxes)
+        for box in boxes:
+            if box.overflow:
+                counts[f"overflow {box.name}"] = counts.get(f"overflow {box.name}", 0) + box.overflow
+        return counts | self.bad.counters()
+
+    def _count(self, name: str) -> int:
+        with self._lock:
+            self._counts[name] = self._counts.get(name, 0) + 1
+            return self._counts[name]
+
+    def _start(self, target: Callable[[], None], name: str) -> None:
+        thread = threading.Thread(target=target, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()

@@ -1,0 +1,9 @@
+"""Names to choose from in the configuration; apart from it, so that `tandem --help` need not load numpy."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+OracleName = Literal["linear", "l2nw", "dnn"]
+TighteningName = Literal["none", "first_step", "tube"]
+Strategy = Literal["fifo", "reservoir", "novelty"]

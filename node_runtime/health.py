@@ -1,0 +1,120 @@
+"""Tell the others how this process is: `Health` twice a second and at every change, `RunInfo` every 5 s."""
+
+from __future__ import annotations
+
+import platform
+import threading
+import time
+from collections.abc import Callable
+from importlib import metadata
+from types import TracebackType
+
+import msgspec
+
+from node_runtime import config as configuration
+from node_runtime.bus import Bus
+from node_runtime.config import Config
+from protocol import topics
+from protocol.messages import Health, ProcessStatus, RunInfo
+
+HEALTH_PERIOD = 0.5
+RUN_INFO_EVERY = 10
+PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh", "torch", "mcap")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of those of our packages that are installed here."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def run_info(config: Config, process: str, run_id: str, units: dict[str, str] | None = None) -> RunInfo:
+    """What a log needs to know about this process. `units`: of its signals, by name."""
+    return RunInfo(
+        run_id=run_id,
+        seq=0,
+        process=process,
+        config=configuration.to_json(config),
+        versions=versions(),
+        seed=config.seed,
+        units=units or {},
+        unix_time=time.time(),
+    )
+
+
+class HealthPublisher:
+    """A context manager with a small thread of its own. Any thread may call `set`."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        info: RunInfo,
+        counters: Callable[[], dict[str, int]] | None = None,
+        note: str = "",
+    ):
+        """`counters`: the process's own figures, added to the bus's. `note`: stands before all others."""
+        self._bus = bus
+        self._info = info
+        self._counters = counters
+        self._standing_note = note
+        self._status: ProcessStatus = "starting"
+        self._note = ""
+        self._seq = 0
+        self._turns = 0
+        self._lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+
+    def set(self, status: ProcessStatus, note: str = "") -> None:
+        """Change the status or the note, and publish it if it is a change."""
+        with self._lock:
+            changed = (status, note) != (self._status, self._note)
+            self._status, self._note = status, note
+        if changed:
+            self.publish()
+
+    def publish(self) -> None:
+        """Publish the present state now."""
+        own = {} if self._counters is None else self._counters()
+        counters = self._bus.counters() | own
+        with self._lock:
+            health = Health(
+                run_id=self._bus.run_id,
+                seq=self._seq,
+                process=self._bus.process,
+                status=self._status,
+                counters=counters,
+                note="; ".join(filter(None, (self._standing_note, self._note))),
+            )
+            self._seq += 1
+            # Inside the lock, so that the order on the wire is the order of seq.
+            self._bus.publish(topics.HEALTH[self._bus.process], health)
+
+    def _run(self) -> None:
+        while True:
+            if self._turns % RUN_INFO_EVERY == 0:
+                info = msgspec.structs.replace(self._info, seq=self._turns // RUN_INFO_EVERY)
+                self._bus.publish(topics.RUN_INFO[self._bus.process], info)
+            self._turns += 1
+            self.publish()
+            if self._end.wait(HEALTH_PERIOD):
+                return
+
+    def __enter__(self) -> HealthPublisher:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end.set()
+        self._thread.join()
+        if error is not None and kind is not KeyboardInterrupt:
+            self.set("failed", f"{type(error).__name__}: {error}")
+        elif self._status != "failed":
+            self.set("stopping")

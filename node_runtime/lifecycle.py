@@ -1,0 +1,52 @@
+"""Begin and end of a process: run ids, signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from node_runtime import clock
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# Ctrl-C reaches a whole process group, and a supervisor may repeat it at once: still one wish to stop.
+SAME_WISH = 1.0
+
+
+def new_run_id(process: str) -> str:
+    """A fresh name for this incarnation of `process`."""
+    return f"{process}-{uuid.uuid4().hex[:12]}"
+
+
+@contextmanager
+def stopped_by_signals(stop: threading.Event | None = None) -> Iterator[threading.Event]:
+    """Let SIGINT and SIGTERM set the event that is yielded. A signal a second later ends the process at once.
+
+    Outside the main thread signals are left alone: there the owner of `stop` sets it.
+    """
+    event = stop or threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    first: list[float] = []
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        if not first:
+            first.append(clock.now())
+            # Event.set from a handler could wait for a lock that the interrupted code holds.
+            threading.Thread(target=event.set, name="stop", daemon=True).start()
+        elif clock.now() - first[0] > SAME_WISH:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+
+    before = {number: signal.signal(number, handle) for number in SIGNALS}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

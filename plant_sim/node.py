@@ -1,0 +1,116 @@
+"""`tandem plant`: the simulated plant in real time, on the bus."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import numpy as np
+
+from lbmpc.plants import PlantError, get_plant
+from node_runtime import clock
+from node_runtime.bus import Bus, OpenInterrupted
+from node_runtime.config import Config, ConfigError
+from node_runtime.health import HealthPublisher, run_info
+from node_runtime.inbox import Inbox
+from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.pacer import Grid, Pacer
+from node_runtime.realtime import GarbageCollection, punctual
+from plant_sim.plant import PlantSim
+from protocol import topics
+from protocol.messages import Command, InputSource
+
+log = logging.getLogger(__name__)
+
+NOTES: dict[InputSource, str] = {
+    "hold": "held at x0 until the first command",
+    "command": "",
+    "plan": "no fresh command: following the rest of the last plan",
+    "safe": "no fresh command and the plan has ended: safe input",
+}
+
+
+def build(config: Config, run_id: str) -> PlantSim:
+    """The plant that the configuration names. Raises `ConfigError`."""
+    try:
+        plant = get_plant(config.plant.model)
+    except KeyError as error:
+        raise ConfigError(f"plant.model: {error.args[0]}") from None
+    x0 = plant.x0 if config.plant.x0 is None else np.array(config.plant.x0, dtype=float)
+    if x0.shape != plant.x0.shape:
+        raise ConfigError(
+            f"plant.x0 has {len(x0)} entries; {plant.name} has {plant.d} states: {', '.join(plant.states)}"
+        )
+    return PlantSim(plant, config.period, x0, config.plant.plan_patience, run_id)
+
+
+class PlantNode:
+    """Samples on an absolute grid, applies commands at the times they arrived."""
+
+    def __init__(self, sim: PlantSim, bus: Bus, health: HealthPublisher, counts: dict[str, int]):
+        """`counts`: this node's own figures, kept up to date here."""
+        self._sim = sim
+        self._bus = bus
+        self._health = health
+        self._counts = counts
+        self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=sim.plant.d, inputs=sim.plant.m)
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop` is set. Raises `PlantError`."""
+        garbage = GarbageCollection()
+        garbage.begin()
+        pacer = Pacer(Grid(self._sim.period, clock.now() + self._sim.period), stop)
+        while (turn := pacer.next()) is not None:
+            slot, lateness = turn
+            self._take_commands()
+            state = self._sim.sample(slot.time)
+            self._bus.publish(topics.PLANT_STATE, state)
+            self._counts["samples"] += 1
+            self._counts["samples skipped"] += slot.skipped
+            self._counts["samples late"] += lateness > 0.2 * self._sim.period
+            self._counts[f"driven by {state.source}"] += 1
+            self._health.set("running" if self._sim.moving else "ready", NOTES[state.source])
+            garbage.idle()
+            # This period's command is normally here by now: work out the next sample in advance.
+            if not pacer.sleep_until(slot.time + 0.5 * self._sim.period):
+                return
+            self._take_commands()
+            self._sim.prepare(slot.time + self._sim.period)
+
+    def _take_commands(self) -> None:
+        for received in self._commands.take_all():
+            verdict = self._sim.command(received.message, received.arrived)
+            if verdict != "ok":
+                command = received.message
+                detail = (
+                    f"command {command.seq} of {command.run_id} for {command.state_seq}, {command.period} s"
+                )
+                self._bus.bad.count(topics.COMMAND.name, verdict, detail)
+
+
+def main(config: Config, stop: threading.Event | None = None) -> int:
+    """`tandem plant`. 0 when told to stop, 2 for a wrong configuration, 3 when the plant's motion ended."""
+    run_id = new_run_id("plant")
+    try:
+        sim = build(config, run_id)
+    except ConfigError as error:
+        log.error("%s", error)
+        return 2
+    names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
+    counts = dict.fromkeys(names, 0)
+    with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:
+        info = run_info(config, "plant", run_id, sim.plant.units)
+        try:
+            with (
+                Bus(config, "plant", run_id, stopping) as bus,
+                HealthPublisher(bus, info, lambda: counts, note) as health,
+            ):
+                try:
+                    PlantNode(sim, bus, health, counts).run(stopping)
+                except PlantError as error:
+                    log.error("%s", error)
+                    health.set("failed", str(error))
+                    return 3
+        except OpenInterrupted:
+            log.info("stopped before there was a router")
+    return 0

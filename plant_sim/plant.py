@@ -1,0 +1,157 @@
+"""The simulated plant in virtual time: its true motion, driven piecewise by whatever acts on its input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.plants import Plant, Truth
+from plant_sim.watchdog import Orders
+from protocol.messages import Command, InputSource, PlantState
+
+CommandVerdict = Literal["ok", "wrong period", "foreign", "stale"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Segment:
+    """A stretch of time, in seconds, under one input; None while the plant is held."""
+
+    duration: float
+    u: np.ndarray | None
+    source: InputSource
+
+
+class PlantSim:
+    """The plant between its commands and its samples. No clock: every time is an argument, in seconds.
+
+    It is held at x0 until the first command that answers one of its own samples, and moves from then on.
+    Commands act from their arrival; `sample` integrates up to its own time, so a command may be handed in
+    late as long as its arrival time is right. The same calls give the same numbers.
+    """
+
+    def __init__(self, plant: Plant, period: float, x0: np.ndarray, plan_patience: float, run_id: str):
+        """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on."""
+        self.plant = plant
+        self.period = period
+        self.run_id = run_id
+        self._patience = plan_patience
+        self._truth = Truth(plant)
+        self._x = np.array(x0, dtype=float)
+        self._first: float | None = None
+        self._t = -math.inf
+        self._seq = -1
+        self._orders: Orders | None = None
+        self._pending: list[Orders] = []
+        self._memo: dict[tuple[bytes, bytes, float], np.ndarray] = {}
+
+    @property
+    def moving(self) -> bool:
+        """False while held at x0."""
+        return self._orders is not None
+
+    def command(self, command: Command, t: float) -> CommandVerdict:
+        """Let `command` act from time t on, or from the last sample if t lies before it.
+
+        It must have the plant's dimensions (`check_dimensions`). It is refused when its period is not the
+        plant's, when it answers another plant's sample or, while held, none, and when it answers a sample so
+        old that the plan had to take over already.
+        """
+        if not math.isclose(command.period, self.period, rel_tol=1e-6):
+            return "wrong period"
+        if command.state_seq >= 0:
+            if command.state_run_id != self.run_id or command.state_seq > self._seq or self._first is None:
+                return "foreign"
+            age = t - (self._first + command.state_seq * self.period)
+            if age > (1.0 + self._patience) * self.period:
+                return "stale"
+        elif not self.moving and not self._pending:
+            return "foreign"
+        at = max(t, self._t, self._pending[-1].arrived if self._pending else -math.inf)
+        self._pending.append(Orders(self.plant, command, at, self._patience))
+        return "ok"
+
+    def sample(self, t: float) -> PlantState:
+        """x(t) and what acted since the sample before; t must rise by about whole periods.
+
+        `applied` is the time average of the input over the last period, that input itself when only one
+        acted, and None when the plant was held for a part of it or the last sample is not one period ago.
+        `source` is what acted just before t.
+
+        Raises:
+            PlantError: the true motion cannot be followed to t.
+        """
+        applied: list[float] | None = None
+        source: InputSource = "hold"
+        if self._first is None:
+            self._first, self._t = t, t
+        segments, orders = self._motion(t)
+        self._x = self._integrate(segments)
+        if segments:
+            source = segments[-1].source
+            applied = self._applied(segments)
+        self._orders = orders
+        self._pending = [order for order in self._pending if order.arrived > t]
+        self._t = t
+        self._seq = max(self._seq + 1, round((t - self._first) / self.period))
+        self._memo = {}
+        return PlantState(
+            run_id=self.run_id,
+            seq=self._seq,
+            t=t,
+            x=self._x.tolist(),
+            applied=applied,
+            source=source,
+            command_seq=-1 if orders is None else orders.seq,
+        )
+
+    def prepare(self, t: float) -> None:
+        """Integrate ahead to the next sample at t; `sample` is then quick unless another command arrives.
+
+        Changes nothing else. Raises `PlantError` like `sample`.
+        """
+        self._integrate(self._motion(t)[0])
+
+    def _motion(self, end: float) -> tuple[list[_Segment], Orders | None]:
+        """The segments from the last sample to `end`, and the orders that hold from there."""
+        t, orders = self._t, self._orders
+        segments: list[_Segment] = []
+        arriving = [order for order in self._pending if order.arrived <= end]
+        for order in [*arriving, None]:
+            at = end if order is None else order.arrived
+            while t < at:
+                if orders is None:
+                    segments.append(_Segment(at - t, None, "hold"))
+                    break
+                drive = orders.drive(t)
+                until = min(drive.until, at)
+                segments.append(_Segment(until - t, drive.u, drive.source))
+                t = until
+            t, orders = at, order or orders
+        if len(segments) == 1 and math.isclose(segments[0].duration, self.period, rel_tol=1e-6):
+            # Differences of large times are not exact; the period is.
+            segments = [_Segment(self.period, segments[0].u, segments[0].source)]
+        return segments, orders
+
+    def _integrate(self, segments: list[_Segment]) -> np.ndarray:
+        x = self._x
+        for segment in segments:
+            if segment.u is None:
+                continue
+            key = (x.tobytes(), segment.u.tobytes(), segment.duration)
+            if key not in self._memo:
+                self._memo[key] = self._truth.step(x, segment.u, segment.duration)
+            x = self._memo[key]
+        return x
+
+    def _applied(self, segments: list[_Segment]) -> list[float] | None:
+        total = sum(segment.duration for segment in segments)
+        inputs = [segment.u for segment in segments if segment.u is not None]
+        if len(inputs) < len(segments) or not math.isclose(total, self.period, rel_tol=1e-6):
+            return None
+        if all(np.array_equal(u, inputs[0]) for u in inputs):
+            return inputs[0].tolist()
+        durations = np.array([segment.duration for segment in segments])
+        return (durations @ np.array(inputs) / total).tolist()

@@ -1,0 +1,109 @@
+"""`tandem record`: logs everything that is said on the bus of one plant, in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from lbmpc.plants import get_plant
+from node_runtime import clock
+from node_runtime.bus import Bus, Mailbox, OpenInterrupted
+from node_runtime.config import Config
+from node_runtime.health import HealthPublisher, run_info
+from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from protocol import topics
+from run_log.errors import LogError
+from run_log.writer import LogWriter
+
+log = logging.getLogger(__name__)
+
+EXIT_BAD_PATH = 2
+EXIT_NOTHING_WRITTEN = 4
+# After Ctrl-C the other processes still say their last words; listen for that long.
+QUIET_S = 0.25
+LAST_WORDS_S = 1.5
+
+
+def main(config: Config, stop: threading.Event | None = None) -> int:
+    """Record to `config.log.path` until told to stop; then finish the file.
+
+    A disk that is full or read-only stops nobody: it is named in Health and tried again, as long as it takes.
+
+    Returns:
+        0; 2 when the path is taken or the plant unknown; 4 when nothing could ever be written.
+    """
+    with stopped_by_signals(stop) as stopping:
+        try:
+            plant = get_plant(config.plant.model)
+            writer = LogWriter(config.log.path, config, plant, start_ns=time.time_ns(), patient=True)
+        except (LogError, KeyError) as error:
+            log.error("%s", error.args[0])
+            return EXIT_BAD_PATH
+        if writer.error is not None:
+            log.error("%s; trying again every %d ms", writer.error, config.log.flush_ms)
+        run_id = new_run_id("recorder")
+        try:
+            with (
+                Bus(config, "recorder", run_id, stopping) as bus,
+                HealthPublisher(
+                    bus, run_info(config, "recorder", run_id, plant.units), lambda: _counters(writer)
+                ) as health,
+            ):
+                _record(config, writer, bus.everything(), health, stopping)
+        except OpenInterrupted:
+            pass
+        return _finish(writer)
+
+
+def _record(
+    config: Config, writer: LogWriter, mailbox: Mailbox, health: HealthPublisher, stopping: threading.Event
+) -> None:
+    prefix = topics.everything(config.name).removesuffix("**")
+    # Arrival is stamped on the monotonic clock; one offset for the whole run keeps the times in order.
+    to_unix = time.time_ns() - clock.now_ns()
+    flush_s = config.log.flush_ms * 1e-3
+    next_flush = clock.now() + flush_s
+    said: str | None = ""
+    end: float | None = None
+    last_arrival = clock.now()
+    while end is None or clock.now() < min(end, last_arrival + QUIET_S):
+        if end is None and stopping.is_set():
+            end = clock.now() + LAST_WORDS_S
+        delivery = mailbox.get(min(0.1, max(0.0, next_flush - clock.now())))
+        if delivery is not None:
+            last_arrival = clock.now()
+            writer.write(delivery.key.removeprefix(prefix), delivery.payload, delivery.received_ns + to_unix)
+        if clock.now() >= next_flush:
+            writer.flush()
+            next_flush = clock.now() + flush_s
+            if writer.error != said:
+                said = _say(writer, health)
+
+
+def _say(writer: LogWriter, health: HealthPublisher) -> str | None:
+    error = writer.error
+    if error is None:
+        log.info("writing %s", writer.path)
+        health.set("running", f"writing {writer.path}")
+    else:
+        log.error("%s; trying again, %d messages dropped so far", error, writer.counters["dropped"])
+        health.set("running", f"NOT LOGGED: {error}")
+    return error
+
+
+def _finish(writer: LogWriter) -> int:
+    if writer.last_bad is not None:
+        log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
+    try:
+        writer.close()
+    except LogError as error:
+        log.error("%s", error)
+    if writer.written == 0:
+        return EXIT_NOTHING_WRITTEN
+    log.info("%s: %d messages", writer.path, writer.counters["messages"])
+    return 0
+
+
+def _counters(writer: LogWriter) -> dict[str, int]:
+    return {**writer.counters, "write errors": writer.write_errors, "file bytes": writer.written}

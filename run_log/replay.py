@@ -1,0 +1,307 @@
+"""`tandem replay`: a fresh controller, the recorded ticks, and a comparison of all that comes out, byte for byte."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from controller_node.core import ControllerCore
+from node_runtime.config import Config, ConfigError, from_json, override
+from node_runtime.health import versions
+from node_runtime.realtime import one_blas_thread
+from protocol import codec, topics
+from protocol import messages as m
+from protocol.topics import Topic
+from run_log.difference import Difference, first_byte, first_difference
+from run_log.errors import LogError
+from run_log.reader import Entry, Run
+
+NAMED = 8
+"""Tick numbers that a message lists before it says how many more there are."""
+Progress = Callable[[int, int], None]
+
+
+class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a replay found. Equal means: every command, result, output weight and keyframe, every byte."""
+
+    ticks: int
+    """Replayed and compared."""
+    equal: bool
+    first_difference: Difference | None
+    differing_ticks: int
+    largest_difference: float | None
+    """Largest |recorded - replayed| among the inputs of all plans, in units of u; null where plans differ in size."""
+    keyframes: int
+    """Compared."""
+    first_tick: int
+    """Where the replay began: the tick after a keyframe."""
+    run_ids: list[str]
+    notes: list[str]
+    """What a person should know: other versions, changed settings, an incomplete last tick."""
+
+
+@dataclass
+class _Recorded:
+    """One controller run as the log has it, by tick."""
+
+    run_id: str
+    config: Config
+    ticks: dict[int, Entry[m.Tick]]
+    commands: dict[int, Entry[m.Command]]
+    results: dict[int, Entry[m.TickResult]]
+    weights: dict[int, Entry[m.OutputWeights]]
+    keyframes: dict[int, Entry[m.Keyframe]]
+    complete: bool
+    """The log holds the run to its end; if not, its last tick may lack some of its messages."""
+
+    @property
+    def last(self) -> int:
+        ends = [max(found, default=-1) for found in (self.ticks, self.commands, self.results)]
+        return max(ends) if self.complete else min(ends)
+
+
+def replay(
+    run: Run,
+    from_tick: int | None = None,
+    overrides: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> ReplayResult:
+    """Replay every controller run of a log from the log alone.
+
+    Args:
+        run: a log, as read.
+        from_tick: begin at the nearest keyframe before this tick; None: at the first tick.
+        overrides: `section.key=value`, to see what a change would have done.
+        progress: called with (ticks done, ticks in all).
+
+    Raises:
+        LogError: ticks, commands, results or keyframes are missing (named), recorded twice, or do not fit the plant;
+            the log's configuration admits no controller.
+        ConfigError: an override cannot be applied.
+    """
+    recorded = [_collect(run, run_id) for run_id in dict.fromkeys(tick.run_id for tick in run.ticks)]
+    if not recorded:
+        raise LogError(
+            f"{run.path}: holds no tick of a controller; there is nothing to replay{_unreadable(run)}"
+        )
+    if from_tick is not None:
+        inside = [r for r in recorded if 0 <= from_tick <= r.last]
+        if not inside:
+            ranges = ", ".join(f"{min(r.ticks)} to {r.last}" for r in recorded)
+            raise LogError(f"{run.path}: there is no tick {from_tick}; the log has {ranges}")
+        recorded = inside
+    starts = [_start(run, r, from_tick) for r in recorded]
+    for r, start in zip(recorded, starts, strict=True):
+        _refuse_gaps(run, r, start)
+    total = sum(r.last - start for r, start in zip(recorded, starts, strict=True))
+    comparison = _Comparison()
+    for r, start in zip(recorded, starts, strict=True):
+        config = override(r.config, list(overrides)) if overrides else r.config
+        with one_blas_thread():
+            _replay_one(run, r, config, start, bool(overrides), comparison, progress, total)
+    return ReplayResult(
+        ticks=comparison.ticks,
+        equal=comparison.first is None,
+        first_difference=comparison.first,
+        differing_ticks=len(comparison.differing),
+        largest_difference=comparison.largest,
+        keyframes=comparison.keyframes,
+        first_tick=starts[0] + 1,
+        run_ids=[r.run_id for r in recorded],
+        notes=_notes(run, recorded, overrides),
+    )
+
+
+class _Comparison:
+    """Counts what was compared, and keeps the first difference."""
+
+    def __init__(self) -> None:
+        self.ticks = 0
+        self.keyframes = 0
+        self.first: Difference | None = None
+        self.differing: set[tuple[str, int]] = set()
+        self.largest: float | None = 0.0
+
+    def compare(self, entry: Entry[Any], replayed: m.Message, name: str) -> None:
+        payload = codec.encode(replayed)
+        if payload == entry.payload:
+            return
+        self.differing.add((replayed.run_id, replayed.seq))
+        if self.first is None:
+            found = first_difference(entry.message, replayed, name)
+            field, left, right = found or first_byte(entry.payload, payload, name)
+            self.first = Difference(
+                run_id=replayed.run_id, tick=replayed.seq, field=field, recorded=left, replayed=right
+            )
+
+    def measure(self, recorded: m.Command, replayed: m.Command) -> None:
+        a, b = recorded.plan, replayed.plan
+        if self.largest is None or [len(row) for row in a] != [len(row) for row in b]:
+            self.largest = None
+            return
+        self.largest = max(self.largest, float(np.max(np.abs(np.array(a) - np.array(b)), initial=0.0)))
+
+
+def _replay_one(
+    run: Run,
+    recorded: _Recorded,
+    config: Config,
+    start: int,
+    changed: bool,
+    comparison: _Comparison,
+    progress: Progress | None,
+    total: int,
+) -> None:
+    try:
+        core = ControllerCore(config, recorded.run_id)
+    except ConfigError as error:
+        raise (
+            error if changed else LogError(f"{run.path}: its configuration admits no controller: {error}")
+        ) from error
+    _begin(run, recorded, core, start, changed, comparison)
+    for seq in range(start + 1, recorded.last + 1):
+        tick = recorded.ticks[seq].message
+        if tick.state is not None:
+            try:
+                codec.check_dimensions(topics.PLANT_STATE, tick.state, core.plant.d, core.plant.m)
+            except codec.BadMessage as error:
+                raise LogError(f"{run.path}: tick {seq} does not fit the plant: {error}") from error
+        outputs = core.step(tick)
+        comparison.compare(recorded.commands[seq], outputs.command, "command")
+        comparison.measure(recorded.commands[seq].message, outputs.command)
+        comparison.compare(recorded.results[seq], outputs.result, "result")
+        if seq in recorded.weights and outputs.output_weights is not None:
+            comparison.compare(recorded.weights[seq], outputs.output_weights, "output_weights")
+        if seq in recorded.keyframes:
+            comparison.compare(recorded.keyframes[seq], core.keyframe(seq), "keyframe")
+            comparison.keyframes += 1
+        comparison.ticks += 1
+        if progress is not None:
+            progress(comparison.ticks, total)
+
+
+def _begin(
+    run: Run, recorded: _Recorded, core: ControllerCore, start: int, changed: bool, comparison: _Comparison
+) -> None:
+    """Put the core where the log's keyframe says that the controller was."""
+    entry = recorded.keyframes[start]
+    if start == -1:
+        # The memory before the first tick follows from the configuration and the seed: that is compared too.
+        comparison.compare(entry, core.keyframe(-1), "keyframe")
+        comparison.keyframes += 1
+    try:
+        core.restore(entry.message)
+    except ValueError as error:
+        if start == -1:
+            return  # a difference, and already noted; a changed configuration begins with its own memory
+        hint = (
+            "; from the first tick on, the changed configuration begins with a memory of its own"
+            if changed
+            else ""
+        )
+        raise LogError(f"{run.path}: {error}{hint}") from error
+
+
+def _collect(run: Run, run_id: str) -> _Recorded:
+    def by_tick(topic: Topic) -> dict[int, Entry[Any]]:
+        found: dict[int, Entry[Any]] = {}
+        for entry in run.entries(topic):
+            if entry.message.run_id != run_id:
+                continue
+            before = found.setdefault(entry.message.seq, entry)
+            if before.payload != entry.payload:
+                raise LogError(
+                    f"{run.path}: {topic.name} of tick {entry.message.seq} is there twice, and different; "
+                    f"another process spoke as {run_id}, or the log was edited"
+                )
+        return found
+
+    infos = [info for info in run.run_infos if info.run_id == run_id]
+    try:
+        config = from_json(infos[0].config) if infos else run.config
+    except ConfigError as error:
+        raise LogError(f"{run.path}: {error}; the log was made by another version of Tandem") from error
+    said = [health.status for health in run.health if health.run_id == run_id]
+    return _Recorded(
+        run_id=run_id,
+        config=config,
+        ticks=by_tick(topics.TICK),
+        commands=by_tick(topics.COMMAND),
+        results=by_tick(topics.RESULT),
+        weights=by_tick(topics.OUTPUT_WEIGHTS),
+        keyframes=by_tick(topics.KEYFRAME),
+        # A simulation has no health; a live run that ended says so.
+        complete=not (run.truncated or run.recovered) and (not said or "stopping" in said),
+    )
+
+
+def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
+    """The keyframe to begin at."""
+    wanted = 0 if from_tick is None else from_tick
+    before = [seq for seq in recorded.keyframes if seq < wanted]
+    if before:
+        return max(before)
+    later = sorted(seq for seq in recorded.keyframes if seq < recorded.last)
+    way = f"; the first one is after tick {later[0]}: use --from-tick {later[0] + 1}" if later else ""
+    raise LogError(
+        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log, so the controller's memory "
+        f"is not known there{way}{_unreadable(run)}"
+    )
+
+
+def _refuse_gaps(run: Run, recorded: _Recorded, start: int) -> None:
+    expected = range(start + 1, recorded.last + 1)
+    every = recorded.config.controller.keyframe_every
+    end = recorded.last + 1 if recorded.complete else recorded.last
+    keyframes = [seq for seq in range(start + 1, end) if (seq + 1) % every == 0]
+    kinds: list[tuple[str, Sequence[int], dict[int, Any]]] = [
+        ("ticks", expected, recorded.ticks),
+        ("commands", expected, recorded.commands),
+        ("results", expected, recorded.results),
+        ("keyframes", keyframes, recorded.keyframes),
+    ]
+    gaps = []
+    for name, needed, found in kinds:
+        missing = [seq for seq in needed if seq not in found]
+        if missing:
+            more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+            gaps.append(f"{name} {', '.join(map(str, missing[:NAMED]))}{more}")
+    if gaps:
+        raise LogError(
+            f"{run.path}: {recorded.run_id} cannot be replayed, its log has a gap: missing are "
+            f"{'; '.join(gaps)}{_unreadable(run)}"
+        )
+
+
+def _unreadable(run: Run) -> str:
+    if not run.bad:
+        return ""
+    return f". In the log but not readable: {', '.join(f'{n} {what}' for what, n in run.bad.items())}"
+
+
+def _notes(run: Run, recorded: list[_Recorded], overrides: Sequence[str]) -> list[str]:
+    notes = [f"changed: {' '.join(overrides)}"] if overrides else []
+    if run.note:
+        notes.append(run.note)
+    here = versions()
+    for info in run.run_infos:
+        if info.run_id in {r.run_id for r in recorded}:
+            other = [
+                f"{name} {then} (here {here[name]})"
+                for name, then in info.versions.items()
+                if name in here and here[name] != then
+            ]
+            if other:
+                notes.append(
+                    f"recorded with {', '.join(other)}: equal to about 1e-7 at best, not to the byte"
+                )
+    for r in recorded:
+        if not r.complete:
+            notes.append(
+                f"{r.run_id}: the log does not hold the run to its end; replayed up to tick {r.last}"
+            )
+    return notes

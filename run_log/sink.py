@@ -1,0 +1,115 @@
+"""A file that keeps its place when the disk is full.
+
+The MCAP library writes to this as to any file. What the disk refuses stays in memory, in order, and is tried
+again; so when there is room again the file goes on at the very byte where it stopped, and is never corrupt.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from pathlib import Path
+
+from run_log.errors import LogError, LogExistsError
+
+PENDING_LIMIT = 64 * 1024 * 1024
+
+
+class Sink:
+    """An append-only file, created exclusively, with bounded memory for what cannot be written yet.
+
+    Args:
+        path: a file that does not exist yet; missing folders above it are made.
+        patient: False raises `LogError` when the file cannot be created; True goes on trying.
+
+    Raises:
+        LogExistsError: something is at `path` already.
+        LogError: not patient, and the file cannot be created.
+    """
+
+    def __init__(self, path: str | Path, *, patient: bool = False, limit: int = PENDING_LIMIT):
+        self.path = Path(path)
+        self.limit = limit
+        self.error: str | None = None
+        """What went wrong in the last attempt to write; None when it went well."""
+        self.errors = 0
+        self.written = 0
+        """Bytes that the operating system has taken."""
+        self._pending: deque[memoryview] = deque()
+        self._length = 0
+        self._fd: int | None = None
+        self._open()
+        if self._fd is None and not patient:
+            raise LogError(self.error)
+
+    @property
+    def pending(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._length - self.written
+
+    def tell(self) -> int:
+        return self._length
+
+    def write(self, data: bytes) -> None:
+        if data:
+            self._pending.append(memoryview(data))
+            self._length += len(data)
+
+    def flush(self) -> None:
+        self.drain()
+
+    def drain(self) -> bool:
+        """Write all that waits, as far as the disk takes it; True when nothing waits any more."""
+        if self._fd is None:
+            try:
+                self._open()
+            except LogExistsError as error:
+                self._failed(str(error))
+            if self._fd is None:
+                return False
+        try:
+            while self._pending:
+                taken = os.write(self._fd, self._pending[0])
+                self.written += taken
+                if taken == len(self._pending[0]):
+                    self._pending.popleft()
+                else:
+                    self._pending[0] = self._pending[0][taken:]
+        except OSError as error:
+            self._failed(
+                f"{self.path}: cannot be written: {error.strerror}; {self.pending} bytes wait in memory"
+            )
+            return False
+        self.error = None
+        return True
+
+    def close(self) -> bool:
+        """Write what can be written and close; True when the file holds everything."""
+        whole = self.drain()
+        if self._fd is not None:
+            try:
+                os.fsync(self._fd)
+                os.close(self._fd)
+            except OSError as error:
+                self._failed(f"{self.path}: cannot be closed: {error.strerror}")
+                whole = False
+            self._fd = None
+        return whole
+
+    def _open(self) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileExistsError as error:
+            if not os.path.lexists(self.path):
+                self._failed(f"{self.path}: cannot be created: {error.filename} is not a folder")
+                return
+            raise LogExistsError(
+                f"{self.path}: exists already, and a log never overwrites anything; choose another name"
+            ) from error
+        except OSError as error:
+            self._failed(f"{self.path}: cannot be created: {error.strerror}")
+
+    def _failed(self, text: str) -> None:
+        self.error = text
+        self.errors += 1

@@ -1,0 +1,312 @@
+"""`tandem`: the command line. Every command has `--help`, and `--json` for one JSON object on stdout.
+
+Exit codes: 0 it went well; 1 it did not (a replay differs, a process died); 2 what was asked cannot be done
+(a mistake in the arguments, the configuration or the file); 130 interrupted.
+
+What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and the
+controller no torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import Positional, Suppress, UseAppendAction, arg, subcommand
+
+from node_runtime.choices import OracleName, TighteningName
+
+if TYPE_CHECKING:
+    from node_runtime.config import Config
+
+FROM_CONFIG = "(default: the configuration's)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """What every command has."""
+
+    json: bool = False
+    """Print the result as one JSON object on standard output, and nothing else there."""
+
+    def run(self) -> int:
+        """Do it; returns the exit code. Raises `ConfigError` or `Refused` for what cannot be done."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Configured(Command):
+    """A command that reads a configuration."""
+
+    config: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped values)")
+    ] = None
+    """Configuration in TOML; see configs/compressor.toml."""
+    set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
+    """Change one value of the configuration."""
+
+    def flags(self) -> dict[str, tuple[str, Any]]:
+        """Options that stand for a configuration key: option -> (key, value or None)."""
+        return {}
+
+    def resolve(self) -> tuple[Config, dict[str, Any]]:
+        """The configuration: file, then --set, then the command's options. And the tree as it was given."""
+        from node_runtime.config import ConfigError, apply_override, from_tree, load_tree
+
+        tree = load_tree(self.config)
+        origins = {apply_override(tree, text): f"--set {text}" for text in self.set}
+        for option, (key, value) in self.flags().items():
+            if value is not None:
+                *tables, last = key.split(".")
+                table = tree
+                for name in tables:
+                    table = table.setdefault(name, {})
+                    if not isinstance(table, dict):
+                        raise ConfigError(
+                            f"{self.config}: {name} is a table: write [{name}] and its keys below"
+                        )
+                table[last] = value
+                origins[key] = option
+        return from_tree(tree, str(self.config or "configuration"), origins), tree
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(Configured):
+    """Run router, recorder, trainer, plant and controller here, watch them, and leave a log and a picture."""
+
+    seconds: Annotated[float, arg(metavar="S")] = 20.0
+    """How long, counted from the first command."""
+    oracle: Annotated[OracleName | None, arg(metavar="linear|l2nw|dnn", help_behavior_hint=FROM_CONFIG)] = (
+        None
+    )
+    """What the controller learns with."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
+    """Samples a second."""
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
+    """Of everything random."""
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
+    """The log; a file of that name is moved aside, never overwritten. The picture lies beside it."""
+
+    def flags(self) -> dict[str, tuple[str, Any]]:
+        return {
+            "--oracle": ("controller.oracle", self.oracle),
+            "--rate": ("rate", self.rate),
+            "--seed": ("seed", self.seed),
+            "--log": ("log.path", None if self.log is None else str(self.log)),
+        }
+
+    def run(self) -> int:
+        config, given = self.resolve()
+        from tandem import run_command
+
+        return run_command.run(config, self.seconds, "endpoint" in given.get("bus", {}), self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate(Configured):
+    """Controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
+
+    oracle: Annotated[OracleName | None, arg(metavar="linear|l2nw|dnn", help_behavior_hint=FROM_CONFIG)] = (
+        None
+    )
+    """What the controller learns with."""
+    steps: Annotated[int, arg(metavar="INT")] = 200
+    """How many ticks."""
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
+    """Of everything random; the same seed gives the same run, bit for bit."""
+    tightening: Annotated[
+        TighteningName | None, arg(metavar="none|first_step|tube", help_behavior_hint=FROM_CONFIG)
+    ] = None
+    """How the nominal constraints are tightened."""
+    adapt_only: bool = False
+    """Never train the hidden layers; adapt the last one only."""
+    x0: Annotated[
+        list[float] | None, arg(metavar="X...", help_behavior_hint="(default: the plant's own)")
+    ] = None
+    """Initial state, in the plant's own units."""
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
+    """Write the run's log too, in the format of a live run."""
+
+    def flags(self) -> dict[str, tuple[str, Any]]:
+        return {
+            "--oracle": ("controller.oracle", self.oracle),
+            "--seed": ("seed", self.seed),
+            "--tightening": ("controller.tightening", self.tightening),
+            "--adapt-only": ("trainer.enabled", False if self.adapt_only else None),
+            "--x0": ("plant.x0", self.x0),
+        }
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.simulate(config, self.steps, self.adapt_only, self.log, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Command):
+    """Give a log's ticks to a fresh controller and compare every command and keyframe, byte for byte."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """A log that `tandem run` or `tandem simulate --log` wrote."""
+    from_tick: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: the first)")] = None
+    """Start at this tick, from the nearest keyframe before it."""
+    set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
+    """Replay with another value than the log's configuration has."""
+
+    def run(self) -> int:
+        from tandem import commands
+
+        return commands.replay(self.file, self.from_tick, self.set, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a run and tabulate it, from its log alone."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The log."""
+    output: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the log's)")] = None
+    """Where the pictures go."""
+
+    def run(self) -> int:
+        from tandem import commands
+
+        return commands.report(self.file, self.output, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recover(Command):
+    """Make a log whole whose recorder did not end cleanly."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The log; it stays as it is."""
+    output: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: NAME.recovered.mcap)")
+    ] = None
+    """Where the whole log goes."""
+
+    def run(self) -> int:
+        from tandem import commands
+
+        return commands.recover(self.file, self.output, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Router(Configured):
+    """The Zenoh router that all processes are clients of."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.router(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller(Configured):
+    """The controller: one tick a period, latch, solve, command."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.controller(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trainer(Configured):
+    """The trainer: collects samples, trains the hidden layers, sends them. Needs torch, not CasADi."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.trainer(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plant(Configured):
+    """The plant: integrates the truth in real time, applies commands as they arrive."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.plant(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Configured):
+    """The recorder: writes everything on the bus to a log."""
+
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=FROM_CONFIG)] = None
+    """The log; must not exist yet."""
+
+    def flags(self) -> dict[str, tuple[str, Any]]:
+        return {"--log": ("log.path", None if self.log is None else str(self.log))}
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.record(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfigShow(Configured):
+    """Print the whole configuration as it is resolved: file, then --set, then defaults."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import commands
+
+        return commands.config_show(config, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfigCommand:
+    """Work with the configuration."""
+
+    # A union, so that `show` is a word of its own on the command line.
+    action: Annotated[ConfigShow, subcommand("show")] | Annotated[None, Suppress]
+
+
+AnyCommand = (
+    Annotated[Run, subcommand("run")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Replay, subcommand("replay")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[Recover, subcommand("recover")]
+    | Annotated[Router, subcommand("router")]
+    | Annotated[Controller, subcommand("controller")]
+    | Annotated[Trainer, subcommand("trainer")]
+    | Annotated[Plant, subcommand("plant")]
+    | Annotated[Record, subcommand("record")]
+    | Annotated[ConfigCommand, subcommand("config")]
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse, do, and say what is wrong in one message; returns the exit code."""
+    parsed: Any = tyro.cli(
+        AnyCommand,
+        prog="tandem",
+        description="Learning-based model predictive control that learns while it runs.",
+        args=argv,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    command: Command = parsed.action if isinstance(parsed, ConfigCommand) else parsed
+    from node_runtime.config import ConfigError
+    from tandem import terminal
+
+    try:
+        return command.run()
+    except (ConfigError, terminal.Refused) as error:
+        terminal.complain(str(error), command.json)
+        return 2
+    except KeyboardInterrupt:
+        return 130

@@ -1,0 +1,263 @@
+"""Draws a live run: `render` for a terminal, `line` for anything else. Pure: data in, text out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from tandem.monitor import Event, Gauge, ProcessRow, Snapshot
+
+NARROW = 76
+TALL = 28
+BARS = "▁▂▃▄▅▆▇█"
+# Shown before the others, and in this order.
+COUNTERS = ("ticks", "messages", "samples", "trainings", "sent control", "sent bulk")
+
+STATUS_STYLE = {
+    "running": "green",
+    "ready": "green",
+    "starting": "yellow",
+    "stopping": "yellow",
+    "silent": "bold yellow",
+    "not heard of": "dim",
+    "failed": "bold red",
+    "ended": "bold red",
+}
+EVENT_STYLE = {"note": "default", "good": "green", "bad": "bold red"}
+
+
+def render(now: Snapshot, width: int, height: int) -> RenderableType:
+    """The whole view in `width` by `height` cells; leaves out the least important where there is no room."""
+    narrow = width < NARROW
+    parts: list[RenderableType] = [_heading(now, width), _panel("states and input", _gauges(now, width - 4))]
+    loop, learning = _panel("loop", _loop(now)), _panel("learning", _learning(now, width // 2))
+    if narrow:
+        parts += [loop, learning]
+    else:
+        half = Table.grid(expand=True, padding=0)
+        half.add_column(ratio=1)
+        half.add_column(ratio=1)
+        half.add_row(loop, learning)
+        parts.append(half)
+    used = 1 + (len(now.states) + len(now.inputs) + 2) + (16 if narrow else 8)
+    rows = len(now.processes) + 2
+    if used + rows <= height:
+        parts.append(_panel("processes", _processes(now.processes, width - 4)))
+        used += rows
+    room = height - used - 1
+    if room >= 3 and now.events:
+        parts.append(_panel("events", _events(now.events[-(room - 2) :], width - 4)))
+    return Group(*parts)
+
+
+def line(now: Snapshot) -> str:
+    """The same as one line of plain text."""
+    if now.elapsed is None:
+        return "waiting for the first command: " + ", ".join(f"{p.name} {p.status}" for p in now.processes)
+    parts = [
+        f"{now.elapsed:6.1f} s",
+        " ".join(f"{g.name} {_number(g)}" for g in (*now.states, *now.inputs)),
+        f"{now.ticks} ticks, {now.late} late",
+    ]
+    if now.solve_ms:
+        parts.append(f"solve p50 {now.solve_ms[0]:.1f} p99 {now.solve_ms[1]:.1f} ms")
+    if now.prediction_error is not None:
+        parts.append(f"error {now.prediction_error:.1e}")
+    parts.append(f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused)")
+    parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
+    troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
+    return " | ".join(parts + troubled)
+
+
+def _panel(title: str, body: RenderableType) -> Panel:
+    return Panel(body, title=title, title_align="left", border_style="dim", padding=(0, 1))
+
+
+def _heading(now: Snapshot, width: int) -> Text:
+    left = Text.assemble(
+        (" Tandem ", "bold reverse"), f" {now.name}  ", (f"{now.plant}, {now.oracle}, {now.rate:g} Hz", "dim")
+    )
+    if now.elapsed is None:
+        right = Text("waiting for the first command ", "yellow")
+    else:
+        elapsed = min(now.elapsed, now.seconds)
+        cells = max(0, min(30, width - left.cell_len - 22))
+        done = round(cells * elapsed / now.seconds)
+        right = Text.assemble(
+            ("━" * done, "cyan"), ("━" * (cells - done), "dim"), f" {elapsed:5.1f} / {now.seconds:g} s "
+        )
+    left.append(" " * max(1, width - left.cell_len - right.cell_len))
+    left.append_text(right)
+    left.truncate(width)
+    return left
+
+
+def _gauges(now: Snapshot, width: int) -> Table:
+    table = Table.grid(padding=(0, 1))
+    table.add_column(justify="left", style="bold")
+    table.add_column(justify="right")
+    table.add_column(justify="right", style="dim")
+    table.add_column()
+    table.add_column(justify="left", style="dim")
+    table.add_column(justify="left", style="dim")
+    cells = width - 4 - 9 - 9 - 9 - 12 - 6
+    for gauge in (*now.states, *now.inputs):
+        value = "-" if gauge.value is None else _number(gauge)
+        error = "" if gauge.value is None else f"{gauge.value - gauge.target:+.4f}"
+        table.add_row(
+            gauge.name,
+            Text(value, _gauge_style(gauge)),
+            f"{gauge.low:.4g}",
+            _bar(gauge, cells) if cells >= 8 else Text(""),
+            f"{gauge.high:.4g}",
+            f"off by {error}" if width >= NARROW and error else "",
+        )
+    return table
+
+
+def _number(gauge: Gauge) -> str:
+    return "-" if gauge.value is None else f"{gauge.value:.4f}"
+
+
+def _gauge_style(gauge: Gauge) -> str:
+    if gauge.value is None:
+        return "dim"
+    margin = min(gauge.value - gauge.low, gauge.high - gauge.value) / (gauge.high - gauge.low)
+    if margin < -1e-6:
+        return "bold red"
+    if margin < 0.05:
+        return "bold yellow"
+    return "green" if abs(gauge.value - gauge.target) <= 0.02 * (gauge.high - gauge.low) else "default"
+
+
+def _bar(gauge: Gauge, cells: int) -> Text:
+    """low ├────┼───●───┤ high; ┼ is where it should come to rest."""
+
+    def cell(value: float) -> int:
+        return round((cells - 1) * (value - gauge.low) / (gauge.high - gauge.low))
+
+    marks = ["─"] * cells
+    marks[0], marks[-1] = "├", "┤"
+    marks[min(max(cell(gauge.target), 0), cells - 1)] = "┼"
+    text = Text("".join(marks), "dim")
+    if gauge.value is None or not math.isfinite(gauge.value):
+        return text
+    at = cell(gauge.value)
+    mark = "◀" if at < 0 else "▶" if at >= cells else "●"
+    at = min(max(at, 0), cells - 1)
+    return Text.assemble(text[:at], (mark, _gauge_style(gauge)), text[at + 1 :])
+
+
+def _pairs(rows: Sequence[tuple[str, RenderableType]]) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis")
+    for name, value in rows:
+        table.add_row(name, value)
+    return table
+
+
+def _counted(count: int, what: str, style: str = "bold yellow") -> Text:
+    return Text(f"{count} {what}", style if count else "default")
+
+
+def _loop(now: Snapshot) -> Table:
+    rate = "-" if now.measured_rate is None else f"{now.measured_rate:.2f} Hz"
+    source = {"hold": "held at x0", "command": "commands", "plan": "the last plan", "safe": "its safe input"}
+    slack = Text.assemble(
+        f"{now.slack:.1e}" if now.slack else "none", "   ", _counted(now.soft, "soft ticks")
+    )
+    return _pairs(
+        [
+            ("ticks", Text.assemble(f"{now.ticks}   {rate}")),
+            ("punctual", Text.assemble(_counted(now.late, "late"), "   ", _counted(now.skipped, "skipped"))),
+            ("solve", _milliseconds(now.solve_ms)),
+            ("tick", _milliseconds(now.tick_ms)),
+            (
+                "mode",
+                Text.assemble(
+                    (now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"),
+                    "   ",
+                    _counted(now.fallback, "fallback"),
+                    f"   plant: {source.get(now.source, now.source or '-')}",
+                ),
+            ),
+            ("slack", slack),
+        ]
+    )
+
+
+def _milliseconds(values: tuple[float, float] | None) -> str:
+    return "-" if values is None else f"p50 {values[0]:.2f} ms   p99 {values[1]:.2f} ms"
+
+
+def _version(now: Snapshot) -> str:
+    return "initial" if now.weights_version < 0 else str(now.weights_version)
+
+
+def _learning(now: Snapshot, width: int) -> Table:
+    error = "-" if now.prediction_error is None else f"{now.prediction_error:.2e}"
+    loss = "-" if now.loss is None else f"{now.loss[0]:.2e} → {now.loss[1]:.2e}"
+    return _pairs(
+        [
+            ("prediction error", Text(error)),
+            ("second by second", spark(now.trend, max(4, width - 24))),
+            ("hidden weights", Text.assemble(f"version {_version(now)}   {now.adopted} adopted")),
+            ("refused", _counted(now.refused, "sets")),
+            ("training loss", Text(loss)),
+            ("buffer", Text(f"{now.samples} samples")),
+        ]
+    )
+
+
+def spark(values: Sequence[float], cells: int) -> Text:
+    """The last `cells` values as bars, on a logarithmic scale over their own range."""
+    shown = [math.log10(max(value, 1e-12)) for value in values[-cells:]]
+    if not shown:
+        return Text("-")
+    low, high = min(shown), max(shown)
+    steps = [0.0 if high == low else (value - low) / (high - low) for value in shown]
+    return Text("".join(BARS[min(7, int(8 * step))] for step in steps), "cyan")
+
+
+def _processes(rows: Sequence[ProcessRow], width: int) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis", max_width=max(10, width - 30))
+    for row in rows:
+        words = [Text(row.note, "yellow" if row.note else "")] if row.note else []
+        words += [_counter(name, row.counters[name]) for name in _ordered(row.counters)]
+        table.add_row(
+            row.name, Text(row.status, STATUS_STYLE.get(row.status, "default")), Text(", ").join(words)
+        )
+    return table
+
+
+def _counter(name: str, count: int) -> Text:
+    return Text(
+        f"{name} {count}", "bold yellow" if name.startswith(("bad", "overflow", "not sent")) else "dim"
+    )
+
+
+def _ordered(counters: dict[str, int]) -> list[str]:
+    """Trouble first, then the usual figures; zeros are left out."""
+    trouble = sorted(name for name in counters if name.startswith(("bad", "overflow", "not sent")))
+    usual = [name for name in COUNTERS if name in counters]
+    rest = sorted(set(counters) - set(trouble) - set(usual))
+    return [name for name in (*trouble, *usual, *rest) if counters[name]]
+
+
+def _events(events: Sequence[Event], width: int) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(justify="right", style="dim", no_wrap=True)
+    table.add_column(no_wrap=True, overflow="ellipsis", max_width=max(10, width - 12))
+    for event in events:
+        at = "" if event.at < 0 else f"{event.at:.1f} s"
+        table.add_row(at, Text(event.text, EVENT_STYLE[event.weight]))
+    return table

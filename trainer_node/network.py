@@ -1,0 +1,174 @@
+"""The network of protocol/network.py in torch, for training its hidden layers under a fixed output layer.
+
+A layer is (1 + n_{i-1}, n_i) with its bias as the first row. All layers lie one behind the other in a single
+parameter, and the gradient is written out by hand: with layers of this size nearly all the time of a training
+step is the cost of calling torch, and this makes the fewest calls: about half the time of autograd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from protocol.network import Activation, NetworkDescription
+
+# torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
+_ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "softsign": torch.nn.functional.softsign,
+    "softplus": lambda a: torch.nn.functional.softplus(a, threshold=50.0),
+    "relu": torch.relu,
+}
+
+# Each activation's way back, from the gradient g and its value s = psi(a) alone.
+_BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+    "tanh": torch.ops.aten.tanh_backward,
+    "sigmoid": torch.ops.aten.sigmoid_backward,
+    "softsign": lambda g, s: g * (1.0 - s.abs()).square_(),
+    "softplus": lambda g, s: g * torch.expm1(-s).neg_(),
+    "relu": lambda g, s: torch.ops.aten.threshold_backward(g, s, 0.0),
+}
+
+
+class Network(torch.nn.Module):
+    """h_hat(x, u) = output_scale * K' phi(x, u), with W_1..W_{L-1} as its only parameter and K given.
+
+    Args:
+        description: sizes, activations and scaling.
+        dtype: float32 to train; float64 to compare with another implementation.
+        device: where it lives; it cannot be moved afterwards.
+    """
+
+    def __init__(
+        self,
+        description: NetworkDescription,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ):
+        super().__init__()
+        self.description = description
+        self.dtype = dtype
+        self.device = torch.device(device)
+        shapes = description.layer_shapes
+        self.flat = torch.nn.Parameter(self.tensor(np.zeros(sum(rows * columns for rows, columns in shapes))))
+        self._input_scale = self.tensor(description.input_scale)
+        self._output_scale = self.tensor(description.output_scale)
+
+    def tensor(self, values: np.ndarray | list[float]) -> torch.Tensor:
+        """A copy of `values` in this network's dtype, on its device."""
+        return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
+
+    def layers(self, of: torch.Tensor | None = None) -> list[torch.Tensor]:
+        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: views of a gradient of the same layout."""
+        flat = self.flat if of is None else of
+        views, start = [], 0
+        for rows, columns in self.description.layer_shapes:
+            views.append(flat[start : start + rows * columns].view(rows, columns))
+            start += rows * columns
+        return views
+
+    def load(self, hidden: list[np.ndarray]) -> None:
+        """Take over W_1..W_{L-1}. Raises `ValueError` when the shapes are not the description's."""
+        shapes = [tuple(layer.shape) for layer in hidden]
+        if shapes != self.description.layer_shapes:
+            raise ValueError(f"hidden layers have shapes {shapes}, expected {self.description.layer_shapes}")
+        with torch.no_grad():
+            for view, layer in zip(self.layers(), hidden, strict=True):
+                view.copy_(self.tensor(layer))
+
+    def hidden(self) -> list[np.ndarray]:
+        """W_1..W_{L-1} as float64 arrays, (1 + n_{i-1}, n_i) each."""
+        return [layer.detach().cpu().numpy().astype(np.float64) for layer in self.layers()]
+
+    def scaled(self, xu: torch.Tensor) -> torch.Tensor:
+        """(x, u) of shape (M, d + m) in units of `input_scale`."""
+        return xu / self._input_scale
+
+    def features(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        """phi(x, u), (M, 1 + n_L), for x (M, d) and u (M, m) in deviation coordinates and plant units."""
+        psi = self.scaled(torch.cat([x, u], dim=1))
+        for layer, activation in zip(self.layers(), self.description.activations, strict=True):
+            psi = _ACTIVATIONS[activation](torch.addmm(layer[0], psi, layer[1:]))
+        return torch.cat([torch.ones_like(psi[:, :1]), psi], dim=1)
+
+    def forward(self, x: torch.Tensor, u: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+        """h_hat(x, u), (M, d), in units of h, for K of shape (1 + n_L, d)."""
+        return self._output_scale * (self.features(x, u) @ K)
+
+    def scaled_targets(self, h: torch.Tensor) -> torch.Tensor:
+        """h, (M, d), in units of `output_scale`."""
+        return h / self._output_scale
+
+
+class Loss:
+    """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient.
+
+    Args:
+        network: whose hidden layers are trained.
+        xu: (x, u), (M, d + m), plant units.
+        h: (M, d), units of h.
+        K: (1 + n_L, d), fixed; a copy is kept.
+    """
+
+    def __init__(self, network: Network, xu: np.ndarray, h: np.ndarray, K: np.ndarray):
+        self._network = network
+        output = network.tensor(K)
+        self._inputs = network.scaled(network.tensor(xu))
+        # K' phi - h is one fused call when the targets are folded into the bias of the output layer.
+        self._offset = output[0] - network.scaled_targets(network.tensor(h))
+        self._weights = output[1:]
+        self._samples = len(xu)
+        self._back = (2.0 / self._samples) * self._weights.T.contiguous()
+        self._gradient = torch.zeros_like(network.flat, requires_grad=False)
+        self._layers = [
+            _Layer(W[0], W[1:], W[1:].T, dW[0], dW[1:], _ACTIVATIONS[activation], _BACKWARD[activation])
+            for W, dW, activation in zip(
+                network.layers(network.flat.detach()),
+                network.layers(self._gradient),
+                network.description.activations,
+                strict=True,
+            )
+        ]
+
+    def _forward(self) -> tuple[list[torch.Tensor], torch.Tensor]:
+        """The input's and every hidden layer's values without their leading 1, and the residual, (M, d)."""
+        values = [self._inputs]
+        for layer in self._layers:
+            values.append(layer.activation(torch.addmm(layer.bias, values[-1], layer.weights)))
+        return values, torch.addmm(self._offset, values[-1], self._weights)
+
+    @torch.no_grad()
+    def value(self) -> float:
+        """The loss at the present hidden layers."""
+        _, residual = self._forward()
+        return float(residual.square().sum()) / self._samples
+
+    @torch.no_grad()
+    def gradient(self) -> torch.Tensor:
+        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
+        values, residual = self._forward()
+        towards = residual @ self._back
+        for i in reversed(range(len(self._layers))):
+            layer = self._layers[i]
+            delta = layer.backward(towards, values[i + 1])
+            torch.sum(delta, 0, out=layer.bias_gradient)
+            torch.mm(values[i].T, delta, out=layer.weights_gradient)
+            if i:
+                towards = delta @ layer.weights_transposed
+        return self._gradient
+
+
+class _Layer(NamedTuple):
+    """Views into the parameter and its gradient, made once: each costs as much as a small product."""
+
+    bias: torch.Tensor
+    weights: torch.Tensor
+    weights_transposed: torch.Tensor
+    bias_gradient: torch.Tensor
+    weights_gradient: torch.Tensor
+    activation: Callable[[torch.Tensor], torch.Tensor]
+    backward: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]

@@ -1,0 +1,235 @@
+"""The replay buffer: every sample until p_max, then a named rule of replacement."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+
+from node_runtime.config import Strategy
+
+REMEMBERED = 40_000
+"""Sequence numbers remembered for one run: twice what a controller's outbox holds."""
+RUNS = 8
+"""Runs whose sequence numbers are remembered."""
+STALE_LOOKS = 16
+"""Outdated nearest neighbours looked up again in one insertion, at most; keeps it O(capacity)."""
+
+
+class Seen:
+    """Which samples were met before, by (run_id, seq), in bounded memory.
+
+    Of each run the newest `remembered` sequence numbers are kept; older ones count as met.
+    """
+
+    def __init__(self, remembered: int = REMEMBERED, runs: int = RUNS):
+        self._remembered = remembered
+        self._runs = runs
+        self._known: OrderedDict[str, set[int]] = OrderedDict()
+        self._floor: dict[str, int] = {}
+        self._last: dict[str, int] = {}
+
+    def add(self, run_id: str, seq: int) -> bool:
+        """Remember a sample. Returns whether it was new."""
+        known = self._known.get(run_id)
+        if known is None:
+            known = self._known[run_id] = set()
+            self._floor[run_id] = self._last[run_id] = -1
+            while len(self._known) > self._runs:
+                forgotten, _ = self._known.popitem(last=False)
+                del self._floor[forgotten], self._last[forgotten]
+        if seq in known or seq <= self._floor[run_id]:
+            return False
+        known.add(seq)
+        self._last[run_id] = max(self._last[run_id], seq)
+        if len(known) >= 2 * self._remembered:
+            self._floor[run_id] = sorted(known)[-self._remembered - 1]
+            self._known[run_id] = {s for s in known if s > self._floor[run_id]}
+        return True
+
+    def last(self, run_id: str) -> int:
+        """The newest sequence number of a run, -1 when there is none."""
+        return self._last.get(run_id, -1)
+
+
+class ReplayBuffer:
+    """Up to `capacity` samples (x, u, h).
+
+    Strategies, once the buffer is full:
+        fifo: the oldest makes room.
+        reservoir: Vitter's algorithm R; every sample ever offered is kept with the same probability.
+        novelty: of the closest pair among the stored samples and the new one, the younger goes. The distance
+            is Euclidean, (x, u) in units of `scale`. A sample nearer to a stored one than any two stored ones
+            are is not stored, so a plant that settles cannot crowd out how it came there; nor are the labels
+            of a known region renewed, so a plant that changes wants another strategy.
+
+    Args:
+        capacity: p_max.
+        strategy: one of the above.
+        seed: of the reservoir's draws.
+        scale: units of (x, u) that count as 1, (d + m,).
+
+    The same samples in the same order with the same seed leave the same buffer, byte for byte.
+    """
+
+    def __init__(self, capacity: int, strategy: Strategy, seed: int, scale: list[float]):
+        self.capacity = capacity
+        self.strategy: Strategy = strategy
+        self._scale = np.asarray(scale, dtype=np.float64)
+        self._rng = np.random.default_rng([seed, 0x5EED])
+        self._seen = Seen()
+        self._length = 0
+        self._offered = 0
+        self._next = 0
+        self._xu = np.empty((0, len(self._scale)))
+        self._h = np.empty((0, 0))
+        self._pairs: _ClosestPairs | None = None
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def offered(self) -> int:
+        """Different samples ever offered."""
+        return self._offered
+
+    def last(self, run_id: str) -> int:
+        """The newest sequence number met of a run, -1 when there is none."""
+        return self._seen.last(run_id)
+
+    def add(self, run_id: str, seq: int, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> bool:
+        """Offer a sample: x (d,), u (m,), h (d,), all finite. Returns whether it was not met before.
+
+        Raises:
+            ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
+        """
+        xu, h = np.concatenate([x, u]).astype(np.float64), np.asarray(h, dtype=np.float64)
+        expected = self._h.shape[1] if self._length else len(h)
+        if xu.shape != self._scale.shape or h.shape != (expected,):
+            raise ValueError(f"(x, u) has {len(xu)} entries, expected {len(self._scale)}; h has {len(h)}")
+        if not (np.isfinite(xu).all() and np.isfinite(h).all()):
+            raise ValueError("not finite")
+        if not self._seen.add(run_id, seq):
+            return False
+        self._offered += 1
+        slot = self._slot(xu / self._scale)
+        if slot is not None:
+            self._store(slot, xu, h)
+        return True
+
+    def sample(self, M: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """M different samples at random, all when there are fewer: (x, u) (M, d + m), and h (M, d)."""
+        chosen = rng.permutation(self._length)[:M]
+        return self._xu[chosen], self._h[chosen]
+
+    def contents(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copies of all that is stored: (x, u) (len, d + m), and h (len, d)."""
+        return self._xu[: self._length].copy(), self._h[: self._length].copy()
+
+    def _slot(self, scaled: np.ndarray) -> int | None:
+        """Where the sample goes, or None when it is not kept."""
+        if self.strategy == "novelty":
+            if self._pairs is None:
+                self._pairs = _ClosestPairs(self.capacity, len(scaled))
+            return self._pairs.insert(scaled)
+        if self._length < self.capacity:
+            return self._length
+        if self.strategy == "reservoir":
+            drawn = int(self._rng.integers(self._offered))
+            return drawn if drawn < self.capacity else None
+        slot, self._next = self._next, (self._next + 1) % self.capacity
+        return slot
+
+    def _store(self, slot: int, xu: np.ndarray, h: np.ndarray) -> None:
+        if slot >= len(self._xu):
+            room = min(self.capacity, max(256, 2 * len(self._xu)))
+            self._xu = _grown(self._xu, room, len(xu))
+            self._h = _grown(self._h, room, len(h))
+        self._xu[slot], self._h[slot] = xu, h
+        self._length = max(self._length, slot + 1)
+
+
+class _ClosestPairs:
+    """The `novelty` rule: points with their nearest neighbours, O(capacity) for an insertion.
+
+    When a point goes, the distances of those whose nearest neighbour it was become lower bounds, and are
+    looked up again only when they come up as the smallest.
+    """
+
+    def __init__(self, capacity: int, dimensions: int):
+        self._capacity = capacity
+        self._points = np.empty((0, dimensions))
+        self._nearest = np.empty((0, 1))
+        self._neighbour = np.empty((0, 1), dtype=np.int64)
+        self._born = np.empty((0, 1), dtype=np.int64)
+        self._length = 0
+        self._births = 0
+
+    def insert(self, point: np.ndarray) -> int | None:
+        """The slot the point took, or None when it is the younger one of the closest pair."""
+        distances = self._distances(point)
+        if self._length < self._capacity:
+            slot = self._length
+            if slot == len(self._points):
+                room = min(self._capacity, max(256, 2 * slot))
+                self._points = _grown(self._points, room, len(point))
+                self._nearest = _grown(self._nearest, room, 1)
+                self._neighbour = _grown(self._neighbour, room, 1)
+                self._born = _grown(self._born, room, 1)
+            self._length += 1
+        else:
+            one, other = self._closest()
+            if distances.min() <= self._nearest[one, 0]:
+                return None
+            slot = one if self._born[one, 0] > self._born[other, 0] else other
+            orphans = self._neighbour[: self._length, 0] == slot
+            self._neighbour[: self._length, 0][orphans] = -1
+            distances[slot] = np.inf
+        self._place(slot, point, distances)
+        return slot
+
+    def _place(self, slot: int, point: np.ndarray, distances: np.ndarray) -> None:
+        self._points[slot] = point
+        self._born[slot, 0] = self._births
+        self._births += 1
+        nearest, neighbour = self._nearest[: len(distances), 0], self._neighbour[: len(distances), 0]
+        closer = distances < nearest
+        nearest[closer], neighbour[closer] = distances[closer], slot
+        self._settle(slot, distances)
+
+    def _settle(self, slot: int, distances: np.ndarray) -> None:
+        if len(distances) and np.isfinite(distances).any():
+            found = int(distances.argmin())
+            self._nearest[slot, 0], self._neighbour[slot, 0] = distances[found], found
+        else:
+            self._nearest[slot, 0], self._neighbour[slot, 0] = np.inf, -1
+
+    def _closest(self) -> tuple[int, int]:
+        """The closest pair stored. With one point, that point twice."""
+        if self._length == 1:
+            return 0, 0
+        for _ in range(STALE_LOOKS):
+            first = int(self._nearest[: self._length, 0].argmin())
+            if self._neighbour[first, 0] >= 0:
+                break
+            self._look_up(first)
+        else:
+            self._look_up(first)
+        return first, int(self._neighbour[first, 0])
+
+    def _look_up(self, slot: int) -> None:
+        distances = self._distances(self._points[slot])
+        distances[slot] = np.inf
+        self._settle(slot, distances)
+
+    def _distances(self, point: np.ndarray) -> np.ndarray:
+        difference = self._points[: self._length] - point
+        return np.einsum("ij,ij->i", difference, difference)
+
+
+def _grown(array: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """A copy with more rows; what it is not filled with is undefined."""
+    larger = np.empty((rows, columns), dtype=array.dtype)
+    if len(array):
+        larger[: len(array)] = array
+    return larger

@@ -1,0 +1,240 @@
+"""The slow timescale: hidden layers trained on the replay buffer, under output weights held fixed at K_{T_k}.
+
+Pure: no bus, no clock. The same samples and output weights in the same order with the same seed give the same
+hidden layers, bit for bit, on a CPU with one thread (`use_one_thread`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, OrderedDict
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch.optim.adam import adam
+
+from node_runtime.config import TrainerConfig
+from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
+from protocol.network import NetworkDescription, hash_layers, why_unacceptable
+from trainer_node.network import Loss, Network
+from trainer_node.replay_buffer import ReplayBuffer
+
+BASES = 8
+"""Sets of hidden layers remembered, newest last: one of them must be what the controller's K belongs to."""
+
+
+def use_one_thread() -> None:
+    """Make this process train on one CPU thread, which also fixes the order of every sum."""
+    torch.set_num_threads(1)
+
+
+class TrainerError(RuntimeError):
+    """This machine cannot train as it was asked to."""
+
+
+def pick_device(wanted: str) -> torch.device:
+    """Resolve "auto", "cpu" or "cuda". Raises `TrainerError` when CUDA is asked for and not there."""
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise TrainerError(
+            "trainer.device is 'cuda', but torch finds no CUDA device here; use 'auto' or 'cpu', "
+            "or install the NVIDIA driver and a CUDA build of torch"
+        )
+    return torch.device("cuda" if available and wanted != "cpu" else "cpu")
+
+
+class _Kept(Exception):
+    """A training that leaves the hidden layers as they are, and why."""
+
+
+class Trainer:
+    """Collects samples and trains the hidden layers.
+
+    Args:
+        description: the network.
+        config: buffer and training.
+        seed: of the drawn samples and of the reservoir.
+        run_id: this trainer's, written into what it publishes.
+        hidden: W_1..W_{L-1} that the controller holds, (1 + n_{i-1}, n_i) each.
+        version: of `hidden`; the first training's weights get the next one.
+
+    Raises:
+        ValueError: the hidden layers are not acceptable for this network.
+        TrainerError: there is no such device.
+    """
+
+    def __init__(
+        self,
+        description: NetworkDescription,
+        config: TrainerConfig,
+        seed: int,
+        run_id: str,
+        hidden: list[np.ndarray],
+        version: int = 0,
+    ):
+        self.description = description
+        self.config = config
+        self.run_id = run_id
+        self.version = version
+        """Of the newest hidden layers; never falls."""
+        self.counters: Counter[str] = Counter()
+        self.buffer = ReplayBuffer(config.capacity, config.strategy, seed, description.input_scale)
+        self._draws = np.random.default_rng([seed, 0xD8A3])
+        self._network = Network(description, device=pick_device(config.device))
+        self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
+        self._fresh = 0
+        self.resume(hidden, version)
+
+    @property
+    def hidden(self) -> list[np.ndarray]:
+        """The newest hidden layers, float32 values in float64, (1 + n_{i-1}, n_i) each."""
+        return [layer.copy() for layer in self._hidden]
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the newest hidden layers."""
+        return self._sha256
+
+    def resume(self, hidden: list[np.ndarray], version: int = 0) -> None:
+        """Go on from the controller's hidden layers, forgetting what was trained. Samples are kept.
+
+        Args:
+            hidden: W_1..W_{L-1}, (1 + n_{i-1}, n_i) each.
+            version: theirs; whatever is trained next has a higher one.
+
+        Raises:
+            ValueError: they are not acceptable for this network.
+        """
+        why = why_unacceptable(self.description, hidden)
+        if why is not None:
+            raise ValueError(f"the hidden layers cannot be used: {why}")
+        self._bases.clear()
+        self._take(hidden)
+        self.version = max(self.version, version)
+
+    def add(self, run_id: str, samples: Iterable[Sample]) -> int:
+        """Offer samples of one controller run; bad ones are counted, left out. Returns how many are new."""
+        new = 0
+        for sample in samples:
+            try:
+                known = not self.buffer.add(
+                    run_id, sample.seq, np.array(sample.x), np.array(sample.u), np.array(sample.h)
+                )
+            except ValueError:
+                self.counters["bad samples"] += 1
+                continue
+            if known:
+                self.counters["samples met before"] += 1
+            else:
+                new += 1
+        self.counters["samples"] += new
+        self._fresh += new
+        return new
+
+    def due(self) -> bool:
+        """Whether enough new samples came since the last training began."""
+        return self._fresh >= self.config.train_every and len(self.buffer) >= self.config.min_samples
+
+    def knows(self, sha256: str) -> bool:
+        """Whether `train` can start from the hidden layers with this hash."""
+        return sha256 in self._bases
+
+    def train(self, output: OutputWeights, for_run: str) -> HiddenWeights | None:
+        """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
+
+        M samples are drawn from the buffer, and `steps` Adam steps taken on all of them, in float32. Adam
+        starts afresh each time.
+
+        Args:
+            output: K_{T_k}, (1 + n_L, d), and the hash of the hidden layers it was adapted to.
+            for_run: the controller run it came from.
+
+        Returns:
+            The new hidden layers, or None when the old ones stay; `counters["kept: <reason>"]` says why.
+        """
+        self._fresh = 0
+        self.counters["trainings"] += 1
+        try:
+            return self._train(output, for_run)
+        except _Kept as reason:
+            self.counters[f"kept: {reason}"] += 1
+            return None
+
+    def _train(self, output: OutputWeights, for_run: str) -> HiddenWeights:
+        K = output.K.numpy()
+        if K.shape != (self.description.features, self.description.states):
+            raise _Kept("K has the wrong shape")
+        if not np.isfinite(K).all():
+            raise _Kept("K is not finite")
+        if np.abs(K).max() > np.finfo(np.float32).max:
+            raise _Kept("K is too large")
+        base = self._bases.get(output.hidden_sha256)
+        if base is None:
+            raise _Kept("K belongs to unknown hidden weights")
+        if not len(self.buffer):
+            raise _Kept("no samples")
+        xu, h = self.buffer.sample(self.config.batch, self._draws)
+        self._network.load(base)
+        before, after = self._descend(Loss(self._network, xu, h, K))
+        trained = self._network.hidden()
+        why = why_unacceptable(self.description, trained)
+        if why is not None:
+            raise _Kept("norm bound" if "norm" in why else "not finite")
+        if not math.isfinite(after):
+            raise _Kept("not finite")
+        if not after < before:
+            raise _Kept("loss not lower")
+        self._bases.move_to_end(output.hidden_sha256)
+        self._take(trained)
+        self.version += 1
+        self.counters["trained"] += 1
+        return HiddenWeights(
+            run_id=self.run_id,
+            seq=self.version,
+            for_run=for_run,
+            trained_on=output.seq,
+            base_sha256=output.hidden_sha256,
+            samples=len(xu),
+            loss_before=before,
+            loss_after=after,
+            network_sha256=self.description.sha256(),
+            sha256=self._sha256,
+            layers=[Array.of(layer, "<f4") for layer in trained],
+        )
+
+    def _descend(self, loss: Loss) -> tuple[float, float]:
+        """Adam on the network's hidden layers. Returns the losses before and after."""
+        parameter = self._network.flat
+        before = loss.value()
+        with torch.no_grad():
+            moments, squares = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            taken = torch.zeros((), device=parameter.device)
+            for _ in range(self.config.steps):
+                gradient = loss.gradient()
+                # What torch.optim.Adam calls. The class would import the rest of torch, over a second.
+                adam(
+                    [parameter],
+                    [gradient],
+                    [moments],
+                    [squares],
+                    [],
+                    [taken],
+                    fused=True,
+                    amsgrad=False,
+                    beta1=0.9,
+                    beta2=0.999,
+                    lr=self.config.learning_rate,
+                    weight_decay=0.0,
+                    eps=1e-8,
+                    maximize=False,
+                )
+        return before, loss.value()
+
+    def _take(self, hidden: list[np.ndarray]) -> None:
+        self._hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]
+        self._sha256 = hash_layers(self._hidden)
+        self._bases[self._sha256] = self._hidden
+        self._bases.move_to_end(self._sha256)
+        while len(self._bases) > BASES:
+            self._bases.popitem(last=False)
