@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import time
 from dataclasses import dataclass
 from importlib import metadata
 
@@ -17,11 +18,27 @@ import numpy as np
 from controller_node.build import build_controller
 from lbmpc.controller import ControllerState, HiddenSet, Observation, StepResult
 from lbmpc.oracles import DnnOracle
+from lbmpc.solver import Solution, Solver
 from node_runtime.config import Config, to_json
 from protocol import messages as m
 from protocol.network import hash_layers
 
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
+
+
+class _Timed:
+    """A solver, and how long its last solve took: for the log, never for a decision."""
+
+    def __init__(self, solver: Solver):
+        self._solver = solver
+        self.seconds = 0.0
+
+    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
+        before = time.perf_counter()
+        try:
+            return self._solver.solve(x, oracle_parameters, warm_start)
+        finally:
+            self.seconds = time.perf_counter() - before
 
 
 @dataclass(frozen=True)
@@ -48,6 +65,7 @@ class ControllerCore:
     def __init__(self, config: Config, run_id: str):
         self.config, self.run_id = config, run_id
         self.controller = build_controller(config)
+        self._timed = self.controller.solver = _Timed(self.controller.solver)
         self.plant = self.controller.model.plant
         self.state: ControllerState = self.controller.initial_state(config.seed)
         oracle = self.controller.oracle
@@ -57,12 +75,18 @@ class ControllerCore:
 
     def step(self, tick: m.Tick) -> Outputs:
         """One control step. Never raises for what a tick may hold."""
+        self._timed.seconds = 0.0
         seen = self._observe(tick)
         self.state, result = self.controller.step(self.state, seen)
         if result.verdict == "adopted":
             self._hidden_hash = self._hash_hidden()
         command = self._command(tick, result)
         return Outputs(command, self._result(tick, command, result), self._sample(tick, result), self._weights(tick))
+
+    @property
+    def solve_seconds(self) -> float:
+        """What the last step's solve took on this machine; 0 where there was none."""
+        return self._timed.seconds
 
     def keyframe(self, seq: int) -> m.Keyframe:
         """The whole memory after tick `seq`, -1 before the first."""

@@ -7,7 +7,7 @@ learned with the features it was applied under, phi_j, then new hidden weights m
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
-from lbmpc.solver import Solution, Solver
+from lbmpc.solver import Solution
 
 Mode = Literal["solver", "shifted_plan", "feedback"]
 
@@ -101,6 +101,12 @@ class StepResult:
     """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
 
 
+class Solves(Protocol):
+    """The seam to the solver: `lbmpc.solver.Solver`, or whatever stands in its place."""
+
+    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution: ...
+
+
 class Controller:
     """LBMPC with an oracle that learns.
 
@@ -109,7 +115,7 @@ class Controller:
         solver: solves it.
     """
 
-    def __init__(self, problem: Problem, solver: Solver):
+    def __init__(self, problem: Problem, solver: Solves):
         self.problem, self.solver = problem, solver
         self.model: Model = problem.model
         self.oracle = problem.oracle

@@ -11,6 +11,7 @@ from node_runtime.bus import Bus, OpenInterrupted, session_config
 from node_runtime.config import Config
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.realtime import punctual
 
 log = logging.getLogger(__name__)
 
@@ -57,14 +58,15 @@ class Router:
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem router`: route until told to stop. 0, or 1 when the endpoint cannot be listened on."""
-    with stopped_by_signals(stop) as stopping:
+    # Every state and every command passes through here, so the router must be as punctual as the loops.
+    with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:
         try:
             with Router(config) as router:
                 log.info("router listening on %s", config.bus.endpoint)
                 # Its health travels like everybody else's, through a client of itself.
                 with (
                     Bus(config, "router", router.run_id, stopping) as bus,
-                    HealthPublisher(bus, run_info(config, "router", router.run_id)) as health,
+                    HealthPublisher(bus, run_info(config, "router", router.run_id), note=note) as health,
                 ):
                     health.set("running")
                     stopping.wait()

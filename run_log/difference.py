@@ -25,7 +25,7 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def first_difference(recorded: Any, replayed: Any, path: str) -> tuple[str, Shown, Shown] | None:
-    """(field, recorded, replayed) of the first field that differs, or None. Floats are compared bit for bit."""
+    """(field, recorded, replayed) of the first field that differs, or None; floats bit for bit."""
     if isinstance(recorded, Array) and isinstance(replayed, Array):
         return _arrays(recorded, replayed, path)
     if type(recorded) is not type(replayed):

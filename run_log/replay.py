@@ -1,4 +1,4 @@
-"""`tandem replay`: a fresh controller, the recorded ticks, and a comparison of all that comes out, byte for byte."""
+"""`tandem replay`: a fresh controller, the recorded ticks, and all that comes out compared byte for byte."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     first_difference: Difference | None
     differing_ticks: int
     largest_difference: float | None
-    """Largest |recorded - replayed| among the inputs of all plans, in units of u; null where plans differ in size."""
+    """Largest |recorded - replayed| among the inputs of all plans, in units of u; null where sizes differ."""
     keyframes: int
     """Compared."""
     first_tick: int
@@ -79,8 +79,8 @@ def replay(
         progress: called with (ticks done, ticks in all).
 
     Raises:
-        LogError: ticks, commands, results or keyframes are missing (named), recorded twice, or do not fit the plant;
-            the log's configuration admits no controller.
+        LogError: ticks, commands, results or keyframes are missing (named), recorded twice, or do not fit the
+            plant; the log's configuration admits no controller.
         ConfigError: an override cannot be applied.
     """
     recorded = [_collect(run, run_id) for run_id in dict.fromkeys(tick.run_id for tick in run.ticks)]
@@ -248,8 +248,8 @@ def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
     later = sorted(seq for seq in recorded.keyframes if seq < recorded.last)
     way = f"; the first one is after tick {later[0]}: use --from-tick {later[0] + 1}" if later else ""
     raise LogError(
-        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log, so the controller's memory "
-        f"is not known there{way}{_unreadable(run)}"
+        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log, so the controller's "
+        f"memory is not known there{way}{_unreadable(run)}"
     )
 
 

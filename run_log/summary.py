@@ -37,6 +37,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
     ticks: int
     late_ticks: int
+    """Ticks that began late, or ended after their period."""
     skipped_slots: int
     weights_adopted: int
     weights_refused: int
@@ -124,7 +125,7 @@ def summarise(run: Run) -> Summary:
     unsettled = motion.step[(np.abs(deviation) > SETTLED).any(axis=1)]
     return Summary(
         ticks=len(ticks),
-        late_ticks=sum(tick.late for tick in ticks),
+        late_ticks=_late(run.config.period, ticks, timings),
         skipped_slots=sum(tick.skipped for tick in ticks),
         weights_adopted=sum(r.weights_verdict == "adopted" for r in results),
         weights_refused=sum(r.weights_verdict.startswith("refused") for r in results),
@@ -172,6 +173,11 @@ def _spread(values: list[float]) -> Spread | None:
     if not values:
         return None
     return Spread(float(np.percentile(values, 50)), float(np.percentile(values, 99)), max(values))
+
+
+def _late(period: float, ticks: list[m.Tick], timings: list[m.TickTiming]) -> int:
+    overrun = {(t.run_id, t.seq) for t in timings if t.lateness_ms + t.tick_ms > period * 1e3}
+    return sum(tick.late or (tick.run_id, tick.seq) in overrun for tick in ticks)
 
 
 def _prediction_error(period: float, ticks: list[m.Tick], results: list[m.TickResult]) -> PredictionError:

@@ -299,7 +299,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args=argv,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    command: Command = parsed.action if isinstance(parsed, ConfigCommand) else parsed
+    command: Command = getattr(parsed, "action", parsed)
     from node_runtime.config import ConfigError
     from tandem import terminal
 

@@ -6,13 +6,17 @@ import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from node_runtime.config import Config, to_toml, to_tree
 from tandem import terminal
 from tandem.terminal import Refused
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
 
 Main = Callable[[Config], int]
 
@@ -84,8 +88,6 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
         raise Refused(f"--steps {steps}: at least 1")
     if log is not None and log.exists():
         raise Refused(f"{log}: exists already, and a log never overwrites anything; choose another name")
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from lbmpc.plants import PlantError
     from run_log.summary import summarise
     from tandem import figures
@@ -94,16 +96,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
     plant_of(config)
     console = terminal.console(as_json)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-    )
-    with bar:
+    with _progress(console) as bar:
         task = bar.add_task(f"simulating, {config.controller.oracle}", total=steps)
         try:
             ran = lock_step(
@@ -126,7 +119,39 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
 def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: bool) -> int:
     """0 when every command and keyframe is equal, 1 when one differs."""
-    raise NotImplementedError
+    with _log_packages():
+        from run_log.errors import LogError
+        from run_log.reader import read_run
+        from run_log.replay import replay as replay_run
+
+    console = terminal.console(as_json)
+    try:
+        ran = read_run(file)
+        with _progress(console) as bar:
+            task = bar.add_task("replaying", total=None)
+            found = replay_run(
+                ran, from_tick, assignments, lambda done, total: bar.update(task, completed=done, total=total)
+            )
+    except LogError as error:
+        raise Refused(str(error)) from error
+    if found.equal:
+        text = f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
+        console.print(text, style="green", markup=False, soft_wrap=True)
+    else:
+        console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+    first = found.first_difference
+    if first is not None:
+        text = (
+            f"first at tick {first.tick}: {first.field} recorded {first.recorded}, replayed {first.replayed}"
+        )
+        console.print(text, markup=False, soft_wrap=True)
+    if not found.equal and found.largest_difference is not None:
+        console.print(f"largest difference of an input: {found.largest_difference:.3g}", markup=False)
+    for note in found.notes:
+        console.print(f"note: {note}", style="yellow", markup=False, soft_wrap=True)
+    if as_json:
+        terminal.emit(msgspec.to_builtins(found))
+    return 0 if found.equal else 1
 
 
 def report(file: Path, folder: Path | None, as_json: bool) -> int:
@@ -193,6 +218,21 @@ def config_show(config: Config, as_json: bool) -> int:
     else:
         sys.stdout.write(to_toml(config))
     return 0
+
+
+def _progress(console: Console) -> Progress:
+    """A progress bar, on a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+    )
 
 
 class _log_packages:

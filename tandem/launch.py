@@ -162,6 +162,9 @@ class Supervisor:
                 said = self.monitor.status(name)
                 raise self._not_ready(child, f"its last word was {said!r}" if said else "it said nothing")
             self._listen()
+        if not self.wish.stop:
+            now = time.monotonic()
+            self.monitor.say(f"{name} ready after {now - self._started_at[name]:.1f} s", now)
 
     def _fail_if_dead(self, *names: str) -> None:
         for name in names:

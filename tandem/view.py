@@ -197,7 +197,7 @@ def _milliseconds(values: tuple[float, float] | None) -> str:
 
 
 def _version(now: Snapshot) -> str:
-    return "initial" if now.weights_version < 0 else str(now.weights_version)
+    return "initial" if now.weights_version <= 0 else str(now.weights_version)
 
 
 def _learning(now: Snapshot, width: int) -> Table:

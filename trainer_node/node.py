@@ -43,7 +43,17 @@ HIDDEN_ANSWER = Topic(topics.HIDDEN_QUERY, m.HiddenSnapshot, "bulk", "controller
 OUTBOX_ANSWER = Topic(topics.OUTBOX_QUERY, m.Samples, "bulk", "controller", topics.SAMPLES.max_bytes)
 
 _Answer = TypeVar("_Answer", m.HiddenSnapshot, m.Samples)
-NAMES = ("samples", "buffer", "trainings", "published", "adopted", "not adopted", "gaps filled", "joined")
+NAMES = (
+    "samples",
+    "buffer",
+    "trainings",
+    "published",
+    "adopted",
+    "not adopted",
+    "gaps filled",
+    "joined",
+    "samples of other runs",
+)
 WAITING = "waiting for a controller with a network"
 
 
@@ -62,7 +72,7 @@ class TrainerNode:
         self._trainer: Trainer | None = None
         self._run = ""
         self._output: m.OutputWeights | None = None
-        self._join_wanted = True
+        self._resync = False
         self._join_at = 0.0
         self._gap: int | None = None
         self._refill_at = 0.0
@@ -84,7 +94,7 @@ class TrainerNode:
         received = self._outputs.take()
         if received is not None:
             self._follow(received.message, now)
-        if self._join_wanted and now >= self._join_at:
+        if self._must_join() and now >= self._join_at:
             self._join_at = now + JOIN_EVERY
             self._join()
         for batch in self._samples.take_all():
@@ -103,14 +113,14 @@ class TrainerNode:
         """Take note of the newest K, and of whether the controller holds the hidden layers it was sent."""
         self._output = output
         if self._trainer is None or output.run_id != self._run:
-            self._join_wanted = True
-        elif output.hidden_sha256 == self._trainer.sha256:
+            return
+        if output.hidden_sha256 == self._trainer.sha256:
             if self._unadopted_since is not None:
                 self._count("adopted")
             self._unadopted_since = None
         elif self._unadopted_since is None:
             self._unadopted_since = now
-        elif now - self._unadopted_since > self._patience and not self._join_wanted:
+        elif now - self._unadopted_since > self._patience and not self._resync:
             # Refused, lost on the way, or another trainer's were adopted: what the controller holds is right.
             self._count("not adopted")
             log.warning(
@@ -118,10 +128,16 @@ class TrainerNode:
                 output.hidden_version,
                 self._trainer.version,
             )
-            self._join_wanted = True
+            self._resync = True
+
+    def _must_join(self) -> bool:
+        """Whether the hidden layers here are not, or may not be, those of the controller that sends K."""
+        if self._trainer is None or self._resync:
+            return True
+        return self._output is not None and self._output.run_id != self._run
 
     def _join(self) -> None:
-        """Take over the hidden layers of the controller that sends K; before that, of any one that answers."""
+        """Take over the hidden layers of the controller that sends K; before that, of any that answers."""
         sender = None if self._output is None else self._output.run_id
         for payload in self._bus.ask(topics.HIDDEN_QUERY, {}, ASK_TIMEOUT):
             snapshot = self._decode(HIDDEN_ANSWER, payload, m.HiddenSnapshot)
@@ -153,7 +169,7 @@ class TrainerNode:
         self._trainer, self._run = trainer, snapshot.run_id
         if self._output is not None and self._output.run_id != self._run:
             self._output = None
-        self._join_wanted, self._unadopted_since = False, None
+        self._resync, self._unadopted_since = False, None
         self._gap, self._refill_at = trainer.buffer.last(self._run), 0.0
         self._count("joined")
         log.info("following %s, hidden weights version %d", self._run, snapshot.hidden_version)
@@ -165,8 +181,8 @@ class TrainerNode:
     def _merge(self, batch: m.Samples) -> None:
         """Add live samples. Where one may have been lost before them, the outbox will be asked."""
         if self._trainer is None or batch.run_id != self._run:
-            # Not lost: joining that run asks its outbox for all of them.
-            self._join_wanted = True
+            # Not lost: once that run's K has come, joining it asks its outbox for all of them.
+            self._count("samples of other runs")
             return
         last = self._trainer.buffer.last(self._run)
         # Ticks that the controller missed leave gaps too; then the outbox has nothing more either.
@@ -211,8 +227,7 @@ class TrainerNode:
         return (
             trainer is not None
             and output is not None
-            and not self._join_wanted
-            and output.run_id == self._run
+            and not self._must_join()
             and output.hidden_sha256 == trainer.sha256
             and trainer.due()
         )
