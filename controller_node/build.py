@@ -41,7 +41,7 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
         hidden=config.network.hidden,
         activations=[config.network.activation] * len(config.network.hidden),
         input_scale=half_widths.tolist(),
-        output_scale=[config.network.output_scale] * plant.d,
+        output_scale=[config.network.output_scale * config.period] * plant.d,
         max_layer_norm=config.network.max_layer_norm,
     )
 
@@ -58,13 +58,17 @@ def build_oracle(config: Config, plant: Plant) -> Oracle:
             raise ConfigError(f"l2nw.variables: {unknown or 'empty'}; choose from {', '.join(names)}")
         indices = tuple(names.index(name) for name in chosen)
         settings = config.l2nw
-        return L2nwOracle(plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation)
+        return L2nwOracle(
+            plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation
+        )
     try:
         description = describe_network(config, plant)
     except ValueError as error:
         raise ConfigError(f"network: {error}") from error
-    adaptation = config.adaptation
-    return DnnOracle(description, adaptation.gamma, adaptation.column_bound, adaptation.initial_scale)
+    adaptation, period = config.adaptation, config.period
+    return DnnOracle(
+        description, adaptation.gamma, adaptation.column_bound * period, adaptation.initial_scale * period
+    )
 
 
 def build_controller(config: Config) -> Controller:

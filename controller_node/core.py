@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 
 from controller_node.build import build_controller
-from lbmpc.controller import ControllerState, HiddenSet, Observation, StepResult
+from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
-from lbmpc.solver import Solution, Solver
+from lbmpc.solution import Solution
 from node_runtime.config import Config, to_json
 from protocol import messages as m
 from protocol.network import hash_layers
@@ -29,7 +29,7 @@ PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "ec
 class _Timed:
     """A solver, and how long its last solve took: for the log, never for a decision."""
 
-    def __init__(self, solver: Solver):
+    def __init__(self, solver: Solves):
         self._solver = solver
         self.seconds = 0.0
 
@@ -81,7 +81,9 @@ class ControllerCore:
         if result.verdict == "adopted":
             self._hidden_hash = self._hash_hidden()
         command = self._command(tick, result)
-        return Outputs(command, self._result(tick, command, result), self._sample(tick, result), self._weights(tick))
+        return Outputs(
+            command, self._result(tick, command, result), self._sample(tick, result), self._weights(tick)
+        )
 
     @property
     def solve_seconds(self) -> float:
@@ -90,8 +92,10 @@ class ControllerCore:
 
     def keyframe(self, seq: int) -> m.Keyframe:
         """The whole memory after tick `seq`, -1 before the first."""
-        kinds = {"i": "<i8", "f": "<f8"}
-        arrays = {name: m.Array.of(a, kinds[a.dtype.kind]) for name, a in self.state.to_arrays().items()}
+        arrays = {
+            name: m.Array.of(array, "<i8" if array.dtype.kind == "i" else "<f8")
+            for name, array in self.state.to_arrays().items()
+        }
         return m.Keyframe(run_id=self.run_id, seq=seq, arrays=arrays)
 
     def restore(self, keyframe: m.Keyframe) -> None:
@@ -104,7 +108,9 @@ class ControllerCore:
         expected = self.state.to_arrays()
         for name in sorted(expected.keys() | arrays.keys()):
             if name not in arrays or name not in expected or arrays[name].shape != expected[name].shape:
-                raise ValueError(f"the keyframe of tick {keyframe.seq} does not fit this configuration: array {name}")
+                raise ValueError(
+                    f"the keyframe of tick {keyframe.seq} does not fit this configuration: array {name}"
+                )
         self.state = ControllerState.from_arrays(arrays)
         self._hidden_hash = self._hash_hidden()
 

@@ -16,7 +16,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
-from lbmpc.solver import Solution
+from lbmpc.solution import Solution
 
 Mode = Literal["solver", "shifted_plan", "feedback"]
 
@@ -73,7 +73,9 @@ class ControllerState:
         """Raises KeyError when an array is missing."""
         source, sequence = (int(value) for value in arrays["pending"])
         prefix = "oracle."
-        oracle = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        oracle = {
+            name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
+        }
         plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
         return cls(plan, arrays["pending.x"], (source, sequence), oracle)
 

@@ -13,7 +13,6 @@ the nominal states move with w. No Hessian is formed and nothing is factorised b
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle
@@ -45,7 +44,9 @@ def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
 
     slopes = oracle.jacobian(ca.vertcat(z[:, :n], v), parts)
     # Column i of the k-th slope is the k-th column of the Jacobian at stage i.
-    stages = [ca.horzcat(*columns) for columns in zip(*(ca.horzsplit(slope) for slope in slopes), strict=True)]
+    stages = [
+        ca.horzcat(*columns) for columns in zip(*(ca.horzsplit(slope) for slope in slopes), strict=True)
+    ]
     a_i = [a + stage_slope[:, :d] for stage_slope in stages]
     b_i = [b + stage_slope[:, d:] for stage_slope in stages]
 
@@ -72,7 +73,10 @@ def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
         [x, v, theta, xr, ur],
         [
             cost,
-            *(ca.densify(ca.horzcat(*blocks)) for blocks in (minimiser, nominal_states, a_i, b_i, gains, inverses)),
+            *(
+                ca.densify(ca.horzcat(*blocks))
+                for blocks in (minimiser, nominal_states, a_i, b_i, gains, inverses)
+            ),
         ],
         ["x", "v", "theta", "xr", "ur"],
         ["cost", "vs", "zs", "A", "B", "K", "L"],
@@ -130,31 +134,11 @@ def _riccati_stage(d: int, m: int, q: ca.DM, r: ca.DM) -> ca.Function:
     return ca.Function(
         "riccati",
         [p_matrix, p_vector, a, b, gradient_z, gradient_v],
-        [0.5 * (previous + previous.T), gradient_z + a.T @ p_vector - half.T @ residual, gain, offset, inverse],
+        [
+            0.5 * (previous + previous.T),
+            gradient_z + a.T @ p_vector - half.T @ residual,
+            gain,
+            offset,
+            inverse,
+        ],
     )
-
-
-class Bound:
-    """A CasADi function called on arrays that stay where they are: no conversion, no allocation.
-
-    `inputs[name]` and `outputs[name]` are Fortran-ordered numpy arrays shared with CasADi; write, call, read.
-    """
-
-    def __init__(self, function: ca.Function):
-        self.function = function
-        self._buffer, self._evaluate = function.buffer()
-        self.inputs: dict[str, np.ndarray] = {}
-        self.outputs: dict[str, np.ndarray] = {}
-        for i, name in enumerate(function.name_in()):
-            self.inputs[name] = self._array(function.size_in(i))
-            self._buffer.set_arg(i, memoryview(self.inputs[name].ravel(order="K")))
-        for i, name in enumerate(function.name_out()):
-            self.outputs[name] = self._array(function.size_out(i))
-            self._buffer.set_res(i, memoryview(self.outputs[name].ravel(order="K")))
-
-    @staticmethod
-    def _array(shape: tuple[int, int]) -> np.ndarray:
-        return np.zeros(shape, order="F")
-
-    def __call__(self) -> None:
-        self._evaluate()

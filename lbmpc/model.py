@@ -101,7 +101,9 @@ def build_model(
     closed = a + b @ k
     radius = float(np.abs(np.linalg.eigvals(closed)).max())
     if radius >= 1.0:
-        raise ModelError(f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})")
+        raise ModelError(
+            f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})"
+        )
     p = solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
     return Model(plant, period, a, b, q, r, k, 0.5 * (p + p.T))
 

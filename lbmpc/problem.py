@@ -60,8 +60,8 @@ def input_set(model: Model) -> Polytope:
 
 
 def disturbance_set(model: Model, half_widths: np.ndarray | None = None) -> Polytope:
-    """W as a box; the plant's own half-widths (d,) by default."""
-    w = np.asarray(model.plant.W if half_widths is None else half_widths, dtype=float)
+    """W as a box of half-widths (d,); by default the plant's own, which grow with the period as h does."""
+    w = np.asarray(model.plant.W * model.period if half_widths is None else half_widths, dtype=float)
     if w.shape != (model.d,):
         raise EmptySetError(f"W has {w.size} half-widths, the plant has {model.d} states")
     return Polytope.box(-w, w, tuple(f"w_{name}" for name in model.plant.states))

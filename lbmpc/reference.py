@@ -7,7 +7,7 @@ import numpy as np
 
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
-from lbmpc.solver import Solution, Status
+from lbmpc.solution import Solution, Status
 
 
 class ReferenceSolver:
@@ -35,11 +35,17 @@ class ReferenceSolver:
         cost += 0.5 * ca.bilin(p, z, z)
         values = ca.vertcat(*values_v, *values_z, ca.DM(rows.terminal_rows) @ nominal)
         count = rows.count_inputs
-        slack = ca.DM(rows.penalty.scale[count:]) * e if problem.soft else ca.DM.zeros(values.shape[0] - count)
+        slack = (
+            ca.DM(rows.penalty.scale[count:]) * e if problem.soft else ca.DM.zeros(values.shape[0] - count)
+        )
         cost += problem.penalty * ca.sum1(e + 0.5 * e**2)
         g = ca.vertcat(values[:count], values[count:] - slack, values[count:] + slack)
-        self._lower = np.concatenate([rows.lower[:count], np.full(len(rows.lower) - count, -np.inf), rows.lower[count:]])
-        self._upper = np.concatenate([rows.upper[:count], rows.upper[count:], np.full(len(rows.upper) - count, np.inf)])
+        self._lower = np.concatenate(
+            [rows.lower[:count], np.full(len(rows.lower) - count, -np.inf), rows.lower[count:]]
+        )
+        self._upper = np.concatenate(
+            [rows.upper[:count], rows.upper[count:], np.full(len(rows.upper) - count, np.inf)]
+        )
         options = {
             "ipopt.print_level": 0,
             "print_time": False,
@@ -51,7 +57,9 @@ class ReferenceSolver:
             "ipopt.max_iter": 500,
         }
         decision = ca.vertcat(ca.vec(v), e)
-        self._solver = ca.nlpsol("r", "ipopt", {"x": decision, "f": cost, "g": g, "p": ca.vertcat(x, theta)}, options)
+        self._solver = ca.nlpsol(
+            "r", "ipopt", {"x": decision, "f": cost, "g": g, "p": ca.vertcat(x, theta)}, options
+        )
         self._lbx = np.concatenate([np.full(m * n, -np.inf), np.zeros(e.shape[0])])
 
     def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
@@ -59,7 +67,11 @@ class ReferenceSolver:
         n, m = self.problem.horizon, self.problem.model.m
         guess = np.concatenate([np.ravel(warm_start), np.full(len(self._lbx) - n * m, 1e-3)])
         result = self._solver(
-            x0=guess, p=np.concatenate([x, oracle_parameters]), lbg=self._lower, ubg=self._upper, lbx=self._lbx
+            x0=guess,
+            p=np.concatenate([x, oracle_parameters]),
+            lbg=self._lower,
+            ubg=self._upper,
+            lbx=self._lbx,
         )
         v = np.array(result["x"]).ravel()[: n * m].reshape(n, m)
         zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)

@@ -33,7 +33,9 @@ class Rows:
         scale[self.count_inputs : self.count_inputs + common * n] = plain
         soft = np.arange(len(self.lower)) >= self.count_inputs
         self.penalty = Penalty(soft, scale, problem.penalty)
-        self.names = [f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names]
+        self.names = [
+            f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
+        ]
 
     def clip(self, v: np.ndarray) -> np.ndarray:
         """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""

@@ -7,54 +7,21 @@ constraint. An oracle whose numbers cannot be used at all is set aside for that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 
 import numpy as np
 
-from lbmpc.kernels import Bound, build_rows, build_sweep
+from lbmpc.bound import Bound
+from lbmpc.kernels import build_rows, build_sweep
 from lbmpc.least_distance import PRIMAL_TOLERANCE, least_distance, violation
 from lbmpc.oracles.base import LinearOracle, Oracle
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
+from lbmpc.solution import Solution, Status
 
 # Above the QP's own tolerance; what a hard row may be off by before a solution is refused.
 HARD_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
-
-
-class Status(StrEnum):
-    """How a solve ended. All but NUMERICAL come with inputs that keep every constraint that can be kept."""
-
-    CONVERGED = "converged"
-    ITERATION_LIMIT = "iteration limit"
-    INFEASIBLE = "infeasible"
-    """Hard state constraints cannot be met from x_t; the solution violates them as little as possible."""
-    ORACLE_REFUSED = "oracle refused"
-    """The oracle's numbers were unusable; solved with the nominal model."""
-    NUMERICAL = "numerical failure"
-    """No usable inputs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Outcome of one solve, in deviation coordinates.
-
-    v is (N, m), zbar (N, d) the nominal states zbar_1..zbar_N. `slack` is the largest state-row violation of zbar in
-    that row's units, 0 when all are kept, and `slack_row` names it ("y at step 3").
-    """
-
-    status: Status
-    v: np.ndarray
-    zbar: np.ndarray
-    cost: float
-    iterations: int
-    slack: float
-    slack_row: str
-
-    @property
-    def usable(self) -> bool:
-        return self.status is not Status.NUMERICAL
 
 
 class Solver:
@@ -123,7 +90,8 @@ class Solver:
         status = Status.ITERATION_LIMIT
         self._evaluate(sweep, x, v)
         iterations = 0
-        for iterations in range(1, self.max_iterations + 1):
+        while iterations < self.max_iterations:
+            iterations += 1
             target, feasible = self._subproblem(sweep)
             if target is None:
                 break
@@ -183,7 +151,9 @@ class Solver:
         """zbar_1..zbar_N under inputs v, (d, N)."""
         return (self._free @ x + self._forced @ v.ravel()).reshape(len(v), -1).T
 
-    def _finish(self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int) -> Solution:
+    def _finish(
+        self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int
+    ) -> Solution:
         zbar = self._nominal(x, v)
         values = self._rows.values(v.T, zbar)
         slack, slack_row = self._rows.slack(values)

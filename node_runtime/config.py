@@ -59,7 +59,7 @@ class ControllerConfig(Section, frozen=True):
     oracle: OracleName = "dnn"
     tightening: TighteningName = "first_step"
     W: list[NonNegative] | None = None
-    """Half-widths of the disturbance box used for tightening; None: the plant's own."""
+    """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
     Q: list[NonNegative] | None = None
     """Diagonal state weights; None: ones."""
     R: list[Positive] | None = None
@@ -77,18 +77,18 @@ class NetworkConfig(Section, frozen=True):
     hidden: list[Width] = msgspec.field(default_factory=lambda: [64, 64])
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
-    output_scale: Positive = 0.01
-    """Units of h that count as 1 for the network."""
+    output_scale: Positive = 0.2
+    """h per second of period that counts as 1 for the network: h of a sampled plant grows with the period."""
     max_layer_norm: Positive = 100.0
 
 
 class AdaptationConfig(Section, frozen=True):
     gamma: Unit = 0.8
     """Learning rate of the last layer, 0 < gamma < 1."""
-    column_bound: Positive = 0.05
-    """Bound on the norm of each column of K, in units of h."""
-    initial_scale: NonNegative = 3e-4
-    """Standard deviation of the entries of K_0, in units of h."""
+    column_bound: Positive = 1.0
+    """Bound on the norm of each column of K, as h per second of period."""
+    initial_scale: NonNegative = 6e-3
+    """Standard deviation of the entries of K_0, as h per second of period."""
 
 
 class L2nwConfig(Section, frozen=True):

@@ -66,9 +66,8 @@ def first_non_finite(value: object, path: str = "") -> str | None:
     if isinstance(value, float):
         return None if math.isfinite(value) else path or "value"
     if isinstance(value, m.Array):
-        if value.dtype in ("<f4", "<f8"):
-            if not np.isfinite(np.frombuffer(value.data, value.dtype)).all():
-                return path or "array"
+        if value.dtype in ("<f4", "<f8") and not np.isfinite(np.frombuffer(value.data, value.dtype)).all():
+            return path or "array"
         return None
     children: Iterable[tuple[object, object]]
     if isinstance(value, msgspec.Struct):
@@ -91,7 +90,9 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
 
     def expect(name: str, values: list[float] | None, length: int) -> None:
         if values is not None and len(values) != length:
-            raise BadMessage(topic.name, "wrong size", f"{name} has {len(values)} entries, the plant has {length}")
+            raise BadMessage(
+                topic.name, "wrong size", f"{name} has {len(values)} entries, the plant has {length}"
+            )
 
     match message:
         case m.PlantState():
@@ -112,4 +113,6 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                 expect("h", sample.h, d)
         case m.OutputWeights():
             if len(message.K.shape) != 2 or message.K.shape[1] != d:
-                raise BadMessage(topic.name, "wrong size", f"K is {message.K.shape}, the plant has {d} states")
+                raise BadMessage(
+                    topic.name, "wrong size", f"K is {message.K.shape}, the plant has {d} states"
+                )

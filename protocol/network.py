@@ -10,6 +10,7 @@ included. The last hidden activation is bounded, so phi is: |phi|^2 <= 1 + n_L =
 from __future__ import annotations
 
 import hashlib
+import itertools
 from typing import Annotated, Literal
 
 import msgspec
@@ -57,7 +58,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     def layer_shapes(self) -> list[tuple[int, int]]:
         """Shapes of W_1..W_{L-1}: (1 + n_{i-1}, n_i)."""
         sizes = [self.states + self.inputs, *self.hidden]
-        return [(1 + a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
+        return [(1 + a, b) for a, b in itertools.pairwise(sizes)]
 
     @property
     def features(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,9 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lbmpc.plants import Plant
+from run_log.summary import TOLERANCE
 from run_log.traces import Traces
 
-BLACK, BLUE, VERMILION, GREEN, GREY = "#000000", "#0072B2", "#D55E00", "#009E73", "#6F6F6F"
+BLACK, BLUE, SKY, VERMILION, GREEN = "#000000", "#0072B2", "#56B4E9", "#D55E00", "#009E73"
+GREY = "#6F6F6F"
 WIDTH = 8.0
 # Model errors this much smaller than the largest are no part of the story.
 MATTERS = 0.02
@@ -72,37 +73,30 @@ def _label(plant: Plant, name: str, what: str = "") -> str:
     return f"{what}{name} ({'–' if unit in ('', '1') else unit})"
 
 
-def _bounded(ax: Axes, low: float, high: float, values: np.ndarray) -> None:
+def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float) -> None:
     """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
+    values = values[np.isfinite(values)]
+    if not values.size:
         return
-    bottom, top = float(finite.min()), float(finite.max())
-    reach = max(top - bottom, 1e-9)
-    near_low, near_high = low > bottom - 2 * reach, high < top + 2 * reach
-    bottom, top = min(bottom, low) if near_low else bottom, max(top, high) if near_high else top
+    bottom, top = min(float(values.min()), rest), max(float(values.max()), rest)
+    reach = 2 * max(top - bottom, 1e-9)
+    drawn = [bound for bound in (low, high) if bottom - reach < bound < top + reach]
+    bottom, top = min(bottom, *drawn, top), max(top, *drawn, bottom)
     margin = 0.06 * max(top - bottom, 1e-9)
     ax.set_ylim(bottom - margin, top + margin)
-    style: dict[str, Any] = {"color": VERMILION, "linestyle": (0, (6, 2)), "linewidth": 1.2}
-    label = "bounds"
-    if near_low:
-        ax.axhline(low, label=label, **style)
-        ax.axhspan(bottom - 2 * margin - reach, low, color=VERMILION, alpha=0.08, linewidth=0)
-        label = "_nolegend_"
-    if near_high:
-        ax.axhline(high, label=label, **style)
-        ax.axhspan(high, top + 2 * margin + reach, color=VERMILION, alpha=0.08, linewidth=0)
-    if not near_low or not near_high:
-        which = (
-            f"[{low:g}, {high:g}]"
-            if not near_low and not near_high
-            else f"{low:g}"
-            if near_high
-            else f"{high:g}"
-        )
-        ax.plot(
-            [], [], " ", label=f"beyond the axis:\nbound{'s' if not (near_low or near_high) else ''} {which}"
-        )
+    for i, bound in enumerate(drawn):
+        label = "bounds" if i == 0 else "_nolegend_"
+        ax.axhline(bound, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label=label)
+        beyond = bottom - margin if bound == low else top + margin
+        ax.axhspan(bound, beyond, color=VERMILION, alpha=0.08, linewidth=0)
+    hidden = ", ".join(f"{bound:g}" for bound in (low, high) if bound not in drawn)
+    if hidden:
+        ax.plot([], [], " ", label=f"bounds beyond the\naxis: {hidden}")
+    distance = float(min((values - low).min(), (high - values).min()))
+    inside = (
+        f"inside by {max(distance, 0.0):.2g}" if distance >= -TOLERANCE else f"OUTSIDE by {-distance:.2g}"
+    )
+    ax.plot([], [], " ", label=inside)
 
 
 def _state(data: Traces, i: int) -> Draw:
@@ -112,7 +106,7 @@ def _state(data: Traces, i: int) -> Draw:
         x = motion.x[:, i]
         ax.plot(motion.t, x, color=BLUE, linewidth=1.6, label="true state")
         ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-        _bounded(ax, plant.x_min[i], plant.x_max[i], np.append(x, plant.x_e[i]))
+        _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
         ax.set_ylabel(_label(plant, plant.states[i]))
 
     return draw
@@ -123,7 +117,7 @@ def _input(data: Traces, j: int) -> Draw:
 
     def draw(ax: Axes) -> None:
         u, applied = data.u[:, j], motion.applied[:, j]
-        ax.step(data.t, u, where="post", color=BLUE, linewidth=1.4, label="commanded")
+        ax.step(data.t, u, where="post", color=SKY, linewidth=3.0, label="commanded")
         # `applied` is reported at the end of the period over which it is the mean.
         ax.step(
             motion.t, applied, where="pre", color=BLACK, linestyle="--", linewidth=1.0, label="applied (mean)"
@@ -133,7 +127,7 @@ def _input(data: Traces, j: int) -> Draw:
                 data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver"
             )
         ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-        _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied, [plant.u_e[j]]]))
+        _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied]), plant.u_e[j])
         ax.set_ylabel(_label(plant, plant.inputs[j]))
 
     return draw

@@ -248,7 +248,7 @@ def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
     later = sorted(seq for seq in recorded.keyframes if seq < recorded.last)
     way = f"; the first one is after tick {later[0]}: use --from-tick {later[0] + 1}" if later else ""
     raise LogError(
-        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log, so the controller's "
+        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log: the controller's "
         f"memory is not known there{way}{_unreadable(run)}"
     )
 

@@ -1,15 +1,12 @@
-"""`tandem report`: pictures and a table of a run, from its log alone."""
+"""`tandem report`: pictures of a run, from its log alone."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from rich.table import Table
-
 from run_log import plots
 from run_log.errors import LogError
 from run_log.reader import Run, read_run
-from run_log.summary import Summary, rows
 from run_log.traces import traces
 
 
@@ -33,16 +30,6 @@ def report(path: str | Path, out_dir: str | Path) -> list[Path]:
 def picture(run: Run, path: str | Path) -> Path:
     """The whole run on one page. Raises `LogError` as `report` does."""
     return _save(plots.overview(traces(run), title(run)), Path(path))
-
-
-def table(summary: Summary) -> Table:
-    """The figures of a run for a terminal."""
-    shown = Table(show_header=False, box=None)
-    shown.add_column(style="bold")
-    shown.add_column(justify="right")
-    for name, value in rows(summary):
-        shown.add_row(name, value)
-    return shown
 
 
 def title(run: Run) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
@@ -149,24 +147,6 @@ def outside(motion: Trajectory, plant: Plant) -> np.ndarray:
     state = (x < plant.x_min - TOLERANCE) | (x > plant.x_max + TOLERANCE)
     applied = (u < plant.u_min - TOLERANCE) | (u > plant.u_max + TOLERANCE)  # false where there was none
     return np.asarray(state.any(axis=1) | applied.any(axis=1))
-
-
-def rows(summary: Summary) -> list[tuple[str, str]]:
-    """Name and value of each figure, for a table."""
-    tree: dict[str, Any] = msgspec.to_builtins(summary)
-    flat: list[tuple[str, str]] = []
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            flat.extend((f"{name}.{part}", _shown(figure)) for part, figure in value.items())
-        else:
-            flat.append((name, _shown(value)))
-    return flat
-
-
-def _shown(value: Any) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _spread(values: list[float]) -> Spread | None:

@@ -3,8 +3,8 @@
 Exit codes: 0 it went well; 1 it did not (a replay differs, a process died); 2 what was asked cannot be done
 (a mistake in the arguments, the configuration or the file); 130 interrupted.
 
-What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and the
-controller no torch.
+What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and
+the controller no torch.
 """
 
 from __future__ import annotations

@@ -89,12 +89,13 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
     if log is not None and log.exists():
         raise Refused(f"{log}: exists already, and a log never overwrites anything; choose another name")
     from lbmpc.plants import PlantError
+    from run_log.errors import LogError
     from run_log.summary import summarise
     from tandem import figures
     from tandem.checks import plant_of
     from tandem.simulate import simulate as lock_step
 
-    plant_of(config)
+    plant = plant_of(config)
     console = terminal.console(as_json)
     with _progress(console) as bar:
         task = bar.add_task(f"simulating, {config.controller.oracle}", total=steps)
@@ -108,7 +109,10 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
     if log is not None:
         from tandem.save import save
 
-        save(ran, log)
+        try:
+            save(ran, log, plant)
+        except LogError as error:
+            raise Refused(str(error)) from error
         ran.path = log
     summary = summarise(ran)
     console.print(figures.table(summary))

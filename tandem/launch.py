@@ -208,11 +208,8 @@ class Supervisor:
             if not self.recorder_died:
                 self.recorder_died = True
                 self.monitor.ended(child.name)
-                self.monitor.say(
-                    f"NOT LOGGED from here on: the {child.name} died ({child.how_it_ended()}); the loop goes on",
-                    now,
-                    "bad",
-                )
+                text = f"NOT LOGGED from here on: the {child.name} died ({child.how_it_ended()})"
+                self.monitor.say(f"{text}; the loop goes on", now, "bad")
             return None
         if child.name not in self._restart_at:
             if now - self._started_at[child.name] > LONG_LIFE_S:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from controller_node.build import initial_state
 from controller_node.core import ControllerCore, Outputs
@@ -19,6 +20,9 @@ from protocol import messages as m
 from protocol import topics
 from protocol.topics import Topic
 from run_log.reader import Run, gather
+
+if TYPE_CHECKING:
+    from trainer_node.training import Trainer
 
 Progress = Callable[[int], None]
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
@@ -62,10 +66,11 @@ class _LockStep:
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
         self.log: list[tuple[Topic, m.Message, int]] = []
 
-    def _trainer(self):  # type: ignore[no-untyped-def]  # torch is imported only where there is a network to train
+    def _trainer(self) -> Trainer | None:
         snapshot = self.core.hidden_snapshot(-1)
         if snapshot is None or self.core.description is None:
             return None
+        # torch is imported only where there is a network to train.
         from trainer_node.training import Trainer, use_one_thread
 
         use_one_thread()

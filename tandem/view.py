@@ -13,10 +13,10 @@ from rich.text import Text
 from tandem.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
-TALL = 28
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
-COUNTERS = ("ticks", "messages", "samples", "trainings", "sent control", "sent bulk")
+COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
+DULL = ("sent control", "sent bulk")
 
 STATUS_STYLE = {
     "running": "green",
@@ -44,14 +44,14 @@ def render(now: Snapshot, width: int, height: int) -> RenderableType:
         half.add_column(ratio=1)
         half.add_row(loop, learning)
         parts.append(half)
-    used = 1 + (len(now.states) + len(now.inputs) + 2) + (16 if narrow else 8)
+    used = 1 + (len(now.states) + len(now.inputs) + 2) + (18 if narrow else 9)
     rows = len(now.processes) + 2
     if used + rows <= height:
-        parts.append(_panel("processes", _processes(now.processes, width - 4)))
+        parts.append(_panel("processes", _processes(now.processes)))
         used += rows
     room = height - used - 1
     if room >= 3 and now.events:
-        parts.append(_panel("events", _events(now.events[-(room - 2) :], width - 4)))
+        parts.append(_panel("events", _events(now.events[-(room - 2) :])))
     return Group(*parts)
 
 
@@ -105,7 +105,8 @@ def _gauges(now: Snapshot, width: int) -> Table:
     table.add_column()
     table.add_column(justify="left", style="dim")
     table.add_column(justify="left", style="dim")
-    cells = width - 4 - 9 - 9 - 9 - 12 - 6
+    roomy = width >= NARROW
+    cells = width - (46 if roomy else 30)
     for gauge in (*now.states, *now.inputs):
         value = "-" if gauge.value is None else _number(gauge)
         error = "" if gauge.value is None else f"{gauge.value - gauge.target:+.4f}"
@@ -115,7 +116,7 @@ def _gauges(now: Snapshot, width: int) -> Table:
             f"{gauge.low:.4g}",
             _bar(gauge, cells) if cells >= 8 else Text(""),
             f"{gauge.high:.4g}",
-            f"off by {error}" if width >= NARROW and error else "",
+            f"off by {error}" if roomy and error else "",
         )
     return table
 
@@ -168,7 +169,12 @@ def _counted(count: int, what: str, style: str = "bold yellow") -> Text:
 
 def _loop(now: Snapshot) -> Table:
     rate = "-" if now.measured_rate is None else f"{now.measured_rate:.2f} Hz"
-    source = {"hold": "held at x0", "command": "commands", "plan": "the last plan", "safe": "its safe input"}
+    source: dict[str, str | Text] = {
+        "hold": "held at x0",
+        "command": "follows commands",
+        "plan": Text("follows the last plan", "bold yellow"),
+        "safe": Text("its own safe input", "bold red"),
+    }
     slack = Text.assemble(
         f"{now.slack:.1e}" if now.slack else "none", "   ", _counted(now.soft, "soft ticks")
     )
@@ -184,10 +190,10 @@ def _loop(now: Snapshot) -> Table:
                     (now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"),
                     "   ",
                     _counted(now.fallback, "fallback"),
-                    f"   plant: {source.get(now.source, now.source or '-')}",
                 ),
             ),
             ("slack", slack),
+            ("plant", source.get(now.source, now.source or "-")),
         ]
     )
 
@@ -205,12 +211,13 @@ def _learning(now: Snapshot, width: int) -> Table:
     loss = "-" if now.loss is None else f"{now.loss[0]:.2e} → {now.loss[1]:.2e}"
     return _pairs(
         [
-            ("prediction error", Text(error)),
-            ("second by second", spark(now.trend, max(4, width - 24))),
-            ("hidden weights", Text.assemble(f"version {_version(now)}   {now.adopted} adopted")),
+            ("pred. error", Text(error)),
+            ("each second", spark(now.trend, max(4, width - 18))),
+            ("weights", Text.assemble(f"version {_version(now)}   {now.adopted} adopted")),
             ("refused", _counted(now.refused, "sets")),
-            ("training loss", Text(loss)),
+            ("loss", Text(loss)),
             ("buffer", Text(f"{now.samples} samples")),
+            ("bad messages", _counted(now.bad_messages, "not obeyed")),
         ]
     )
 
@@ -225,13 +232,14 @@ def spark(values: Sequence[float], cells: int) -> Text:
     return Text("".join(BARS[min(7, int(8 * step))] for step in steps), "cyan")
 
 
-def _processes(rows: Sequence[ProcessRow], width: int) -> Table:
-    table = Table.grid(padding=(0, 2))
+def _processes(rows: Sequence[ProcessRow]) -> Table:
+    table = Table.grid(padding=(0, 2), expand=True)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis", max_width=max(10, width - 30))
+    table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
     for row in rows:
-        words = [Text(row.note, "yellow" if row.note else "")] if row.note else []
+        calm = row.status in ("running", "ready")
+        words = [Text(row.note, "default" if calm else "yellow")] if row.note else []
         words += [_counter(name, row.counters[name]) for name in _ordered(row.counters)]
         table.add_row(
             row.name, Text(row.status, STATUS_STYLE.get(row.status, "default")), Text(", ").join(words)
@@ -249,14 +257,14 @@ def _ordered(counters: dict[str, int]) -> list[str]:
     """Trouble first, then the usual figures; zeros are left out."""
     trouble = sorted(name for name in counters if name.startswith(("bad", "overflow", "not sent")))
     usual = [name for name in COUNTERS if name in counters]
-    rest = sorted(set(counters) - set(trouble) - set(usual))
-    return [name for name in (*trouble, *usual, *rest) if counters[name]]
+    rest = sorted(set(counters) - set(trouble) - set(usual) - set(DULL))
+    return [name for name in (*trouble, *usual, *rest, *DULL) if counters.get(name)]
 
 
-def _events(events: Sequence[Event], width: int) -> Table:
-    table = Table.grid(padding=(0, 2))
+def _events(events: Sequence[Event]) -> Table:
+    table = Table.grid(padding=(0, 2), expand=True)
     table.add_column(justify="right", style="dim", no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis", max_width=max(10, width - 12))
+    table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
     for event in events:
         at = "" if event.at < 0 else f"{event.at:.1f} s"
         table.add_row(at, Text(event.text, EVENT_STYLE[event.weight]))

@@ -64,6 +64,24 @@ def test_torch_and_casadi_agree_to_1e_12_in_float64(
     assert bool((phi.square().sum(dim=1) <= description.features).all())
 
 
+def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> None:
+    description = NetworkDescription(
+        states=1,
+        inputs=1,
+        hidden=[1, 1],
+        activations=["softplus", "softsign"],
+        input_scale=[1.0, 1.0],
+        output_scale=[1.0],
+    )
+    hidden, K = [np.array([[0.0], [1.0], [0.0]]), np.array([[-21.0], [1.0]])], np.array([[0.0], [1.0]])
+    network, oracle = Network(description, torch.float64), DnnOracle(description)
+    network.load(hidden)
+    function, theta = oracle.function(), oracle.pack(hidden, K)
+    for x in (-60.0, -5.0, 0.0, 19.9, 20.1, 21.0, 30.0, 49.0, 51.0, 600.0):
+        ours = network(network.tensor([[x]]), network.tensor([[0.0]]), network.tensor(K)).item()
+        assert abs(ours - float(function([x], [0.0], theta)[0])) < 1e-12
+
+
 def test_a_controller_and_a_plant_load_neither_torch_nor_the_trainer() -> None:
     code = (
         "import sys, controller_node.node, plant_sim.node\n"

@@ -58,7 +58,7 @@ class Network(torch.nn.Module):
         self._input_scale = self.tensor(description.input_scale)
         self._output_scale = self.tensor(description.output_scale)
 
-    def tensor(self, values: np.ndarray | list[float]) -> torch.Tensor:
+    def tensor(self, values: np.ndarray | list[float] | list[list[float]]) -> torch.Tensor:
         """A copy of `values` in this network's dtype, on its device."""
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 

@@ -55,7 +55,9 @@ def function(oracle: Oracle) -> ca.Function:
     xu = ca.vertcat(x, u)
     parts = oracle.split(theta)
     columns = ca.horzcat(*oracle.jacobian(xu, parts))
-    return ca.Function("oracle", [x, u, theta], [oracle.value(xu, parts), columns], ["x", "u", "theta"], ["h", "J"])
+    return ca.Function(
+        "oracle", [x, u, theta], [oracle.value(xu, parts), columns], ["x", "u", "theta"], ["h", "J"]
+    )
 
 
 class LinearOracle:

@@ -30,7 +30,9 @@ class _Activation(NamedTuple):
 ACTIVATIONS: dict[Activation, _Activation] = {
     "tanh": _Activation(ca.tanh, lambda a, s: 1 - s * s, np.tanh),
     "sigmoid": _Activation(
-        lambda a: 0.5 + 0.5 * ca.tanh(0.5 * a), lambda a, s: s * (1 - s), lambda a: 0.5 + 0.5 * np.tanh(0.5 * a)
+        lambda a: 0.5 + 0.5 * ca.tanh(0.5 * a),
+        lambda a, s: s * (1 - s),
+        lambda a: 0.5 + 0.5 * np.tanh(0.5 * a),
     ),
     "softsign": _Activation(
         lambda a: a / (1 + ca.fabs(a)), lambda a, s: 1 / (1 + ca.fabs(a)) ** 2, lambda a: a / (1 + np.abs(a))
@@ -89,13 +91,13 @@ class DnnOracle:
         activation = xu / self.input_scale
         for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], self._psi, strict=True):
             activation = psi.value(_affine(bias, weights, activation))
-        return _affine(*parts[-2:], activation) * self.output_scale
+        return _affine(parts[-2], parts[-1], activation) * self.output_scale
 
     def jacobian(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
         points, variables = xu.shape[1], self.d + self.m
         activation = xu / self.input_scale
         # Forward mode, all directions and all points side by side: each layer is one matrix product.
-        tangent = None
+        tangent: ca.MX | None = None
         for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], self._psi, strict=True):
             total = _affine(bias, weights, activation)
             activation = psi.value(total)

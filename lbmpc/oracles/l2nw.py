@@ -27,7 +27,9 @@ class L2nwOracle:
 
     name = "l2nw"
 
-    def __init__(self, d: int, m: int, variables: tuple[int, ...], window: int, bandwidth: float, regularisation: float):
+    def __init__(
+        self, d: int, m: int, variables: tuple[int, ...], window: int, bandwidth: float, regularisation: float
+    ):
         self.d, self.m, self.variables = d, m, variables
         self.window, self.bandwidth, self.regularisation = window, bandwidth, regularisation
         # theta, column-major: kernel inputs (n, window), labels (d, window), validity (1, window).
@@ -45,7 +47,9 @@ class L2nwOracle:
     def jacobian(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
         slopes = self._value_and_slopes(xu, parts)[1]
         zero = ca.MX.zeros(self.d, xu.shape[1])
-        return [slopes[self.variables.index(k)] if k in self.variables else zero for k in range(self.d + self.m)]
+        return [
+            slopes[self.variables.index(k)] if k in self.variables else zero for k in range(self.d + self.m)
+        ]
 
     def _value_and_slopes(self, xu: ca.MX, parts: list[ca.MX]) -> tuple[ca.MX, list[ca.MX]]:
         points, labels, valid = parts

@@ -13,6 +13,8 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import DOP853
 
+from lbmpc.bound import Bound
+
 
 class PlantError(ArithmeticError):
     """The plant's true equations cannot be followed any further; the text says why and where."""
@@ -49,7 +51,7 @@ class Plant:
     u_min: np.ndarray
     u_max: np.ndarray
     W: np.ndarray
-    """Half-widths of the disturbance box used for tightening by default."""
+    """Half-widths of the disturbance box used for tightening by default, per second of sampling period."""
     x0: np.ndarray
     safe_input: np.ndarray
     """What the plant's own hardware applies when nobody commands it."""
@@ -72,7 +74,7 @@ class Plant:
     def function(self) -> ca.Function:
         """f as a CasADi function (x, u) -> dx/dt."""
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
-        return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))])
+        return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
 
 
 class Truth:
@@ -83,12 +85,7 @@ class Truth:
 
     def __init__(self, plant: Plant):
         self.plant = plant
-        buffer, self._evaluate = plant.function().buffer()
-        self._x, self._u, self._dx = np.zeros(plant.d), np.zeros(plant.m), np.zeros(plant.d)
-        buffer.set_arg(0, memoryview(self._x))
-        buffer.set_arg(1, memoryview(self._u))
-        buffer.set_res(0, memoryview(self._dx))
-        self._buffer = buffer
+        self._f = Bound(plant.function())
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         """x(t + dt) from x(t) = x, (d,), under the constant input u, (m,).
@@ -97,24 +94,27 @@ class Truth:
             PlantError: a state that must stay positive does not, or the numbers are not finite.
         """
         self._check(x)
-        self._u[:] = u
+        self._f.inputs["u"][:, 0] = u
         if dt <= 0.0:
             return np.array(x, dtype=float)
         solver = DOP853(self._rhs, 0.0, np.asarray(x, dtype=float), dt, rtol=1e-12, atol=1e-12)
         while solver.status == "running":
             trouble = solver.step()
             if trouble:
-                raise PlantError(f"{self.plant.name}: the equations of motion cannot be integrated: {trouble}")
+                raise PlantError(
+                    f"{self.plant.name}: the equations of motion cannot be integrated: {trouble}"
+                )
         self._check(solver.y)
         return solver.y
 
     def _rhs(self, _t: float, x: np.ndarray) -> np.ndarray:
-        self._x[:] = x
-        self._evaluate()
-        if not np.isfinite(self._dx).all():
+        self._f.inputs["x"][:, 0] = x
+        self._f()
+        dx = self._f.outputs["dx"][:, 0]
+        if not np.isfinite(dx).all():
             self._check(x)
             raise PlantError(f"{self.plant.name}: dx/dt is not finite at x = {x.tolist()}")
-        return self._dx.copy()
+        return dx.copy()
 
     def _check(self, x: np.ndarray) -> None:
         for domain in self.plant.positive:

@@ -35,15 +35,20 @@ def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps:
         if bound[worst] < 0:
             raise EmptySetError(
                 f"no robust positively invariant set of A + BK exists: after {k} steps the disturbance alone moves "
-                f"{names[worst]} past its bound by {-bound[worst]:.3g}. A smaller W, another K or a shorter period would help."
+                f"{names[worst]} past its bound by {-bound[worst]:.3g}. "
+                "A smaller W, another K or a shorter period would help."
             )
         new = [i for i in range(len(power)) if not _redundant(power[i], bound[i], kept_rows, kept_bounds)]
         if not new:
             infinite = np.full(len(kept_rows), -np.inf)
-            return Polytope(kept_rows, infinite, kept_bounds, tuple(f"Omega row {i}" for i in range(len(kept_rows))))
+            return Polytope(
+                kept_rows, infinite, kept_bounds, tuple(f"Omega row {i}" for i in range(len(kept_rows)))
+            )
         kept_rows = np.vstack([kept_rows, power[new]])
         kept_bounds = np.concatenate([kept_bounds, bound[new]])
-    raise EmptySetError(f"the robust positively invariant set of A + BK is not determined within {max_steps} steps")
+    raise EmptySetError(
+        f"the robust positively invariant set of A + BK is not determined within {max_steps} steps"
+    )
 
 
 def _names(set_: Polytope) -> list[str]:

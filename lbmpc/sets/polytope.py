@@ -76,7 +76,9 @@ class Polytope:
 
     def interior_point(self) -> np.ndarray | None:
         """Some point of the set, or None when it is empty."""
-        solution = linprog(np.zeros(self.dimension), *self._inequalities(), bounds=(None, None), method="highs")
+        solution = linprog(
+            np.zeros(self.dimension), *self._inequalities(), bounds=(None, None), method="highs"
+        )
         return solution.x if solution.status == 0 else None
 
     def one_sided(self) -> tuple[np.ndarray, np.ndarray]:

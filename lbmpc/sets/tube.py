@@ -11,7 +11,9 @@ import numpy as np
 from lbmpc.sets.polytope import Polytope
 
 
-def tube_margins(F: np.ndarray, closed_loop: np.ndarray, W: Polytope, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def tube_margins(
+    F: np.ndarray, closed_loop: np.ndarray, W: Polytope, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Support of R_0..R_steps in the directions -F and +F, each (steps + 1, rows)."""
     low, high = np.zeros((steps + 1, len(F))), np.zeros((steps + 1, len(F)))
     rows = F.copy()
@@ -22,7 +24,9 @@ def tube_margins(F: np.ndarray, closed_loop: np.ndarray, W: Polytope, steps: int
     return low, high
 
 
-def tighten(X: Polytope, F: np.ndarray, closed_loop: np.ndarray, W: Polytope, steps: int, what: str) -> list[Polytope]:
+def tighten(
+    X: Polytope, F: np.ndarray, closed_loop: np.ndarray, W: Polytope, steps: int, what: str
+) -> list[Polytope]:
     """X tightened by F R_0 .. F R_steps; F maps the tube's state to X's space (I for X, K for U).
 
     Raises:

@@ -1,0 +1,42 @@
+"""What a solve returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+
+class Status(StrEnum):
+    """How a solve ended. All but NUMERICAL come with inputs that keep every constraint that can be kept."""
+
+    CONVERGED = "converged"
+    ITERATION_LIMIT = "iteration limit"
+    INFEASIBLE = "infeasible"
+    """Hard state constraints cannot be met from x_t; the solution violates them as little as possible."""
+    ORACLE_REFUSED = "oracle refused"
+    """The oracle's numbers were unusable; solved with the nominal model."""
+    NUMERICAL = "numerical failure"
+    """No usable inputs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Outcome of one solve, in deviation coordinates.
+
+    v is (N, m), zbar (N, d) the nominal states zbar_1..zbar_N. `slack` is the largest state-row violation of zbar in
+    that row's units, 0 when all are kept, and `slack_row` names it ("y at step 3").
+    """
+
+    status: Status
+    v: np.ndarray
+    zbar: np.ndarray
+    cost: float
+    iterations: int
+    slack: float
+    slack_row: str
+
+    @property
+    def usable(self) -> bool:
+        return self.status is not Status.NUMERICAL
