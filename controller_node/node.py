@@ -244,18 +244,17 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         try:
             _check_phase(config)
             core = ControllerCore(config, run_id)
+            with (
+                punctual(config.realtime.priority) as note,
+                Bus(config, "controller", run_id, stopping) as bus,
+                HealthPublisher(bus, core.run_info(time.time()), lambda: counts, note) as health,
+            ):
+                ControllerNode(core, bus, health, counts).run(stopping)
         except ConfigError as error:
             log.error("%s", error)
             return 2
-        with punctual(config.realtime.priority) as note:
-            try:
-                with (
-                    Bus(config, "controller", run_id, stopping) as bus,
-                    HealthPublisher(bus, core.run_info(time.time()), lambda: counts, note) as health,
-                ):
-                    ControllerNode(core, bus, health, counts).run(stopping)
-            except OpenInterrupted:
-                log.info("stopped before there was a router")
+        except OpenInterrupted:
+            log.info("stopped before there was a router")
     return 0
 
 

@@ -12,6 +12,7 @@ import contextlib
 import json
 import logging
 import queue
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +24,7 @@ import zenoh
 
 from node_runtime import clock
 from node_runtime.bad_messages import BadMessages
-from node_runtime.config import Config
+from node_runtime.config import Config, ConfigError
 from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
 from protocol import codec, topics
 from protocol.messages import Message
@@ -35,6 +36,8 @@ BULK_MESSAGES = 2000
 BULK_BYTES = 256 * 1024 * 1024
 PENDING_QUERIES = 32
 LARGEST = max(topic.max_bytes for topic in topics.ALL)
+
+ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
 
 Handler = Callable[[dict[str, str]], list[bytes]]
 
@@ -51,8 +54,12 @@ def session_config(mode: str, endpoint: str, lease_ms: int) -> zenoh.Config:
     An explicit endpoint, no scouting, no shared memory.
 
     Raises:
-        ValueError: `endpoint` is not one that Zenoh understands, e.g. `tcp/127.0.0.1:7447`.
+        ConfigError: `endpoint` is not like `tcp/127.0.0.1:7447`. Zenoh itself would try it again for ever.
     """
+    if not ENDPOINT.fullmatch(endpoint):
+        raise ConfigError(
+            f"bus.endpoint = {endpoint!r} is not an endpoint; write tcp/HOST:PORT, or tls/ or quic/ for tcp/"
+        )
     settings: dict[str, Any] = {
         "mode": mode,
         "scouting/multicast/enabled": False,
@@ -77,7 +84,7 @@ def session_config(mode: str, endpoint: str, lease_ms: int) -> zenoh.Config:
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise ValueError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
+            raise ConfigError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
     return config
 
 
@@ -122,14 +129,14 @@ class Bus:
 
         Raises:
             OpenInterrupted: the stop event was set first.
-            ValueError: the endpoint is not a Zenoh endpoint.
+            ConfigError: the endpoint is none.
         """
         if self._control is not None:
             raise RuntimeError("this bus is open already")
         control = self._connect()
         try:
             self._bulk = self._connect()
-        except (OpenInterrupted, ValueError):
+        except (OpenInterrupted, ConfigError):
             control.close()
             raise
         self._control = control
@@ -166,7 +173,7 @@ class Bus:
         try:
             return result.result()
         except zenoh.ZError as error:
-            raise ValueError(f"bus.endpoint = {bus.endpoint!r} cannot be used: {error}") from error
+            raise ConfigError(f"bus.endpoint = {bus.endpoint!r} cannot be used: {error}") from error
 
     def close(self, drain_s: float = 2.0) -> None:
         """Send what is left of the bulk lane, for at most `drain_s`, and leave. Safe to call twice."""

@@ -8,7 +8,7 @@ import threading
 import zenoh
 
 from node_runtime.bus import Bus, OpenInterrupted, session_config
-from node_runtime.config import Config
+from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import punctual
@@ -29,12 +29,10 @@ class Router:
         self._session: zenoh.Session | None = None
 
     def open(self) -> None:
-        """Listen. Raises `RouterError` when the endpoint cannot be listened on."""
+        """Listen. Raises `RouterError` when that is not possible, `ConfigError` when the endpoint is none."""
         bus = self.config.bus
         try:
             self._session = zenoh.open(session_config("router", bus.endpoint, bus.lease_ms))
-        except ValueError as error:
-            raise RouterError(str(error)) from error
         except zenoh.ZError as error:
             if "in use" in str(error):
                 raise RouterError(
@@ -57,7 +55,7 @@ class Router:
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem router`: route until told to stop. 0, or 1 when the endpoint cannot be listened on."""
+    """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it is none."""
     # Every state and every command passes through here, so the router must be as punctual as the loops.
     with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:
         try:
@@ -73,6 +71,9 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         except RouterError as error:
             log.error("%s", error)
             return 1
+        except ConfigError as error:
+            log.error("%s", error)
+            return 2
         except OpenInterrupted:
             pass
     return 0

@@ -93,9 +93,13 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     run_id = new_run_id("plant")
     try:
         sim = build(config, run_id)
+        return _live(config, sim, run_id, stop)
     except ConfigError as error:
         log.error("%s", error)
         return 2
+
+
+def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | None) -> int:
     names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
     counts = dict.fromkeys(names, 0)
     with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:

@@ -41,13 +41,12 @@ class Orders:
     def drive(self, t: float) -> Drive:
         """What acts at time t, `arrived` or later."""
         # A switching time that rounding put a hair too late still counts as reached.
-        elapsed = (t - self.arrived) / self._period + 1e-9
-        if elapsed < self._patience:
-            return Drive(self._plan[0], "command", self._when(self._patience, t))
-        entry = math.floor(elapsed)
-        if entry < len(self._plan):
-            return Drive(self._plan[entry], "plan", self._when(entry + 1, t))
+        reached = t + 1e-9 * self._period + 4 * math.ulp(t)
+        patience_ends = self.arrived + self._patience * self._period
+        if patience_ends > reached:
+            return Drive(self._plan[0], "command", patience_ends)
+        for entry in range(math.floor(self._patience), len(self._plan)):
+            ends = self.arrived + (entry + 1) * self._period
+            if ends > reached:
+                return Drive(self._plan[entry], "plan", ends)
         return Drive(self._safe, "safe", math.inf)
-
-    def _when(self, periods: float, t: float) -> float:
-        return max(self.arrived + periods * self._period, math.nextafter(t, math.inf))

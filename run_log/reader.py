@@ -108,6 +108,13 @@ class Run:
         return list(first.values())
 
     @property
+    def controllers(self) -> list[str]:
+        """Runs with ticks, in order. One that said nothing of itself (no info, health or keyframe) is a stranger."""
+        spoke = {x.run_id for x in (*self.run_infos, *self.health, *self.keyframes)}
+        ticked = list(dict.fromkeys(tick.run_id for tick in self.ticks))
+        return [run_id for run_id in ticked if run_id in spoke] or ticked
+
+    @property
     def versions(self) -> dict[str, str]:
         """What the recorder had installed."""
         return cast(dict[str, str], json.loads(self.attachments.get("versions.json", b"{}")))

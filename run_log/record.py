@@ -63,7 +63,7 @@ def _record(
     # Arrival is stamped on the monotonic clock; one offset for the whole run keeps the times in order.
     to_unix = time.time_ns() - clock.now_ns()
     flush_s = config.log.flush_ms * 1e-3
-    next_flush = clock.now() + flush_s
+    next_flush = clock.now()
     said: str | None = ""
     end: float | None = None
     last_arrival = clock.now()

@@ -83,7 +83,7 @@ def replay(
             plant; the log's configuration admits no controller.
         ConfigError: an override cannot be applied.
     """
-    recorded = [_collect(run, run_id) for run_id in dict.fromkeys(tick.run_id for tick in run.ticks)]
+    recorded = [_collect(run, run_id) for run_id in run.controllers]
     if not recorded:
         raise LogError(
             f"{run.path}: holds no tick of a controller; there is nothing to replay{_unreadable(run)}"
@@ -299,6 +299,9 @@ def _notes(run: Run, recorded: list[_Recorded], overrides: Sequence[str]) -> lis
                 notes.append(
                     f"recorded with {', '.join(other)}: equal to about 1e-7 at best, not to the byte"
                 )
+    strangers = {tick.run_id for tick in run.ticks} - set(run.controllers)
+    if strangers:
+        notes.append(f"not replayed, since it never said what it is: {', '.join(sorted(strangers))}")
     for r in recorded:
         if not r.complete:
             notes.append(

@@ -90,7 +90,8 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
     Raises:
         LogError: the log holds no state of this plant's size.
     """
-    followed = {tick.state.run_id for tick in run.ticks if tick.state is not None}
+    controllers = set(run.controllers)
+    followed = {t.state.run_id for t in run.ticks if t.state is not None and t.run_id in controllers}
     states = [s for s in run.plant_states if len(s.x) == plant.d and (s.run_id in followed or not followed)]
     if not states:
         raise LogError(
@@ -117,7 +118,10 @@ def summarise(run: Run) -> Summary:
     """Raises `LogError`: the plant is unknown here, or the log holds none of its states."""
     plant = plant_of(run)
     motion = trajectory(run, plant)
-    ticks, results, timings = run.ticks, run.results, run.timings
+    controllers = set(run.controllers)
+    ticks = [tick for tick in run.ticks if tick.run_id in controllers]
+    results = [r for r in run.results if r.run_id in controllers]
+    timings = [timing for timing in run.timings if timing.run_id in controllers]
     performance = list(plant.performance)
     deviation = motion.x[:, performance] - plant.x_e[performance]
     unsettled = motion.step[(np.abs(deviation) > SETTLED).any(axis=1)]

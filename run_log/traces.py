@@ -50,7 +50,8 @@ def traces(run: Run) -> Traces:
     """Raises `LogError`: the plant is unknown here, or the log holds none of its states or no tick."""
     plant = plant_of(run)
     motion = trajectory(run, plant)
-    results = run.results
+    controllers = set(run.controllers)
+    results = [r for r in run.results if r.run_id in controllers]
     if not results:
         raise LogError(f"{run.path}: holds no tick of a controller; there is nothing to draw")
     keys = [(r.run_id, r.seq) for r in results]

@@ -305,7 +305,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         return command.run()
-    except (ConfigError, terminal.Refused) as error:
+    except ConfigError as error:
+        text, file = str(error), getattr(command, "config", None)
+        named = file is None or text.startswith(("--", str(file)))
+        terminal.complain(text if named else f"{file}: {text}", command.json)
+        return 2
+    except terminal.Refused as error:
         terminal.complain(str(error), command.json)
         return 2
     except KeyboardInterrupt:

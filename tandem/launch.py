@@ -182,8 +182,8 @@ class Supervisor:
 
     def _watch(self) -> str | None:
         """Until the time is over, or the person asks, or a process without which nothing goes on has died."""
-        # Half a period early: no tick begins that does not count any more.
-        lasts = self.monitor.seconds - 0.5 * self.config.period
+        # The last tick that counts has begun by then, and is finished; the next one does not begin.
+        lasts = self.monitor.seconds - 0.75 * self.config.period
         waiting_since = time.monotonic()
         while not self.wish.stop:
             first = self.monitor.first_command

@@ -6,7 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from node_runtime import clock
 from node_runtime.bus import Bus, Mailbox
@@ -47,6 +47,11 @@ class Process:
 
     def signal(self, number: signal.Signals) -> None:
         self._popen.send_signal(number)
+
+    def lines(self) -> Iterator[str]:
+        """What the process says, line by line, while it runs."""
+        assert self._popen.stderr is not None
+        return iter(self._popen.stderr)
 
     def end(self, timeout_s: float = 20.0) -> int:
         """Wait for the end; the exit code. What the process said is in `said` afterwards."""

@@ -13,9 +13,9 @@ from live import Process, free_endpoint, live_config, wait_for
 
 from node_runtime import clock, router
 from node_runtime.bus import Bus, OpenInterrupted, session_config
-from node_runtime.config import Config, override
+from node_runtime.config import Config, ConfigError, override
 from node_runtime.mailbox import Delivery, Mailbox
-from node_runtime.router import Router, RouterError
+from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
 
@@ -171,34 +171,37 @@ def test_what_is_pending_is_sent_before_closing(config: Config, controller: Bus)
 
 def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
     config = live_config("bus.lease_ms=60000")
-    with Process("node_runtime.router", config) as frozen, Bus(config, "controller", "controller-a") as bus:
-        with Bus(config, "plant", "plant-a") as reader:
-            reader.everything()
-            wait_for(lambda: bus.matched(topics.KEYFRAME) and bus.matched(topics.COMMAND))
-            frozen.signal(signal.SIGSTOP)
-            command = m.Command(
-                run_id="controller-a",
-                seq=0,
-                state_run_id="",
-                state_seq=-1,
-                period=0.05,
-                mode="solver",
-                u=[1.0],
-                plan=[[1.0]] * 60,
-            )
-            longest = 0.0
-            for seq in range(60):
-                before = clock.now()
-                bus.publish(topics.COMMAND, command)
-                bus.publish(topics.KEYFRAME, keyframe(seq, 8_000_000))
-                longest = max(longest, clock.now() - before)
-            # Encoding 8 MB is the largest part of it.
-            assert longest < 0.5
-            assert bus.counters()["bulk overflow"] > 20
+    with (
+        Process("node_runtime.router", config) as frozen,
+        Bus(config, "controller", "controller-a") as bus,
+        Bus(config, "plant", "plant-a") as reader,
+    ):
+        reader.everything()
+        wait_for(lambda: bus.matched(topics.KEYFRAME) and bus.matched(topics.COMMAND))
+        frozen.signal(signal.SIGSTOP)
+        command = m.Command(
+            run_id="controller-a",
+            seq=0,
+            state_run_id="",
+            state_seq=-1,
+            period=0.05,
+            mode="solver",
+            u=[1.0],
+            plan=[[1.0]] * 60,
+        )
+        longest = 0.0
+        for seq in range(60):
             before = clock.now()
-            reader.close(drain_s=0.2)
-            bus.close(drain_s=0.2)
-            assert clock.now() - before < 5.0
+            bus.publish(topics.COMMAND, command)
+            bus.publish(topics.KEYFRAME, keyframe(seq, 8_000_000))
+            longest = max(longest, clock.now() - before)
+        # Encoding 8 MB is the largest part of it.
+        assert longest < 0.5
+        assert bus.counters()["bulk overflow"] > 20
+        before = clock.now()
+        reader.close(drain_s=0.2)
+        bus.close(drain_s=0.2)
+        assert clock.now() - before < 5.0
 
 
 # -- questions and answers -------------------------------------------------------------------------------
@@ -253,24 +256,22 @@ def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controlle
 
 def test_a_router_restart_is_survived() -> None:
     config = live_config()
-    with Router(config) as first:
-        with (
-            Bus(config, "plant", "plant-a") as plant,
-            Bus(config, "controller", "controller-a") as controller,
-        ):
-            latest = controller.latest(topics.PLANT_STATE)
-            controller.serve(topics.OUTBOX_QUERY, lambda _: [b"answer"])
-            wait_for(lambda: plant.matched(topics.PLANT_STATE))
-            first.close()
-            wait_for(lambda: not plant.connected and not controller.connected)
-            plant.publish(topics.PLANT_STATE, state(0))
-            with Router(config):
-                wait_for(
-                    lambda: plant.connected and controller.connected and plant.matched(topics.PLANT_STATE)
-                )
-                plant.publish(topics.PLANT_STATE, state(1))
-                assert seq_of(latest.wait(10.0)) == 1
-                wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {}, 1.0) == [b"answer"])
+    with (
+        Router(config) as first,
+        Bus(config, "plant", "plant-a") as plant,
+        Bus(config, "controller", "controller-a") as controller,
+    ):
+        latest = controller.latest(topics.PLANT_STATE)
+        controller.serve(topics.OUTBOX_QUERY, lambda _: [b"answer"])
+        wait_for(lambda: plant.matched(topics.PLANT_STATE))
+        first.close()
+        wait_for(lambda: not plant.connected and not controller.connected)
+        plant.publish(topics.PLANT_STATE, state(0))
+        with Router(config):
+            wait_for(lambda: plant.connected and controller.connected and plant.matched(topics.PLANT_STATE))
+            plant.publish(topics.PLANT_STATE, state(1))
+            assert seq_of(latest.wait(10.0)) == 1
+            wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {}, 1.0) == [b"answer"])
 
 
 def test_opening_waits_for_the_router() -> None:
@@ -296,13 +297,12 @@ def test_opening_can_be_stopped() -> None:
     assert clock.now() - before < 5.0
 
 
-@pytest.mark.parametrize("endpoint", ["nonsense", "tcp/127.0.0.1", "carrier-pigeon/127.0.0.1:1"])
+@pytest.mark.parametrize("endpoint", ["nonsense", "tcp/127.0.0.1", "carrier/127.0.0.1:1", "tcp/::1:1"])
 def test_an_endpoint_that_is_none_is_an_error_for_a_person(endpoint: str) -> None:
     config = override(Config(), [f'bus.endpoint="{endpoint}"'])
-    with pytest.raises(ValueError, match=r"bus\.endpoint"):
+    with pytest.raises(ConfigError, match=r"bus\.endpoint"):
         Bus(config, "plant", "plant-a").open()
-    with pytest.raises(RouterError, match=r"bus\.endpoint|listen"):
-        Router(config).open()
+    assert router.main(config) == 2
 
 
 def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.LogCaptureFixture) -> None:

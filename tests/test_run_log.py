@@ -358,10 +358,7 @@ def test_foreign_files_are_named(tmp_path: Path) -> None:
 def test_a_lying_chunk_does_not_take_the_memory(whole: Path, tmp_path: Path) -> None:
     """A chunk that says it is 2^62 bytes when unpacked."""
     data = bytearray(whole.read_bytes())
-    position = 8
-    while data[position] != 6:
-        position += 9 + struct.unpack_from("<Q", data, position + 1)[0]
-    struct.pack_into("<Q", data, position + 9 + 16, 2**62)
+    struct.pack_into("<Q", data, chunks(data)[0] + 9 + 16, 2**62)
     path = tmp_path / "liar.mcap"
     path.write_bytes(data)
     with pytest.raises(LogError, match="chunk"):
@@ -404,10 +401,21 @@ def test_recover_overwrites_nothing_and_leaves_whole_files_alone(whole: Path, tm
         recover(cut, cut)
 
 
-@pytest.mark.parametrize("share", [0.15, 0.5, 0.8])
-def test_recover_saves_what_is_around_the_damage(whole: Path, tmp_path: Path, share: float) -> None:
+def chunks(data: bytes | bytearray) -> list[int]:
+    """Where each chunk record begins."""
+    found, position = [], 8
+    while data[position] != 0x0F:  # the end of the data
+        if data[position] == 6:
+            found.append(position)
+        position += 9 + struct.unpack_from("<Q", data, position + 1)[0]
+    return found
+
+
+@pytest.mark.parametrize("which", [0, 4, -1])
+def test_recover_saves_what_is_around_the_damage(whole: Path, tmp_path: Path, which: int) -> None:
+    """The first chunk too, in which the channels are declared."""
     data = bytearray(whole.read_bytes())
-    data[int(len(data) * share)] ^= 1
+    data[chunks(data)[which] + 200] ^= 1
     edited, out = tmp_path / "edited.mcap", tmp_path / "out.mcap"
     edited.write_bytes(data)
     saved = recover(edited, out)
@@ -466,7 +474,9 @@ def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, mes
         msgspec.structs.replace(first, run_id="liar", x=[99.0] * 4, source="command"),
         6,
     )
-    disturbed = summarise(gather(config, [*held, *later[:50], liar, *later[50:]]))
+    tick = next(message for topic, message, _ in messages if topic is topics.TICK)
+    strange = (topics.TICK, msgspec.structs.replace(tick, run_id="stranger", state=liar[1]), 7)
+    disturbed = summarise(gather(config, [*held, *later[:50], liar, strange, *later[50:]]))
     assert disturbed == plain
 
 

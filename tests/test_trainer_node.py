@@ -74,6 +74,7 @@ class Controller:
         self.hidden = initial_hidden(description, np.random.default_rng(seed))
         self.version = 0
         self.adopts = True
+        self.claimed = ""
         self.adopted: list[HiddenWeights] = []
         self.questions: list[float] = []
         self.seq = -1
@@ -100,7 +101,7 @@ class Controller:
             run_id=self.run_id,
             seq=max(self.seq, 0),
             hidden_version=self.version,
-            hidden_sha256=hash_layers(self.hidden),
+            hidden_sha256=self.claimed or hash_layers(self.hidden),
             description=msgspec.json.encode(self.description).decode(),
             layers=[Array.of(layer, "<f4") for layer in self.hidden],
         )
@@ -136,15 +137,15 @@ class Controller:
             ),
         )
 
-    def until(self, condition: Callable[[Health], bool], tick: bool = False, run_id: str = "") -> Health:
-        """Wait for a trainer's health that satisfies the condition, ticking at each that does not yet."""
+    def until(self, condition: Callable[[Health], bool], tick: bool = False, ignored: str = "") -> Health:
+        """Wait for a trainer's health that satisfies the condition; `ignored`: another trainer's run id."""
         deadline = time.monotonic() + PATIENCE
         health = None
         while time.monotonic() < deadline:
             delivery = self._health.get(0.2)
             if delivery is not None:
                 health = codec.decode_as(Health, delivery.payload)
-                if health.run_id != run_id and condition(health):
+                if health.run_id != ignored and condition(health):
                     return health
             if tick:
                 self.tick(5)
@@ -225,10 +226,11 @@ def test_a_restarted_trainer_goes_on_with_rising_versions(config: Config) -> Non
             controller.until(lambda h: h.counters["adopted"] >= 2, tick=True)
         reached = controller.version
         with RunningTrainer(config, "trainer-2") as trainer:
-            controller.until(lambda h: h.counters.get("adopted", 0) >= 1, tick=True, run_id="trainer-1")
+            controller.until(lambda h: h.counters.get("adopted", 0) >= 1, tick=True, ignored="trainer-1")
             assert controller.adopted[-1].run_id == "trainer-2"
             assert controller.adopted[-1].seq > reached
-            controller.until(holds(controller.seq + 1), run_id="trainer-1")
+            health = controller.until(holds(controller.seq + 1), ignored="trainer-1")
+            assert health.counters["not adopted"] == 0
             assert trainer.labels() == list(range(controller.seq + 1))
 
 
@@ -345,9 +347,12 @@ def test_a_snapshot_that_cannot_be_right_is_not_used(config: Config) -> None:
         bad = "bad controller/hidden: not finite"
         controller.until(lambda h: h.counters.get(bad, 0) >= 1)
         controller.hidden = right[::-1] * 2
-        controller.until(lambda h: h.counters.get("bad controller/hidden: unusable", 0) >= 1)
+        bad = "bad controller/hidden: unusable"
+        before = controller.until(lambda h: h.counters.get(bad, 0) >= 1).counters[bad]
+        controller.hidden, controller.claimed = right, "0" * 64
+        controller.until(lambda h: h.counters[bad] >= before + 2)
         assert trainer.node.trainer is None
-        controller.hidden = right
+        controller.claimed = ""
         controller.until(joined)
 
 
@@ -372,8 +377,8 @@ def test_a_killed_process_is_replaced_and_its_successor_ends_when_asked(config: 
         controller.tick(40)
         second = process(config)
         try:
-            controller.until(lambda h: h.counters["adopted"] >= 1, tick=True, run_id=health.run_id)
-            last = controller.until(holds(controller.seq + 1), run_id=health.run_id)
+            controller.until(lambda h: h.counters["adopted"] >= 1, tick=True, ignored=health.run_id)
+            last = controller.until(holds(controller.seq + 1), ignored=health.run_id)
             assert last.counters["buffer"] == controller.seq + 1
             second.send_signal(signal.SIGTERM)
             assert second.wait(PATIENCE) == 0

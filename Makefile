@@ -1,0 +1,42 @@
+# make run does all set-up and then everything; make help lists what there is.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+# Passed on to tandem, e.g. make run ARGS="--seconds 60 --oracle l2nw"
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run simulate test lint format clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
+
+setup: $(READY)  ## a virtual environment in .venv with everything in it
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[trainer,log,dev]'
+	@touch $(READY)
+
+run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
+	$(BIN)/tandem run $(ARGS)
+
+simulate: $(READY)  ## the same in lock-step, faster than real time
+	$(BIN)/tandem simulate $(ARGS)
+
+test: $(READY)  ## all tests
+	$(BIN)/pytest $(ARGS)
+
+lint: $(READY)  ## style, types, and which package may import which
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(READY)  ## put the code into the one style
+	$(BIN)/ruff format .
+
+clean:  ## remove the environment and all caches; logs stay
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

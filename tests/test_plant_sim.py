@@ -1,0 +1,280 @@
+"""The plant: held, driven, going on alone; in virtual time bit for bit, and as a real process."""
+
+from __future__ import annotations
+
+import signal
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from live import Ear, Process, health_of, live_config, wait_for
+
+from lbmpc.plants import Plant, PlantError, Truth, get_plant
+from node_runtime.bus import Bus
+from node_runtime.router import Router
+from plant_sim import node
+from plant_sim.plant import PlantSim
+from plant_sim.watchdog import Orders
+from protocol import messages as m
+from protocol import topics
+
+PLANT: Plant = get_plant("moore_greitzer")
+PERIOD = 0.05
+U = float(PLANT.u_e[0])
+
+
+def command(
+    seq: int,
+    u: float,
+    plan: list[float] | None = None,
+    answers: int = 0,
+    run_id: str = "plant-a",
+    period: float = PERIOD,
+) -> m.Command:
+    entries = [[u], *([value] for value in plan or [])]
+    return m.Command(
+        run_id="controller-a",
+        seq=seq,
+        state_run_id=run_id,
+        state_seq=answers,
+        period=period,
+        mode="solver",
+        u=[u],
+        plan=entries,
+    )
+
+
+def plant(x0: np.ndarray = PLANT.x0, patience: float = 1.5) -> PlantSim:
+    return PlantSim(PLANT, PERIOD, x0, patience, "plant-a")
+
+
+# -- in virtual time -------------------------------------------------------------------------------------
+
+
+def test_the_plant_is_held_until_its_first_command() -> None:
+    sim = plant()
+    for k in range(5):
+        state = sim.sample(k * PERIOD)
+        assert (state.seq, state.x, state.applied) == (k, PLANT.x0.tolist(), None)
+        assert (state.source, state.command_seq) == ("hold", -1)
+    assert not sim.moving
+
+
+def test_lock_step_applies_each_input_exactly_for_its_period() -> None:
+    sim, truth = plant(), Truth(PLANT)
+    x = PLANT.x0
+    rng = np.random.default_rng(0)
+    state = sim.sample(0.0)
+    for k in range(40):
+        u = U + float(rng.uniform(-0.05, 0.05))
+        assert sim.command(command(k, u, answers=state.seq), k * PERIOD) == "ok"
+        state = sim.sample((k + 1) * PERIOD)
+        x = truth.step(x, np.array([u]), PERIOD)
+        assert state.x == x.tolist()
+        assert state.applied == [u]
+        assert (state.source, state.command_seq, state.seq) == ("command", k, k + 1)
+
+
+def test_an_input_in_the_middle_of_a_period_acts_from_there() -> None:
+    sim, truth = plant(), Truth(PLANT)
+    sim.sample(0.0)
+    sim.command(command(0, 1.1), 0.0)
+    sim.sample(PERIOD)
+    sim.command(command(1, 1.3, answers=1), 1.2 * PERIOD)
+    state = sim.sample(2 * PERIOD)
+    x = truth.step(PLANT.x0, np.array([1.1]), PERIOD)
+    x = truth.step(truth.step(x, np.array([1.1]), 0.2 * PERIOD), np.array([1.3]), 0.8 * PERIOD)
+    assert state.x == pytest.approx(x.tolist(), abs=1e-10)
+    assert state.applied == pytest.approx([0.2 * 1.1 + 0.8 * 1.3], abs=1e-12)
+
+
+def test_the_period_in_which_the_plant_is_released_has_no_applied_input() -> None:
+    sim = plant()
+    sim.sample(0.0)
+    sim.command(command(0, U), 0.3 * PERIOD)
+    assert sim.sample(PERIOD).applied is None
+    assert sim.sample(2 * PERIOD).applied == [U]
+
+
+def test_without_commands_the_plan_and_then_the_safe_input() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U + 0.01, [U + 0.02, U + 0.03, U + 0.04]), 0.0)
+    states = [sim.sample(k * PERIOD) for k in range(1, 8)]
+    assert [state.source for state in states] == ["command", "plan", "plan", "plan", "safe", "safe", "safe"]
+    # The first entry acts for the patience of 1.5 periods, so half of the second period is still its.
+    applied = [state.applied[0] - U for state in states if state.applied]
+    assert applied == pytest.approx([0.01, 0.015, 0.03, 0.04, 0.0, 0.0, 0.0], abs=1e-12)
+    assert all(state.command_seq == 0 for state in states)
+
+
+def test_a_fresh_command_ends_the_plan() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U] * 3), 0.0)
+    for k in range(1, 4):
+        state = sim.sample(k * PERIOD)
+    assert state.source == "plan"
+    sim.command(command(9, U + 0.01, answers=3), 3 * PERIOD)
+    state = sim.sample(4 * PERIOD)
+    assert (state.source, state.applied, state.command_seq) == ("command", [U + 0.01], 9)
+
+
+@given(st.floats(1.0, 6.0), st.integers(0, 8), st.floats(0.0, 1e7), st.floats(0.001, 10.0))
+def test_what_drives_always_moves_on(patience: float, entries: int, arrived: float, period: float) -> None:
+    orders = Orders(PLANT, command(0, U, [U] * entries, period=period), arrived, patience)
+    t, sources = arrived, []
+    while np.isfinite(t):
+        drive = orders.drive(t)
+        assert drive.until > t
+        sources.append(drive.source)
+        t = drive.until
+        assert len(sources) <= entries + 3
+    assert sources[0] == "command"
+    assert sources[-1] == "safe"
+    assert sources[1:-1] == ["plan"] * (len(sources) - 2)
+
+
+def test_the_actuator_clips_and_what_is_reported_is_the_clipped_input() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, 99.0, [-99.0] * 5), 0.0)
+    assert sim.sample(PERIOD).applied == PLANT.u_max.tolist()
+    assert sim.sample(3 * PERIOD).applied is None  # a sample was missed
+    state = sim.sample(4 * PERIOD)
+    assert (state.applied, state.source, state.seq) == (PLANT.u_min.tolist(), "plan", 4)
+
+
+def test_what_must_not_be_obeyed_is_refused() -> None:
+    sim = plant()
+    assert sim.command(command(0, U), 0.0) == "foreign"  # there was no sample yet
+    sim.sample(0.0)
+    assert sim.command(command(0, U, run_id="plant-b"), 0.0) == "foreign"
+    assert sim.command(command(0, U, answers=1), 0.0) == "foreign"
+    assert sim.command(command(0, U, answers=-1, run_id=""), 0.0) == "foreign"
+    assert sim.command(command(0, U, period=3000.0), 0.0) == "wrong period"
+    assert not sim.sample(PERIOD).command_seq >= 0
+    assert sim.command(command(0, U, answers=1), PERIOD) == "ok"
+    assert sim.command(command(1, U, answers=-1, run_id=""), PERIOD) == "ok"
+
+
+def test_old_commands_in_a_burst_are_refused() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U), 0.0)
+    for k in range(1, 61):
+        sim.sample(k * PERIOD)
+    burst = 60.5 * PERIOD
+    verdicts = [sim.command(command(k, U, answers=k), burst) for k in range(1, 61)]
+    assert verdicts == ["stale"] * 57 + ["ok"] * 3
+
+
+def test_working_ahead_changes_nothing() -> None:
+    def states(ahead: bool) -> list[m.PlantState]:
+        sim, rng, found = plant(), np.random.default_rng(1), []
+        for k in range(30):
+            found.append(sim.sample(k * PERIOD))
+            if ahead:
+                sim.prepare((k + 1) * PERIOD)
+            if k % 7 < 5:
+                at = (k + rng.uniform(0.0, 0.9)) * PERIOD
+                sim.command(command(k, U + rng.uniform(-0.05, 0.05), [U] * 2, answers=k), at)
+            if ahead:
+                sim.prepare((k + 1) * PERIOD)
+        return found
+
+    assert states(ahead=True) == states(ahead=False)
+
+
+def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
+    sim = plant(np.array([-1.6, 0.05, 2.0, 0.0]))
+    sim.sample(0.0)
+    sim.command(command(0, float(PLANT.u_max[0]), [float(PLANT.u_max[0])] * 60), 0.0)
+    with pytest.raises(PlantError, match="pressure y"):
+        sim.sample(PERIOD * 10)
+
+
+# -- as a process ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.live
+def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
+    config = live_config("rate=50.0", "plant.x0=[0.5, 1.6875, 1.1547, 0.0]")
+    with Router(config), Bus(config, "controller", "controller-a") as bus:
+        ear = Ear(bus)
+        with Process("plant_sim.node", config) as process:
+            ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
+            stranger = Bus(config, "controller", "controller-b")
+            stranger.open()
+            wait_for(lambda: bus.matched(topics.COMMAND) and stranger.matched(topics.COMMAND))
+            for k in range(5):
+                ear.of(topics.PLANT_STATE)
+                state = ear.until(lambda message: isinstance(message, m.PlantState))
+                assert isinstance(state, m.PlantState)
+                answer = command(k, U + 0.01, [U] * 5, answers=state.seq, run_id=state.run_id, period=0.02)
+                bus.publish(topics.COMMAND, answer)
+                stranger.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
+            ear.until(health_of("plant", note="no fresh command and the plan has ended: safe input"))
+            health = ear.until(lambda message: isinstance(message, m.Health))
+            process.signal(signal.SIGINT)
+            ear.until(health_of("plant", status="stopping"))
+            assert process.end() == 0
+            stranger.close()
+    sources = [state.source for state in ear.of(topics.PLANT_STATE)]
+    order = [source for k, source in enumerate(sources) if k == 0 or sources[k - 1] != source]
+    assert order[0] == "hold"
+    assert order[1] == "command"
+    assert order[-2:] == ["plan", "safe"]
+    applied = {state.applied[0] for state in ear.of(topics.PLANT_STATE) if state.applied}
+    assert all(U - 1e-9 <= u <= U + 0.01 + 1e-9 for u in applied)
+    assert isinstance(health, m.Health)
+    assert health.counters["bad controller/command: foreign"] == 5
+    seqs = [state.seq for state in ear.of(topics.PLANT_STATE)]
+    assert seqs == sorted(set(seqs))
+
+
+@pytest.mark.live
+def test_a_plant_whose_motion_ends_says_why() -> None:
+    config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
+    high = float(PLANT.u_max[0])
+    with Router(config), Bus(config, "controller", "controller-a") as bus:
+        ear = Ear(bus)
+        with Process("plant_sim.node", config) as process:
+            state = ear.until(lambda message: isinstance(message, m.PlantState))
+            assert isinstance(state, m.PlantState)
+            answer = command(0, high, [high] * 60, answers=state.seq, run_id=state.run_id, period=0.02)
+            wait_for(lambda: bus.matched(topics.COMMAND))
+            bus.publish(topics.COMMAND, answer)
+            health = ear.until(health_of("plant", status="failed"))
+            assert isinstance(health, m.Health)
+            assert "pressure y" in health.note
+            assert process.end() == 3
+            assert "Traceback" not in process.said
+            assert "pressure y" in process.said
+
+
+def test_a_wrong_plant_is_a_message_for_a_person(caplog: pytest.LogCaptureFixture) -> None:
+    assert node.main(live_config('plant.model="moore"')) == 2
+    assert node.main(live_config("plant.x0=[1.0]")) == 2
+    assert "did you mean 'moore_greitzer'?" in caplog.text
+    assert "plant.x0 has 1 entries; moore_greitzer has 4 states: z, y, r, rdot" in caplog.text
+
+
+@pytest.mark.live
+def test_a_plant_without_a_router_can_be_stopped() -> None:
+    config = live_config()
+    with Process("plant_sim.node", config) as process:
+        wait_for_words(process, "waiting for it")
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0
+        assert "Traceback" not in process.said
+
+
+def wait_for_words(process: Process, words: str) -> None:
+    """Read what the process says up to a line with these words."""
+    for line in process.lines():
+        if words in line:
+            return
+    raise AssertionError(f"the process never said {words!r}")

@@ -1,0 +1,60 @@
+"""The compressor's true motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from lbmpc.plants import PlantError, Truth, get_plant
+from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
+
+RNG = np.random.default_rng(1)
+
+
+def by_hand(x: np.ndarray, u: float) -> list[float]:
+    """The paper's equations with sqrt(y), written a second time, without CasADi."""
+    z, y, r, rdot = x
+    omega, zeta = 10 * np.sqrt(10), 1 / np.sqrt(2)
+    return [
+        -y + 1 + 1.5 * z - 0.5 * z**3,
+        z + 1 - r * np.sqrt(y),
+        rdot,
+        omega**2 * (u - r) - 2 * zeta * omega * rdot,
+    ]
+
+
+@pytest.mark.parametrize("period", [0.001, 0.05])
+def test_a_step_is_within_1e_9_of_a_tight_reference(period: float) -> None:
+    truth = Truth(PLANT)
+    for _ in range(5):
+        x = RNG.uniform(PLANT.x_min, PLANT.x_max)
+        u = RNG.uniform(PLANT.u_min, PLANT.u_max)
+        reference = solve_ivp(
+            lambda _t, s, u=u: by_hand(s, u[0]), (0, period), x, method="Radau", rtol=3e-14, atol=1e-15
+        )
+        assert np.abs(truth.step(x, u, period) - reference.y[:, -1]).max() < 1e-9
+
+
+def test_the_equilibrium_stays_where_it_is() -> None:
+    assert np.abs(Truth(PLANT).step(PLANT.x_e, PLANT.u_e, 10.0) - PLANT.x_e).max() < 1e-4
+    # The paper's printed digits, (0.5, 1.6875, 1.1547, 0), are the same point.
+    assert np.abs(by_hand(np.array([0.5, 1.6875, 1.1547, 0.0]), 1.1547)).max() < 1e-6
+
+
+@pytest.mark.parametrize("y", [-0.1, 0.0])
+def test_a_pressure_that_is_not_positive_is_named(y: float) -> None:
+    with pytest.raises(PlantError, match="pressure y is"):
+        Truth(PLANT).step(np.array([0.1, y, 1.0, 0.0]), PLANT.u_e, 0.05)
+
+
+def test_a_pressure_that_falls_to_zero_within_a_step_is_named_and_never_nan() -> None:
+    # Flow reversed beyond -1 empties the plenum.
+    with pytest.raises(PlantError, match=r"pressure y is|not finite|cannot be integrated") as caught:
+        Truth(PLANT).step(np.array([-3.0, 0.05, 1.0, 0.0]), PLANT.u_e, 0.05)
+    assert "nan" not in str(caught.value)
+
+
+def test_an_unknown_plant_is_answered_with_the_nearest() -> None:
+    with pytest.raises(KeyError, match="did you mean 'moore_greitzer'"):
+        get_plant("more_greitzer")

@@ -1,0 +1,254 @@
+"""The recorder as a process of its own: it logs whatever is said, and neither a kill nor a full disk spoils it."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+from live import Ear, Process, free_endpoint, health_of, live_config, wait_for
+
+from node_runtime import clock
+from node_runtime.bus import Bus, session_config
+from node_runtime.config import Config, override
+from node_runtime.router import Router
+from protocol import codec, topics
+from protocol import messages as m
+from run_log.reader import read_run
+from run_log.recover import recover
+from run_log.replay import replay
+from run_log.summary import summarise
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def base() -> Iterator[Config]:
+    config = live_config("controller.horizon=20", "controller.keyframe_every=20", "controller.oracle=linear")
+    with Router(config):
+        yield config
+
+
+@pytest.fixture
+def config(base: Config, tmp_path: Path) -> Config:
+    # A name of its own: what other tests say is not on this bus.
+    name = f"jet{abs(hash(tmp_path)) % 10**8}"
+    return override(base, [f'log.path="{tmp_path / "run.mcap"}"', f"name={name}"])
+
+
+@pytest.fixture
+def plant(config: Config) -> Iterator[Bus]:
+    with Bus(config, "plant", "plant-a") as bus:
+        yield bus
+
+
+@pytest.fixture
+def ear(plant: Bus) -> Ear:
+    return Ear(plant)
+
+
+def state(seq: int, x: float = 1.0) -> m.PlantState:
+    return m.PlantState(
+        run_id="plant-a", seq=seq, t=0.01 * seq, x=[x] * 4, applied=None, source="hold", command_seq=-1
+    )
+
+
+def recorder(config: Config) -> Process:
+    return Process("run_log.record", config)
+
+
+def noted(text: str) -> Callable[[m.Message], bool]:
+    running = health_of("recorder", status="running")
+    return lambda message: running(message) and isinstance(message, m.Health) and text in message.note
+
+
+def recorded(plant: Bus, ear: Ear, process: Process, config: Config) -> None:
+    """Wait until the recorder hears the plant."""
+    ear.until(noted("writing"))
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+
+
+def test_everything_said_is_in_the_log(config: Config, plant: Bus, ear: Ear) -> None:
+    states = [state(i) for i in range(300)]
+    garbage = [b"", b"\x00" * 100, codec.encode(state(1, float("nan")))]
+    with recorder(config) as process:
+        recorded(plant, ear, process, config)
+        before = time.time_ns()
+        stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        for payload in garbage:
+            stranger.put(f"tandem/{config.name}/controller/tick", payload)
+        stranger.put(f"tandem/{config.name}/no/such/topic", b"hello")
+        for message in states:
+            plant.publish(topics.PLANT_STATE, message)
+        ear.until(lambda x: noted("writing")(x) and x.counters["messages"] >= 304)
+        process.signal(signal.SIGINT)
+        # Others still have something to say when everybody is told to stop.
+        plant.publish(topics.PLANT_STATE, state(300))
+        assert process.end() == 0
+        stranger.close()
+    run = read_run(config.log.path)
+    assert not run.truncated
+    assert run.config == config
+    assert [e.payload for e in run.entries(topics.PLANT_STATE)] == [
+        codec.encode(s) for s in [*states, state(300)]
+    ]
+    assert run.bad == {"controller/tick: malformed": 2, "controller/tick: not finite": 1} or run.bad == {
+        "controller/tick: malformed": 3
+    }
+    assert run.strangers == {"no/such/topic": 1}
+    assert {info.process for info in run.run_infos} == {"recorder"}
+    times = [entry.log_time for entry in run.entries(topics.PLANT_STATE)]
+    assert times == sorted(times)
+    assert before - 10**8 < times[0] < times[-1] < time.time_ns() + 10**8
+
+
+def test_a_killed_recorder_leaves_all_but_the_last_half_second(config: Config, plant: Bus, ear: Ear) -> None:
+    stop = threading.Event()
+
+    def talk() -> None:
+        begin = clock.now()
+        for seq in range(100_000):
+            plant.publish(topics.PLANT_STATE, state(seq))
+            if stop.wait(max(0.0, begin + 0.005 * seq - clock.now())):
+                return
+
+    talker = threading.Thread(target=talk)
+    with recorder(config) as process:
+        recorded(plant, ear, process, config)
+        talker.start()
+        ear.until(lambda x: noted("writing")(x) and x.counters["messages"] >= 300)
+        killed = time.time_ns()
+        process.signal(signal.SIGKILL)
+        process.end()
+        stop.set()
+        talker.join()
+    run = read_run(config.log.path)
+    assert run.truncated
+    times = [entry.log_time for entry in run.entries(topics.PLANT_STATE)]
+    assert [s.seq for s in run.plant_states] == list(range(len(times)))
+    # Half a second between flushes, and a little for a machine that is busy.
+    assert killed - times[-1] < 0.7e9
+    out = Path(config.log.path).with_suffix(".recovered.mcap")
+    assert recover(config.log.path, out).messages == sum(map(len, run.streams.values()))
+    assert [s.seq for s in read_run(out).plant_states] == list(range(len(times)))
+
+
+def talk_while_full(
+    config: Config, plant: Bus, ear: Ear, fill: Callable[[int], None], free: Callable[[int], None]
+):
+    """The disk fills up, stays full for a while, and has room again: nothing is lost, and Health says it all."""
+    noise = [m.Keyframe(run_id="plant-a", seq=i, arrays={"a": array(i)}) for i in range(20)]
+    with recorder(config) as process:
+        recorded(plant, ear, process, config)
+        fill(process._popen.pid)
+        for message in noise:
+            plant.publish(topics.KEYFRAME, message)
+        trouble = ear.until(noted("NOT LOGGED"))
+        assert isinstance(trouble, m.Health)
+        assert "cannot be written" in trouble.note
+        assert trouble.counters["write errors"] > 0
+        plant.publish(topics.PLANT_STATE, state(0))
+        free(process._popen.pid)
+        ear.until(noted("writing"))
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0
+    assert "cannot be written" in process.said
+    run = read_run(config.log.path)
+    assert not run.truncated
+    assert run.keyframes == noise
+    assert run.plant_states == [state(0)]
+
+
+def array(seed: int) -> m.Array:
+    """Does not compress."""
+    import numpy as np
+
+    return m.Array.of(np.random.default_rng(seed).normal(size=2000))
+
+
+def test_a_full_quota_is_waited_for(config: Config, plant: Bus, ear: Ear) -> None:
+    full, none = (100_000, resource.RLIM_INFINITY), (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+    talk_while_full(
+        config,
+        plant,
+        ear,
+        fill=lambda pid: resource.prlimit(pid, resource.RLIMIT_FSIZE, full),
+        free=lambda pid: resource.prlimit(pid, resource.RLIMIT_FSIZE, none),
+    )
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("mounting a small disk needs privileges")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def test_a_full_disk_is_waited_for(config: Config, plant: Bus, ear: Ear, small_disk: Path) -> None:
+    grow = ["mount", "-o", "remount,size=10m", str(small_disk)]
+    talk_while_full(
+        override(config, [f'log.path="{small_disk / "run.mcap"}"']),
+        plant,
+        ear,
+        fill=lambda pid: None,
+        free=lambda pid: subprocess.run(grow, check=True) and None,
+    )
+
+
+def test_a_place_that_can_never_be_written(config: Config, plant: Bus, ear: Ear, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with recorder(override(config, [f'log.path="{tmp_path / "file" / "run.mcap"}"'])) as process:
+        ear.until(noted("NOT LOGGED"))
+        plant.publish(topics.PLANT_STATE, state(0))
+        process.signal(signal.SIGTERM)
+        assert process.end() == 4
+    assert "cannot be created" in process.said
+
+
+def test_an_existing_log_is_left_alone(config: Config) -> None:
+    Path(config.log.path).write_bytes(b"mine")
+    with recorder(config) as process:
+        assert process.end() == 2
+    assert "exists already" in process.said
+    assert Path(config.log.path).read_bytes() == b"mine"
+
+
+def test_stopped_before_there_was_a_router(config: Config) -> None:
+    alone = override(config, [f'bus.endpoint="{free_endpoint()}"'])
+    with recorder(alone) as process:
+        next(line for line in process.lines() if "no router" in line)
+        process.signal(signal.SIGINT)
+        assert process.end() == 0
+    assert not read_run(config.log.path).truncated
+
+
+def test_a_live_loop_replays_byte_for_byte(config: Config, ear: Ear) -> None:
+    """Three real processes; the log alone gives every command back."""
+    with recorder(config) as log:
+        ear.until(noted("writing"))
+        with (
+            Process("plant_sim.node", config) as plant,
+            Process("controller_node.node", config) as controller,
+        ):
+            ear.until(lambda x: isinstance(x, m.Tick) and x.seq >= 50)
+            for process in (controller, plant, log):
+                process.signal(signal.SIGINT)
+                assert process.end() == 0
+    run = read_run(config.log.path)
+    assert not run.bad
+    found = replay(run)
+    assert found.equal, found
+    assert found.ticks >= 51
+    assert found.ticks == len(run.commands) == len(run.ticks)
+    assert replay(run, 45).first_tick == 40
+    assert summarise(run).constraint_violations == 0
