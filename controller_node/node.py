@@ -110,6 +110,8 @@ class ControllerNode:
 
         After an outage longer than the plan there is nothing left to say, so the loop comes back here.
         """
+        if stop.is_set():
+            return False
         self._send_samples()
         self._health.set("ready", "no plant: waiting for its states")
         while not stop.is_set():

@@ -9,7 +9,7 @@ import time
 from lbmpc.plants import get_plant
 from node_runtime import clock
 from node_runtime.bus import Bus, Mailbox, OpenInterrupted
-from node_runtime.config import Config
+from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from protocol import topics
@@ -18,7 +18,7 @@ from run_log.writer import LogWriter
 
 log = logging.getLogger(__name__)
 
-EXIT_BAD_PATH = 2
+EXIT_CANNOT = 2
 EXIT_NOTHING_WRITTEN = 4
 # After Ctrl-C the other processes still say their last words; listen for that long.
 QUIET_S = 0.25
@@ -31,7 +31,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     A disk that is full or read-only stops nobody: it is named in Health and tried again, as long as it takes.
 
     Returns:
-        0; 2 when the path is taken or the plant unknown; 4 when nothing could ever be written.
+        0; 2 when the path is taken, the plant unknown or the endpoint none; 4 when nothing could ever be written.
     """
     with stopped_by_signals(stop) as stopping:
         try:
@@ -39,7 +39,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
             writer = LogWriter(config.log.path, config, plant, start_ns=time.time_ns(), patient=True)
         except (LogError, KeyError) as error:
             log.error("%s", error.args[0])
-            return EXIT_BAD_PATH
+            return EXIT_CANNOT
         if writer.error is not None:
             log.error("%s; trying again every %d ms", writer.error, config.log.flush_ms)
         run_id = new_run_id("recorder")
@@ -53,6 +53,10 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                 _record(config, writer, bus.everything(), health, stopping)
         except OpenInterrupted:
             pass
+        except ConfigError as error:
+            log.error("%s", error)
+            _finish(writer)
+            return EXIT_CANNOT
         return _finish(writer)
 
 

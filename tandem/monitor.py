@@ -15,6 +15,7 @@ from node_runtime.inbox import Follower
 from node_runtime.mailbox import Delivery
 from protocol import codec, topics
 from protocol import messages as m
+from run_log.summary import SOFT
 
 RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
@@ -80,6 +81,8 @@ class Snapshot:
     mode: str
     fallback: int
     slack: float
+    slack_row: str
+    """Which state constraint gives way, as "y at step 3"."""
     soft: int
     solve_ms: tuple[float, float] | None
     """p50 and p99 of the recent ticks."""
@@ -188,7 +191,7 @@ class Monitor:
         before = self._result.mode if self._result else "solver"
         self._result = result
         self._fallback += result.mode != "solver"
-        self._soft += result.slack > 0.0
+        self._soft += result.slack > SOFT
         if result.mode != before:
             weight: Weight = "bad" if result.mode != "solver" else "good"
             self.say(
@@ -277,7 +280,8 @@ class Monitor:
             skipped=self._skipped,
             mode=result.mode if result else "",
             fallback=self._fallback,
-            slack=result.slack if result else 0.0,
+            slack=result.slack if result and result.slack > SOFT else 0.0,
+            slack_row=result.slack_row if result else "",
             soft=self._soft,
             solve_ms=_percentiles(self._solve_ms),
             tick_ms=_percentiles(self._tick_ms),

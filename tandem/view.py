@@ -13,9 +13,11 @@ from rich.text import Text
 from tandem.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
+FIGURES = 7
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
+TROUBLE = ("bad", "overflow", "not sent", "write errors", "dropped")
 DULL = ("sent control", "sent bulk")
 
 STATUS_STYLE = {
@@ -33,26 +35,29 @@ EVENT_STYLE = {"note": "default", "good": "green", "bad": "bold red"}
 
 def render(now: Snapshot, width: int, height: int) -> RenderableType:
     """The whole view in `width` by `height` cells; leaves out the least important where there is no room."""
-    narrow = width < NARROW
-    parts: list[RenderableType] = [_heading(now, width), _panel("states and input", _gauges(now, width - 4))]
     loop, learning = _panel("loop", _loop(now)), _panel("learning", _learning(now, width // 2))
-    if narrow:
-        parts += [loop, learning]
+    # With the height of each, the most important first.
+    parts: list[tuple[RenderableType, int]] = [
+        (_heading(now, width), 1),
+        (_panel("states and input", _gauges(now, width - 4)), len(now.states) + len(now.inputs) + 2),
+    ]
+    if width < NARROW:
+        parts += [(loop, FIGURES + 2), (learning, FIGURES + 2)]
     else:
-        half = Table.grid(expand=True, padding=0)
-        half.add_column(ratio=1)
-        half.add_column(ratio=1)
-        half.add_row(loop, learning)
-        parts.append(half)
-    used = 1 + (len(now.states) + len(now.inputs) + 2) + (18 if narrow else 9)
-    rows = len(now.processes) + 2
-    if used + rows <= height:
-        parts.append(_panel("processes", _processes(now.processes)))
-        used += rows
-    room = height - used - 1
-    if room >= 3 and now.events:
-        parts.append(_panel("events", _events(now.events[-(room - 2) :])))
-    return Group(*parts)
+        both = Table.grid(expand=True, padding=0)
+        both.add_column(ratio=1)
+        both.add_column(ratio=1)
+        both.add_row(loop, learning)
+        parts.append((both, FIGURES + 2))
+    parts.append((_panel("processes", _processes(now.processes)), len(now.processes) + 2))
+    shown: list[RenderableType] = []
+    for part, rows in parts:
+        if rows <= height:
+            shown.append(part)
+            height -= rows
+    if height >= 3 and now.events:
+        shown.append(_panel("events", _events(now.events[-(height - 2) :])))
+    return Group(*shown)
 
 
 def line(now: Snapshot) -> str:
@@ -175,9 +180,8 @@ def _loop(now: Snapshot) -> Table:
         "plan": Text("follows the last plan", "bold yellow"),
         "safe": Text("its own safe input", "bold red"),
     }
-    slack = Text.assemble(
-        f"{now.slack:.1e}" if now.slack else "none", "   ", _counted(now.soft, "soft ticks")
-    )
+    gives = f"{now.slack:.1e} {now.slack_row}" if now.slack else "none"
+    slack = Text.assemble(gives, "   ", _counted(now.soft, "soft ticks"))
     return _pairs(
         [
             ("ticks", Text.assemble(f"{now.ticks}   {rate}")),
@@ -239,26 +243,25 @@ def _processes(rows: Sequence[ProcessRow]) -> Table:
     table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
     for row in rows:
         calm = row.status in ("running", "ready")
-        words = [Text(row.note, "default" if calm else "yellow")] if row.note else []
-        words += [_counter(name, row.counters[name]) for name in _ordered(row.counters)]
-        table.add_row(
-            row.name, Text(row.status, STATUS_STYLE.get(row.status, "default")), Text(", ").join(words)
-        )
+        words = [Text(f"{name} {row.counters[name]}", "bold yellow") for name in _trouble(row.counters)]
+        words += [Text(row.note, "default" if calm else "yellow")] if row.note else []
+        words += [Text(f"{name} {row.counters[name]}", "dim") for name in _usual(row.counters)]
+        status = Text(row.status, STATUS_STYLE.get(row.status, "default"))
+        table.add_row(row.name, status, Text(", ").join(words))
     return table
 
 
-def _counter(name: str, count: int) -> Text:
-    return Text(
-        f"{name} {count}", "bold yellow" if name.startswith(("bad", "overflow", "not sent")) else "dim"
+def _trouble(counters: dict[str, int]) -> list[str]:
+    """Counters that ought to be zero and are not."""
+    return sorted(name for name in counters if counters[name] and name.startswith(TROUBLE))
+
+
+def _usual(counters: dict[str, int]) -> list[str]:
+    """The other counters, the telling ones first; zeros are left out."""
+    rest = sorted(
+        name for name in counters if name not in (*COUNTERS, *DULL) and not name.startswith(TROUBLE)
     )
-
-
-def _ordered(counters: dict[str, int]) -> list[str]:
-    """Trouble first, then the usual figures; zeros are left out."""
-    trouble = sorted(name for name in counters if name.startswith(("bad", "overflow", "not sent")))
-    usual = [name for name in COUNTERS if name in counters]
-    rest = sorted(set(counters) - set(trouble) - set(usual) - set(DULL))
-    return [name for name in (*trouble, *usual, *rest, *DULL) if counters.get(name)]
+    return [name for name in (*COUNTERS, *rest, *DULL) if counters.get(name)]
 
 
 def _events(events: Sequence[Event]) -> Table:

@@ -136,10 +136,6 @@ class Trainer:
         """Whether enough new samples came since the last training began."""
         return self._fresh >= self.config.train_every and len(self.buffer) >= self.config.min_samples
 
-    def knows(self, sha256: str) -> bool:
-        """Whether `train` can start from the hidden layers with this hash."""
-        return sha256 in self._bases
-
     def train(self, output: OutputWeights, for_run: str) -> HiddenWeights | None:
         """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
 
