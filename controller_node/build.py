@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import casadi as ca
 import numpy as np
 
 from lbmpc.controller import Controller
@@ -13,6 +16,8 @@ from lbmpc.sets.polytope import EmptySetError
 from lbmpc.solver import Solver
 from node_runtime.config import Config, ConfigError
 from protocol.network import NetworkDescription
+
+Realise = Callable[[ca.Function], ca.Function]
 
 
 def build_plant(config: Config) -> Plant:
@@ -71,8 +76,8 @@ def build_oracle(config: Config, plant: Plant) -> Oracle:
     )
 
 
-def build_controller(config: Config) -> Controller:
-    """Everything a controller is, built once. Raises `ConfigError`."""
+def build_controller(config: Config, realise: Realise | None = None) -> Controller:
+    """Everything a controller is, built once; `realise` may compile its functions. Raises `ConfigError`."""
     plant = build_plant(config)
     settings = config.controller
     try:
@@ -87,7 +92,13 @@ def build_controller(config: Config) -> Controller:
         )
     except (ModelError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
-    return Controller(problem, Solver(problem, settings.solver.max_iterations, settings.solver.tolerance))
+    chosen = settings.solver
+    solver = Solver(problem, chosen.max_iterations, chosen.tolerance, realise or _as_it_is)
+    return Controller(problem, solver, real_time=chosen.mode == "real_time")
+
+
+def _as_it_is(function: ca.Function) -> ca.Function:
+    return function
 
 
 def _model(config: Config, plant: Plant) -> Model:

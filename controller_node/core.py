@@ -7,6 +7,7 @@ live node, the lock-step simulation and the replay all call `step` and differ on
 from __future__ import annotations
 
 import hashlib
+import math
 import platform
 import time
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import msgspec
 import numpy as np
 
 from controller_node.build import build_controller
+from controller_node.compile import Compiler
 from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
 from lbmpc.solution import Solution
@@ -35,10 +37,18 @@ class _Timed:
 
     def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
         before = time.perf_counter()
-        try:
-            return self._solver.solve(x, oracle_parameters, warm_start)
-        finally:
-            self.seconds = time.perf_counter() - before
+        solution = self._solver.solve(x, oracle_parameters, warm_start)
+        self.seconds = time.perf_counter() - before
+        return solution
+
+    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
+        self._solver.prepare(x, oracle_parameters, warm_start)
+
+    def feedback(self, x: np.ndarray) -> Solution:
+        before = time.perf_counter()
+        solution = self._solver.feedback(x)
+        self.seconds = time.perf_counter() - before
+        return solution
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,9 @@ class ControllerCore:
 
     def __init__(self, config: Config, run_id: str):
         self.config, self.run_id = config, run_id
-        self.controller = build_controller(config)
+        compiler = Compiler() if config.controller.solver.compile == "auto" else None
+        self.controller = build_controller(config, compiler)
+        self.kernels = compiler.note if compiler else "virtual machine, as configured"
         self._timed = self.controller.solver = _Timed(self.controller.solver)
         self.plant = self.controller.model.plant
         self.state: ControllerState = self.controller.initial_state(config.seed)
@@ -84,6 +96,10 @@ class ControllerCore:
         return Outputs(
             command, self._result(tick, command, result), self._sample(tick, result), self._weights(tick)
         )
+
+    def prepare(self) -> None:
+        """Use the time until the next tick; see `Controller.prepare`."""
+        self.controller.prepare(self.state)
 
     @property
     def solve_seconds(self) -> float:
@@ -131,6 +147,7 @@ class ControllerCore:
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
         versions = {"python": platform.python_version(), "machine": platform.machine()}
+        versions |= {"kernels": self.kernels}
         versions |= {name: metadata.version(name) for name in PACKAGES}
         return m.RunInfo(
             run_id=self.run_id,
@@ -152,8 +169,13 @@ class ControllerCore:
         if state is None:
             return Observation(None, None, 0, -1, hidden)
         applied = None if state.applied is None else np.array(state.applied) - self.plant.u_e
+        pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
+        total = sum(seconds for seconds, _u in pieces)
+        if pieces and not math.isclose(total, self.config.period, rel_tol=1e-3):
+            # Not the whole period: what acted in the rest of it is not known.
+            applied, pieces = None, ()
         source = int.from_bytes(hashlib.sha256(state.run_id.encode()).digest()[:7], "little")
-        return Observation(np.array(state.x) - self.plant.x_e, applied, source, state.seq, hidden)
+        return Observation(np.array(state.x) - self.plant.x_e, applied, source, state.seq, hidden, pieces)
 
     def _command(self, tick: m.Tick, result: StepResult) -> m.Command:
         plan = result.plan + self.plant.u_e

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
-from lbmpc.model import Model
+from lbmpc.model import Model, Pieces
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
@@ -45,6 +45,8 @@ class Observation:
     sequence: int
     """Its sample number; a label needs two consecutive ones."""
     hidden: HiddenSet | None
+    pieces: Pieces = ()
+    """The inputs of that period where there were several, deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,8 @@ class ControllerState:
     """x_t whose label is still to come, (d,)."""
     pending: tuple[int, int]
     """Its (source, sequence); sequence -1 when none is pending."""
+    predicted: np.ndarray
+    """The learned model's prediction of the next state, (d,)."""
     oracle: OracleState
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -65,6 +69,7 @@ class ControllerState:
             "plan.left": np.array([self.plan.left], dtype=np.int64),
             "pending.x": self.pending_x,
             "pending": np.array(self.pending, dtype=np.int64),
+            "predicted": self.predicted,
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -77,7 +82,7 @@ class ControllerState:
             name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
         }
         plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
-        return cls(plan, arrays["pending.x"], (source, sequence), oracle)
+        return cls(plan, arrays["pending.x"], (source, sequence), arrays["predicted"], oracle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +113,10 @@ class Solves(Protocol):
 
     def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution: ...
 
+    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None: ...
+
+    def feedback(self, x: np.ndarray) -> Solution: ...
+
 
 class Controller:
     """LBMPC with an oracle that learns.
@@ -115,10 +124,12 @@ class Controller:
     Args:
         problem: the optimisation problem.
         solver: solves it.
+        real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
     """
 
-    def __init__(self, problem: Problem, solver: Solves):
-        self.problem, self.solver = problem, solver
+    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False):
+        self.problem, self.solver, self.real_time = problem, solver, real_time
+        self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self.oracle = problem.oracle
 
@@ -126,7 +137,18 @@ class Controller:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
         oracle = self.oracle.initial_state(np.random.default_rng(seed))
         plan = empty_plan(self.problem.horizon, self.model.m)
-        return ControllerState(plan, np.zeros(self.model.d), (0, -1), oracle)
+        nothing = np.zeros(self.model.d)
+        return ControllerState(plan, nothing, (0, -1), nothing, oracle)
+
+    def prepare(self, state: ControllerState) -> None:
+        """Do now what the next step from this state would do first: linearise about the predicted state.
+
+        For the time between two samples. Never needed for the result: a step that finds nothing prepared prepares
+        by itself, with the same numbers.
+        """
+        if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
+            self.solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+            self._prepared_for = state
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
@@ -134,11 +156,13 @@ class Controller:
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
         oracle, verdict = self._adopt(oracle, seen.hidden)
-        plan, mode, solution = self._plan(state.plan, oracle, seen.x)
+        plan, mode, solution = self._plan(state, oracle, seen.x)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
-        after = ControllerState(self._shifted(plan, solution), pending_x, pending, oracle)
+        x = seen.x if seen.x is not None else state.predicted
+        predicted = self.model.A @ x + self.model.B @ plan.v[0] + self.oracle.estimate(oracle, x, plan.v[0])
+        after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, oracle)
         return after, StepResult(plan.v, mode, solution, label, verdict)
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
@@ -147,7 +171,7 @@ class Controller:
         if seen.x is None or seen.applied is None or not follows:
             return None, state.oracle
         x, u = state.pending_x, seen.applied
-        h = self.model.label(x, u, seen.x)
+        h = self.model.label(x, u, seen.x, seen.pieces)
         label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u))
         return label, self.oracle.learn(state.oracle, x, u, h)
 
@@ -159,12 +183,12 @@ class Controller:
         return self.oracle.adopt(oracle, hidden.version, hidden.layers, hidden.sha256, hidden.network_sha256)
 
     def _plan(
-        self, plan: Plan, oracle: OracleState, x: np.ndarray | None
+        self, state: ControllerState, oracle: OracleState, x: np.ndarray | None
     ) -> tuple[Plan, Mode, Solution | None]:
-        horizon = self.problem.horizon
+        horizon, plan = self.problem.horizon, state.plan
         solution = None
         if x is not None:
-            solution = self.solver.solve(x, self.oracle.theta(oracle), plan.v)
+            solution = self._solve(state, oracle, x)
             if solution.usable:
                 return Plan(solution.v, horizon), "solver", solution
         if plan.left > 0:
@@ -173,6 +197,14 @@ class Controller:
             # Neither a plan nor a state: the equilibrium input is all that is left.
             return Plan(np.zeros((horizon, self.model.m)), 0), "feedback", solution
         return Plan(feedback_plan(self.model, x, horizon), 0), "feedback", solution
+
+    def _solve(self, state: ControllerState, oracle: OracleState, x: np.ndarray) -> Solution:
+        if not self.real_time or state.plan.left == 0:
+            # Without a plan to start from, one step is not enough.
+            return self.solver.solve(x, self.oracle.theta(oracle), state.plan.v)
+        self.prepare(state)
+        self._prepared_for = None
+        return self.solver.feedback(x)
 
     def _shifted(self, plan: Plan, solution: Solution | None) -> Plan:
         end = solution.zbar[-1] if solution is not None and solution.usable else np.zeros(self.model.d)

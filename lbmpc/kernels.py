@@ -85,29 +85,39 @@ def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
 
 def build_rows(model: Model, n: int) -> ca.Function:
     """(A, B, K, L) of `sweep` -> (Mv (m n, m n), Mz (d n, m n)): how v and zbar_1..n move with w."""
+    return _propagation(model, n, follow_state=False)
+
+
+def build_tangent(model: Model, n: int) -> ca.Function:
+    """`build_rows`, and besides (Yv (m n, d), Yz (d n, d)): how v and zbar_1..n follow x when w stays."""
+    return _propagation(model, n, follow_state=True)
+
+
+def _propagation(model: Model, n: int, follow_state: bool) -> ca.Function:
     d, m = model.d, model.m
     a, b = ca.DM(model.A), ca.DM(model.B)
     a_all, b_all = ca.MX.sym("A", d, d * n), ca.MX.sym("B", d, m * n)
     k_all, l_all = ca.MX.sym("K", m, d * n), ca.MX.sym("L", m, m * n)
     a_i, b_i = ca.horzsplit(a_all, d), ca.horzsplit(b_all, m)
     k_i, l_i = ca.horzsplit(k_all, d), ca.horzsplit(l_all, m)
-    step, nominal = ca.MX(d, 0), ca.MX(d, 0)
+    # Columns: the directions of x, where they are followed, then w_0, w_1, ... as they begin to act.
+    before = d if follow_state else 0
+    step = nominal = ca.MX.eye(d) if follow_state else ca.MX(d, 0)
+    pad = ca.MX.zeros(d, m)
     moves, states = [], []
     for i in range(n):
-        # Row block i sees w_0..w_i only.
-        move = ca.horzcat(k_i[i] @ step, l_i[i]) if i else l_i[0]
-        step = (ca.horzcat(a_i[i] @ step, ca.MX.zeros(d, m)) if i else ca.MX.zeros(d, m)) + b_i[i] @ move
-        nominal = (ca.horzcat(a @ nominal, ca.MX.zeros(d, m)) if i else ca.MX.zeros(d, m)) + b @ move
+        move = ca.horzcat(k_i[i] @ step, l_i[i]) if step.shape[1] else l_i[i]
+        step = (ca.horzcat(a_i[i] @ step, pad) if step.shape[1] else pad) + b_i[i] @ move
+        nominal = (ca.horzcat(a @ nominal, pad) if nominal.shape[1] else pad) + b @ move
         rest = m * (n - 1 - i)
         moves.append(ca.horzcat(move, ca.MX.zeros(m, rest)))
         states.append(ca.horzcat(nominal, ca.MX.zeros(d, rest)))
-    return ca.Function(
-        "rows",
-        [a_all, b_all, k_all, l_all],
-        [ca.densify(ca.vertcat(*moves)), ca.densify(ca.vertcat(*states))],
-        ["A", "B", "K", "L"],
-        ["Mv", "Mz"],
-    )
+    mv, mz = ca.densify(ca.vertcat(*moves)), ca.densify(ca.vertcat(*states))
+    outputs, names = [mv[:, before:], mz[:, before:]], ["Mv", "Mz"]
+    if follow_state:
+        outputs, names = [*outputs, mv[:, :before], mz[:, :before]], [*names, "Yv", "Yz"]
+    name = "tangent" if follow_state else "rows"
+    return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
 
 
 def _learned_stage(model: Model, oracle: Oracle, parts: list[ca.MX]) -> ca.Function:

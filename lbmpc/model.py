@@ -14,6 +14,9 @@ from scipy.signal import place_poles
 
 from lbmpc.plants.base import Plant
 
+Pieces = tuple[tuple[float, np.ndarray], ...]
+"""Stretches of time under one input each: (seconds, u (m,))."""
+
 
 class ModelError(ValueError):
     """The plant's equations and the chosen period give no usable model."""
@@ -28,6 +31,10 @@ class Model:
 
     plant: Plant
     period: float
+    a: np.ndarray
+    """Continuous-time Jacobian in x, (d, d)."""
+    b: np.ndarray
+    """Continuous-time Jacobian in u, (d, m)."""
     A: np.ndarray
     B: np.ndarray
     Q: np.ndarray
@@ -48,9 +55,22 @@ class Model:
         """A + BK, Schur stable."""
         return self.A + self.B @ self.K
 
-    def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
-        """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, with the input that really was applied; (d,)."""
-        return x_next - self.A @ x - self.B @ u
+    def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray, pieces: Pieces = ()) -> np.ndarray:
+        """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), with the input that really was applied.
+
+        Where several inputs acted within the period, `pieces` has them, and B u_t becomes what the linear model answers
+        to just these. Their mean would do for a slow input; for an actuator faster than the period it would book the
+        timing of the command as a disturbance.
+        """
+        return x_next - self.A @ x - (self.answer(pieces) if pieces else self.B @ u)
+
+    def answer(self, pieces: Pieces) -> np.ndarray:
+        """The linear model's state, (d,), after the inputs of `pieces` in turn, from the equilibrium."""
+        x = np.zeros(self.d)
+        for seconds, u in pieces:
+            phi, gamma = discretise(self.a, self.b, seconds)
+            x = phi @ x + gamma @ u
+        return x
 
 
 def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +107,8 @@ def build_model(
     Raises:
         ModelError: no equilibrium, not stabilisable, or weights of the wrong length.
     """
-    a, b = discretise(*linearise(plant), period)
+    a_c, b_c = linearise(plant)
+    a, b = discretise(a_c, b_c, period)
     q = np.diag(_weights("Q", Q, plant.d))
     r = np.diag(_weights("R", R, plant.m))
     try:
@@ -105,7 +126,7 @@ def build_model(
             f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})"
         )
     p = solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
-    return Model(plant, period, a, b, q, r, k, 0.5 * (p + p.T))
+    return Model(plant, period, a_c, b_c, a, b, q, r, k, 0.5 * (p + p.T))
 
 
 def _weights(name: str, given: np.ndarray | None, length: int) -> np.ndarray:

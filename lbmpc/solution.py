@@ -13,6 +13,8 @@ class Status(StrEnum):
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "iteration limit"
+    REAL_TIME = "real-time iteration"
+    """One Gauss-Newton step from a linearisation that was prepared before x_t was known."""
     INFEASIBLE = "infeasible"
     """Hard state constraints cannot be met from x_t; the solution violates them as little as possible."""
     ORACLE_REFUSED = "oracle refused"

@@ -7,12 +7,14 @@ constraint. An oracle whose numbers cannot be used at all is set aside for that 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from lbmpc.bound import Bound
-from lbmpc.kernels import build_rows, build_sweep
+from lbmpc.kernels import build_rows, build_sweep, build_tangent
 from lbmpc.least_distance import PRIMAL_TOLERANCE, least_distance, violation
 from lbmpc.oracles.base import LinearOracle, Oracle
 from lbmpc.problem import Problem
@@ -24,6 +26,24 @@ HARD_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A linearisation about a predicted state, waiting for the measured one."""
+
+    x: np.ndarray
+    """Predicted state, (d,)."""
+    status: Status
+    merit: float
+    values: np.ndarray
+    """Row values at w = 0 and x, (rows,)."""
+    slopes: np.ndarray
+    """Their slopes in w, (rows, m N)."""
+    follow: np.ndarray
+    """Their slopes in x, (rows, d)."""
+    free: np.ndarray
+    """The unconstrained minimiser's inputs, (N, m)."""
+
+
 class Solver:
     """One problem, solved again and again from new states, parameters and references.
 
@@ -31,20 +51,31 @@ class Solver:
         problem: what to solve; nothing in it is rebuilt later.
         max_iterations: Gauss-Newton steps in one solve, at least 1.
         tolerance: converged when no input of the plan moves by more (input units).
+        realise: what turns a CasADi function into the one that is called, a compiler for instance.
     """
 
-    def __init__(self, problem: Problem, max_iterations: int = 10, tolerance: float = 1e-6):
+    def __init__(
+        self,
+        problem: Problem,
+        max_iterations: int = 10,
+        tolerance: float = 1e-6,
+        realise: Callable[[ca.Function], ca.Function] = lambda function: function,
+    ):
         self.problem = problem
         self.max_iterations, self.tolerance = max_iterations, tolerance
+        self._realise = realise
         self._rows = Rows(problem)
-        self._move = Bound(build_rows(problem.model, problem.horizon))
+        self._move = Bound(realise(build_rows(problem.model, problem.horizon)))
         self._sweep = self._bind(problem.oracle)
         nominal = LinearOracle(problem.model.d, problem.model.m)
         self._nominal_sweep = self._sweep if problem.oracle.name == nominal.name else self._bind(nominal)
         self._free, self._forced = _prediction(problem)
+        # Built at the first preparation: a controller that converges every tick does not need it.
+        self._tangent: Bound | None = None
+        self._prepared: Prepared | None = None
 
     def _bind(self, oracle: Oracle) -> Bound:
-        return Bound(build_sweep(self.problem.model, oracle, self.problem.horizon))
+        return Bound(self._realise(build_sweep(self.problem.model, oracle, self.problem.horizon)))
 
     def solve(
         self,
@@ -73,6 +104,66 @@ class Solver:
             nominal = self._solve(self._nominal_sweep, x, np.zeros(0), warm_start, xr, ur)
             return replace(nominal, status=Status.ORACLE_REFUSED) if nominal.usable else nominal
 
+    # -- real-time iteration --------------------------------------------------------------------------------
+
+    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
+        """Linearise ahead of the sample, about a predicted state x, (d,); everything that needs no x_t is done here.
+
+        Arguments as for `solve`. One Gauss-Newton step is left for `feedback`.
+        """
+        if self._tangent is None:
+            function = build_tangent(self.problem.model, self.problem.horizon)
+            self._tangent = Bound(self._realise(function))
+        tangent, v = self._tangent, self._rows.clip(np.nan_to_num(warm_start))
+        with np.errstate(all="ignore"):
+            for sweep, theta, status in (
+                (self._sweep, oracle_parameters, Status.REAL_TIME),
+                (self._nominal_sweep, np.zeros(0), Status.ORACLE_REFUSED),
+            ):
+                self._load(sweep, x, theta, None, None)
+                merit = self._evaluate(sweep, x, v)
+                if np.isfinite(merit) and np.isfinite(sweep.outputs["zs"]).all():
+                    break
+                if sweep is self._nominal_sweep:
+                    status = Status.NUMERICAL
+                    break
+            for name in "ABKL":
+                tangent.inputs[name][:] = sweep.outputs[name]
+            tangent()
+        slopes = self._rows.slopes(tangent.outputs["Mv"], tangent.outputs["Mz"])
+        follow = self._rows.slopes(tangent.outputs["Yv"], tangent.outputs["Yz"])
+        values = self._rows.values(sweep.outputs["vs"], sweep.outputs["zs"])
+        free = sweep.outputs["vs"].T.copy()
+        self._prepared = Prepared(np.array(x, dtype=float), status, merit, values, slopes, follow, free)
+
+    def feedback(self, x: np.ndarray) -> Solution:
+        """Complete the prepared step for the measured state x, (d,): a correction of x, and a few QP rows.
+
+        The nominal trajectory is linear in x, so the constraints hold for x itself, not for its prediction.
+
+        Raises:
+            RuntimeError: nothing was prepared.
+        """
+        ready, tangent = self._prepared, self._tangent
+        if ready is None or tangent is None:
+            raise RuntimeError("feedback without preparation: call prepare first")
+        rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
+        with np.errstate(all="ignore"):
+            values = ready.values + ready.follow @ change
+            status, merit = ready.status, ready.merit
+            if status is Status.NUMERICAL or not np.isfinite(values).all():
+                return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
+            v = ready.free + (tangent.outputs["Yv"] @ change).reshape(ready.free.shape)
+            if (violation(values, rows.lower, rows.upper) > PRIMAL_TOLERANCE).any():
+                w, feasible = self._nearest(values, ready.slopes)
+                if w is None:
+                    return self._finish(Status.NUMERICAL, x, v, np.inf, 1)
+                v = v + (tangent.outputs["Mv"] @ w).reshape(v.shape)
+                status = status if feasible else Status.INFEASIBLE
+            return self._finish(status, x, rows.clip(v), merit, 1)
+
+    # -- one Gauss-Newton step -------------------------------------------------------------------------------
+
     def _solve(
         self,
         sweep: Bound,
@@ -82,10 +173,7 @@ class Solver:
         xr: np.ndarray | None,
         ur: np.ndarray | None,
     ) -> Solution:
-        sweep.inputs["x"][:, 0] = x
-        sweep.inputs["theta"][:, 0] = theta
-        sweep.inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
-        sweep.inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
+        self._load(sweep, x, theta, xr, ur)
         v, merit = self._rows.clip(np.nan_to_num(warm_start)), np.inf
         status = Status.ITERATION_LIMIT
         self._evaluate(sweep, x, v)
@@ -98,8 +186,13 @@ class Solver:
             target = self._rows.clip(target)
             if not feasible:
                 status = Status.INFEASIBLE
+            step = target - v
+            if np.isfinite(merit) and np.abs(step).max() < self.tolerance:
+                # Too small a step to be worth another linearisation, and v is feasible already.
+                v, status = target, Status.CONVERGED if feasible else status
+                break
             # The first step leads into the feasible set; after it the true cost must fall.
-            step, trial_merit = target - v, self._evaluate(sweep, x, target)
+            trial_merit = self._evaluate(sweep, x, target)
             if not np.isfinite(trial_merit):
                 break
             halvings = 0
@@ -116,6 +209,15 @@ class Solver:
                 status = Status.CONVERGED if feasible else status
                 break
         return self._finish(status, x, v, merit, iterations)
+
+    @staticmethod
+    def _load(
+        sweep: Bound, x: np.ndarray, theta: np.ndarray, xr: np.ndarray | None, ur: np.ndarray | None
+    ) -> None:
+        sweep.inputs["x"][:, 0] = x
+        sweep.inputs["theta"][:, 0] = theta
+        sweep.inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
+        sweep.inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
 
     def _evaluate(self, sweep: Bound, x: np.ndarray, v: np.ndarray) -> float:
         """Linearise at v, (N, m), and return its true cost, soft constraints included; inf when not usable."""
@@ -139,13 +241,17 @@ class Solver:
             self._move.inputs[name][:] = outputs[name]
         self._move()
         mv, mz = self._move.outputs["Mv"], self._move.outputs["Mz"]
-        slopes = rows.slopes(mv, mz)
-        soft = self.problem.soft
-        w = least_distance(values, slopes, rows.lower, rows.upper, rows.penalty if soft else None)
-        feasible = w is not None or soft
-        if w is None and not soft:
-            w = least_distance(values, slopes, rows.lower, rows.upper, rows.penalty)
+        w, feasible = self._nearest(values, rows.slopes(mv, mz))
         return (None if w is None else free.T + (mv @ w).reshape(free.T.shape)), feasible
+
+    def _nearest(self, values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray | None, bool]:
+        """The w nearest to 0 that the rows allow, softly where they are soft or contradict each other."""
+        rows, soft = self._rows, self.problem.soft
+        if not soft:
+            w = least_distance(values, slopes, rows.lower, rows.upper, None)
+            if w is not None:
+                return w, True
+        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty), soft
 
     def _nominal(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """zbar_1..zbar_N under inputs v, (d, N)."""

@@ -9,15 +9,11 @@ mailbox: a slow reader loses its own oldest messages and stalls nobody.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import queue
-import re
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from concurrent.futures import wait as wait_for
 from typing import Any
 
 import zenoh
@@ -26,6 +22,7 @@ from node_runtime import clock
 from node_runtime.bad_messages import BadMessages
 from node_runtime.config import Config, ConfigError
 from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
+from node_runtime.session import OpenInterrupted, connect, session_config
 from protocol import codec, topics
 from protocol.messages import Message
 from protocol.topics import Topic
@@ -37,63 +34,9 @@ BULK_BYTES = 256 * 1024 * 1024
 PENDING_QUERIES = 32
 LARGEST = max(topic.max_bytes for topic in topics.ALL)
 
-ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
-
 Handler = Callable[[dict[str, str]], list[bytes]]
 
 __all__ = ["Bus", "Delivery", "Handler", "Latest", "Mailbox", "OpenInterrupted", "session_config"]
-
-
-class OpenInterrupted(RuntimeError):
-    """The process was told to stop while it still waited for the router."""
-
-
-def session_config(mode: str, endpoint: str, lease_ms: int) -> zenoh.Config:
-    """Zenoh's configuration for a session of `mode` "client" or "router".
-
-    An explicit endpoint, no scouting, no shared memory.
-
-    Raises:
-        ConfigError: `endpoint` is not like `tcp/127.0.0.1:7447`. Zenoh itself would try it again for ever.
-    """
-    if not ENDPOINT.fullmatch(endpoint):
-        raise ConfigError(
-            f"bus.endpoint = {endpoint!r} is not an endpoint; write tcp/HOST:PORT, or tls/ or quic/ for tcp/"
-        )
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        # Messages above 3 kB vanish without an error where the receiver's memlock limit is small.
-        "transport/shared_memory/enabled": False,
-        # A frozen process or a cut link is noticed after the lease; the default is 10 s.
-        "transport/link/tx/lease": lease_ms,
-        "transport/link/tx/keep_alive": 4,
-        # With Zenoh's two places a busy machine loses up to 3 % of the control messages: whatever is put while the
-        # sending thread waits for a core. Sixteen small ones are still younger than a period.
-        "transport/link/tx/queue/size/real_time": 16,
-    }
-    if mode == "client":
-        settings |= {
-            "listen/endpoints": [],
-            "connect/endpoints": [endpoint],
-            "connect/timeout_ms": -1,
-            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2.0},
-        }
-    else:
-        settings |= {"listen/endpoints": [endpoint], "connect/endpoints": [], "listen/exit_on_failure": True}
-    config = zenoh.Config()
-    for key, value in settings.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise ConfigError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
-    return config
-
-
-def _discard(opened: Future[zenoh.Session]) -> None:
-    if opened.exception() is None:
-        opened.result().close()
 
 
 class Bus:
@@ -136,9 +79,9 @@ class Bus:
         """
         if self._control is not None:
             raise RuntimeError("this bus is open already")
-        control = self._connect()
+        control = connect(self.config, self._stop)
         try:
-            self._bulk = self._connect()
+            self._bulk = connect(self.config, self._stop)
         except (OpenInterrupted, ConfigError):
             control.close()
             raise
@@ -148,35 +91,6 @@ class Bus:
                 self._publisher(topic)
         self._start(self._send_bulk, "bulk")
         self._start(self._answer, "queries")
-
-    def _connect(self) -> zenoh.Session:
-        """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
-        bus = self.config.bus
-        config = session_config("client", bus.endpoint, bus.lease_ms)
-        result: Future[zenoh.Session] = Future()
-
-        def connect() -> None:
-            try:
-                result.set_result(zenoh.open(config))
-            except zenoh.ZError as error:
-                result.set_exception(error)
-
-        threading.Thread(target=connect, name="connect", daemon=True).start()
-        told = False
-        started = clock.now()
-        while not wait_for([result], timeout=0.05).done:
-            if self._stop.is_set():
-                result.add_done_callback(_discard)
-                raise OpenInterrupted(f"stopped while waiting for the router at {bus.endpoint}")
-            if not told and clock.now() - started > 2.0:
-                told = True
-                log.warning(
-                    "no router at %s yet; waiting for it (start it with `tandem router`)", bus.endpoint
-                )
-        try:
-            return result.result()
-        except zenoh.ZError as error:
-            raise ConfigError(f"bus.endpoint = {bus.endpoint!r} cannot be used: {error}") from error
 
     def close(self, drain_s: float = 2.0) -> None:
         """Send what is left of the bulk lane, for at most `drain_s`, and leave. Safe to call twice."""

@@ -7,3 +7,5 @@ from typing import Literal
 OracleName = Literal["linear", "l2nw", "dnn"]
 TighteningName = Literal["none", "first_step", "tube"]
 Strategy = Literal["fifo", "reservoir", "novelty"]
+SolverMode = Literal["converged", "real_time"]
+CompileMode = Literal["auto", "never"]

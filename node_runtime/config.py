@@ -17,7 +17,7 @@ import msgspec
 import tomli_w
 
 from node_runtime import config_words
-from node_runtime.choices import OracleName, Strategy, TighteningName
+from node_runtime.choices import CompileMode, OracleName, SolverMode, Strategy, TighteningName
 from protocol.codec import first_non_finite
 from protocol.network import BOUNDED, Activation, Width
 
@@ -47,6 +47,10 @@ class PlantConfig(Section, frozen=True):
 
 
 class SolverConfig(Section, frozen=True):
+    mode: SolverMode = "converged"
+    """"converged" solves every tick to its tolerance; "real_time" takes one prepared Gauss-Newton step."""
+    compile: CompileMode = "auto"
+    """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
     max_iterations: PositiveInt = 10
     tolerance: Positive = 1e-6
     """Converged when no input of the plan moves by more than this (input units)."""

@@ -42,9 +42,7 @@ class Mailbox:
             self._items.append(delivery)
             self._bytes += len(delivery.payload)
             self._received += 1
-            while len(self._items) > self._capacity or (
-                self._bytes > self._max_bytes and len(self._items) > 1
-            ):
+            while len(self._items) > 1 and self._full():
                 self._bytes -= len(self._items.popleft().payload)
                 self._overflow += 1
             self._arrived.notify()

@@ -10,7 +10,7 @@ import numpy as np
 
 from lbmpc.plants import Plant, Truth
 from plant_sim.watchdog import Orders
-from protocol.messages import Command, InputSource, PlantState
+from protocol.messages import Command, InputSource, Piece, PlantState
 
 CommandVerdict = Literal["ok", "wrong period", "foreign", "stale"]
 
@@ -92,6 +92,7 @@ class PlantSim:
         if segments:
             source = segments[-1].source
             applied = self._applied(segments)
+        pieces = [Piece(s.duration, s.u.tolist()) for s in _merged(segments) if s.u is not None]
         self._orders = orders
         self._pending = [order for order in self._pending if order.arrived > t]
         self._t = t
@@ -103,6 +104,7 @@ class PlantSim:
             t=t,
             x=self._x.tolist(),
             applied=applied,
+            pieces=pieces if applied is not None and len(pieces) > 1 else [],
             source=source,
             command_seq=-1 if orders is None else orders.seq,
         )
@@ -155,3 +157,20 @@ class PlantSim:
             return inputs[0].tolist()
         durations = np.array([segment.duration for segment in segments])
         return (durations @ np.array(inputs) / total).tolist()
+
+
+def _merged(segments: list[_Segment]) -> list[_Segment]:
+    """The same motion with neighbours under the same input made one."""
+    merged: list[_Segment] = []
+    for segment in segments:
+        last = merged[-1] if merged else None
+        if (
+            last is not None
+            and last.u is not None
+            and segment.u is not None
+            and np.array_equal(last.u, segment.u)
+        ):
+            merged[-1] = _Segment(last.duration + segment.duration, last.u, segment.source)
+        else:
+            merged.append(segment)
+    return merged

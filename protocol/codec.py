@@ -98,6 +98,8 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
         case m.PlantState():
             expect("x", message.x, d)
             expect("applied", message.applied, m_inputs)
+            for i, piece in enumerate(message.pieces):
+                expect(f"pieces[{i}].u", piece.u, m_inputs)
         case m.Command():
             expect("u", message.u, m_inputs)
             for i, entry in enumerate(message.plan):

@@ -61,7 +61,14 @@ class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.frombuffer(self.data, dtype=self.dtype).reshape(self.shape).astype(self.dtype[1:])
 
 
-class PlantState(Message, frozen=True):
+class Piece(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A stretch of time under one input."""
+
+    seconds: Annotated[float, msgspec.Meta(ge=0)]
+    u: list[float]
+
+
+class PlantState(Message, frozen=True, kw_only=True):
     """One sample of the plant, x(t), and the input that really acted since the sample before."""
 
     t: float
@@ -69,6 +76,8 @@ class PlantState(Message, frozen=True):
     x: list[float]
     applied: list[float] | None
     """Time average of the input over the last period; None where that period was not a whole one."""
+    pieces: list[Piece] = msgspec.field(default_factory=list)
+    """The inputs that made up that period, in order, where there was more than one; else empty."""
     source: InputSource
     command_seq: Sequence
     """Tick of the last command received, -1 before the first."""

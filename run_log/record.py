@@ -44,13 +44,12 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
             log.error("%s; trying again every %d ms", writer.error, config.log.flush_ms)
         run_id = new_run_id("recorder")
         try:
-            with (
-                Bus(config, "recorder", run_id, stopping) as bus,
-                HealthPublisher(
-                    bus, run_info(config, "recorder", run_id, plant.units), lambda: _counters(writer)
-                ) as health,
-            ):
-                _record(config, writer, bus.everything(), health, stopping)
+            with Bus(config, "recorder", run_id, stopping) as bus:
+                mailbox = bus.everything()
+                # Only now, so that what it says of itself is in the log too.
+                info = run_info(config, "recorder", run_id, plant.units)
+                with HealthPublisher(bus, info, lambda: _counters(writer)) as health:
+                    _record(config, writer, mailbox, health, stopping)
         except OpenInterrupted:
             pass
         except ConfigError as error:
@@ -73,7 +72,8 @@ def _record(
     last_arrival = clock.now()
     while end is None or clock.now() < min(end, last_arrival + QUIET_S):
         if end is None and stopping.is_set():
-            end = clock.now() + LAST_WORDS_S
+            last_arrival = clock.now()
+            end = last_arrival + LAST_WORDS_S
         delivery = mailbox.get(min(0.1, max(0.0, next_flush - clock.now())))
         if delivery is not None:
             last_arrival = clock.now()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import threading
 import time
@@ -23,6 +24,8 @@ SAME_WISH_S = 0.3
 STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 LONG_LIFE_S = 20.0
+SHOW_S = 0.2
+GRACE_S = 0.5
 
 Show = Callable[[Snapshot], None]
 
@@ -88,6 +91,7 @@ class Supervisor:
         self._bus: Bus | None = None
         self._mailbox: Mailbox | None = None
         self._next_show = 0.0
+        self._end: Snapshot | None = None
         self._restart_at: dict[str, float] = {}
         self._started_at: dict[str, float] = {}
         self._deaths: dict[str, int] = {}
@@ -155,6 +159,7 @@ class Supervisor:
 
     def _await_ready(self, name: str) -> None:
         child = self.children[name]
+        self.monitor.phase = f"the {name}"
         deadline = time.monotonic() + child.process.ready_s
         while self.monitor.status(name) not in ("ready", "running") and not self.wish.stop:
             self._fail_if_dead(*self.children)
@@ -182,12 +187,15 @@ class Supervisor:
 
     def _watch(self) -> str | None:
         """Until the time is over, or the person asks, or a process without which nothing goes on has died."""
-        # The last tick that counts has begun by then, and is finished; the next one does not begin.
-        lasts = self.monitor.seconds - 0.75 * self.config.period
+        self.monitor.phase = ""
+        slots = max(1, round(self.monitor.seconds * self.config.rate))
         waiting_since = time.monotonic()
         while not self.wish.stop:
             first = self.monitor.first_command
-            if first is not None and time.monotonic() >= first + lasts:
+            # The last slot says it exactly, the clock in any case.
+            if self.monitor.slots >= slots:
+                return None
+            if first is not None and time.monotonic() >= first + self.monitor.seconds + GRACE_S:
                 return None
             if first is None and time.monotonic() > waiting_since + 30.0:
                 return "the controller is ready, but no command came for 30 s"
@@ -237,19 +245,22 @@ class Supervisor:
         else:
             time.sleep(timeout_s)
         now = time.monotonic()
-        if now >= self._next_show:
-            self._next_show = now + 0.2
+        if self._end is None and now >= self._next_show:
+            self._next_show = now + SHOW_S
             self._show(self.monitor.snapshot(now))
 
     # -- stopping ----------------------------------------------------
 
     def _stop_all(self) -> None:
-        """In order, politely, then not."""
+        """In order, politely, then not. The screen keeps the last moment of the run."""
+        ended = time.monotonic()
+        last = self._end = self.monitor.snapshot(ended)
         for name in STOP_ORDER:
             child = self.children.get(name)
             if child is None or not child.alive():
                 continue
             child.signal(signal.SIGTERM)
+            self._show(dataclasses.replace(last, phase=f"the {name} to stop"))
             deadline = time.monotonic() + STOP_S[name]
             while child.alive() and time.monotonic() < deadline:
                 self._listen(0.01)
@@ -264,6 +275,13 @@ class Supervisor:
             elif child.exit_code() != 0:
                 self.monitor.say(f"the {name} ended with {child.how_it_ended()}", time.monotonic(), "bad")
                 self.recorder_died |= name == "recorder"
+        # With what was still on its way: the last tick, and anything that went wrong in stopping.
+        frozen = ("states", "inputs", "source", "processes", "phase")
+        self._show(
+            dataclasses.replace(
+                self.monitor.snapshot(ended), **{name: getattr(last, name) for name in frozen}
+            )
+        )
 
     def _kill_all(self) -> None:
         """Whatever still runs. Signals are ignored meanwhile, so that nothing interrupts this."""

@@ -67,6 +67,8 @@ class Snapshot:
     plant: str
     oracle: str
     rate: float
+    phase: str
+    """What is being waited for, e.g. "the trainer"; empty while the run goes on."""
     elapsed: float | None
     """Seconds since the first command, None before it."""
     seconds: float
@@ -116,8 +118,12 @@ class Monitor:
     plant: Plant
     seconds: float
     bad: BadMessages = field(default_factory=BadMessages)
+    phase: str = ""
+    """See `Snapshot`; whoever supervises says it."""
     first_command: float | None = None
     """When the first command arrived; seconds on the monotonic clock."""
+    slots: int = 0
+    """Of the controller, up to its newest tick."""
 
     def __post_init__(self) -> None:
         self._followers: dict[str, Follower] = {}
@@ -133,7 +139,7 @@ class Monitor:
         self._errors: deque[tuple[float, float]] = deque(maxlen=RECENT_TICKS)
         self._trend: deque[float] = deque(maxlen=TREND_SECONDS)
         self._trend_second = 0
-        self._ticks = self._late = self._skipped = self._fallback = self._soft = 0
+        self._first_slot = self._ticks = self._late = self._skipped = self._fallback = self._soft = 0
         self._adopted = self._refused = 0
         self._events: deque[Event] = deque(maxlen=200)
         self._new_events: deque[Event] = deque(maxlen=200)
@@ -171,6 +177,9 @@ class Monitor:
                     self.say("the first command: the run begins", now)
                 self._input = message.u
             case m.Tick():
+                if not self._ticks:
+                    self._first_slot = message.slot
+                self.slots = message.slot - self._first_slot + 1
                 self._ticks += 1
                 self._late += message.late
                 self._skipped += message.skipped
@@ -262,6 +271,7 @@ class Monitor:
             plant=plant.name,
             oracle=self.config.controller.oracle,
             rate=self.config.rate,
+            phase=self.phase,
             elapsed=None if self.first_command is None else now - self.first_command,
             seconds=self.seconds,
             states=_gauges(

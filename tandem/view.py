@@ -63,7 +63,9 @@ def render(now: Snapshot, width: int, height: int) -> RenderableType:
 def line(now: Snapshot) -> str:
     """The same as one line of plain text."""
     if now.elapsed is None:
-        return "waiting for the first command: " + ", ".join(f"{p.name} {p.status}" for p in now.processes)
+        return f"waiting for {now.phase or 'the first command'}: " + ", ".join(
+            f"{p.name} {p.status}" for p in now.processes
+        )
     parts = [
         f"{now.elapsed:6.1f} s",
         " ".join(f"{g.name} {_number(g)}" for g in (*now.states, *now.inputs)),
@@ -87,8 +89,8 @@ def _heading(now: Snapshot, width: int) -> Text:
     left = Text.assemble(
         (" Tandem ", "bold reverse"), f" {now.name}  ", (f"{now.plant}, {now.oracle}, {now.rate:g} Hz", "dim")
     )
-    if now.elapsed is None:
-        right = Text("waiting for the first command ", "yellow")
+    if now.phase or now.elapsed is None:
+        right = Text(f"waiting for {now.phase or 'the first command'} ", "yellow")
     else:
         elapsed = min(now.elapsed, now.seconds)
         cells = max(0, min(30, width - left.cell_len - 22))

@@ -308,17 +308,19 @@ def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
             # The plan comes to its end, the controller waits, and goes on when the plant is back.
             ear.until(waiting)
             ticks_before = ear.of(topics.TICK)[-1].seq
-            script.send()
-            resumed = ear.until(
-                lambda message: isinstance(message, m.Tick) and message.state_verdict == "fresh"
-            )
+            again: list[int] = []
+            while all(
+                tick.seq <= ticks_before for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"
+            ):
+                script.period(config)
+                again.append(script.send().seq)
             process.signal(signal.SIGTERM)
             assert process.end() == 0
         script.close()
     ticks: list[m.Tick] = ear.of(topics.TICK)
-    assert resumed.seq == ticks_before + 1
+    assert [tick.seq for tick in ticks] == list(range(len(ticks)))
     assert {tick.state.run_id for tick in ticks if tick.state} == {"plant-a"}
-    assert {tick.state.seq for tick in ticks if tick.state_verdict == "fresh"} <= {*good, script.seq}
+    assert {tick.state.seq for tick in ticks if tick.state_verdict == "fresh"} <= {*good, *again}
     by_seq = {tick.seq: tick for tick in ticks}
     for command in ear.of(topics.COMMAND):
         if by_seq[command.seq].state_verdict != "fresh":

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lbmpc.model import ModelError, build_model, linearise
+from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
 from science import compressor
 
@@ -72,3 +73,23 @@ def test_what_is_no_equilibrium_is_refused() -> None:
 def test_weights_of_the_wrong_length_are_refused() -> None:
     with pytest.raises(ModelError, match="Q has 3 weights"):
         build_model(PLANT, 0.05, Q=np.ones(3))
+
+
+def test_the_answer_to_one_piece_is_B_u_and_pieces_compose() -> None:
+    model, u = compressor(), np.array([0.3])
+    np.testing.assert_allclose(model.answer(((0.05, u),)), model.B @ u, atol=1e-15)
+    np.testing.assert_allclose(model.answer(((0.02, u), (0.03, u))), model.B @ u, atol=1e-14)
+
+
+def test_a_label_with_pieces_is_free_of_the_commands_timing() -> None:
+    """Near the equilibrium h is tiny; the mean input would book a late command as an h many times that size."""
+    model, truth = compressor(), Truth(PLANT)
+    early, late = np.array([0.02]), np.array([-0.05])
+    x = np.array([0.01, -0.01, 0.0, 0.0])
+    middle = truth.step(x + PLANT.x_e, early + PLANT.u_e, 0.01)
+    after = truth.step(middle, late + PLANT.u_e, 0.04) - PLANT.x_e
+    mean = 0.2 * early + 0.8 * late
+    exact = model.label(x, mean, after, ((0.01, early), (0.04, late)))
+    naive = model.label(x, mean, after)
+    assert np.abs(exact).max() < 2e-5
+    assert np.abs(naive).max() > 0.05

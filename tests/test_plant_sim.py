@@ -46,8 +46,8 @@ def command(
     )
 
 
-def plant(x0: np.ndarray = PLANT.x0, patience: float = 1.5) -> PlantSim:
-    return PlantSim(PLANT, PERIOD, x0, patience, "plant-a")
+def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
+    return PlantSim(PLANT, period, x0, 1.5, "plant-a")
 
 
 # -- in virtual time -------------------------------------------------------------------------------------
@@ -62,16 +62,18 @@ def test_the_plant_is_held_until_its_first_command() -> None:
     assert not sim.moving
 
 
-def test_lock_step_applies_each_input_exactly_for_its_period() -> None:
-    sim, truth = plant(), Truth(PLANT)
+# With a period of 0.03 s an average over the period would round, with 0.05 s it would not.
+@pytest.mark.parametrize("period", [0.05, 0.03])
+def test_lock_step_applies_each_input_exactly_for_its_period(period: float) -> None:
+    sim, truth = plant(period=period), Truth(PLANT)
     x = PLANT.x0
     rng = np.random.default_rng(0)
     state = sim.sample(0.0)
-    for k in range(40):
+    for k in range(60):
         u = U + float(rng.uniform(-0.05, 0.05))
-        assert sim.command(command(k, u, answers=state.seq), k * PERIOD) == "ok"
-        state = sim.sample((k + 1) * PERIOD)
-        x = truth.step(x, np.array([u]), PERIOD)
+        assert sim.command(command(k, u, answers=state.seq, period=period), k * period) == "ok"
+        state = sim.sample((k + 1) * period)
+        x = truth.step(x, np.array([u]), period)
         assert state.x == x.tolist()
         assert state.applied == [u]
         assert (state.source, state.command_seq, state.seq) == ("command", k, k + 1)
@@ -201,7 +203,7 @@ def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
 
 @pytest.mark.live
 def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
-    config = live_config("rate=50.0", "plant.x0=[0.5, 1.6875, 1.1547, 0.0]")
+    config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]")
     with Router(config), Bus(config, "controller", "controller-a") as bus:
         ear = Ear(bus)
         with Process("plant_sim.node", config) as process:
@@ -213,7 +215,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
                 ear.of(topics.PLANT_STATE)
                 state = ear.until(lambda message: isinstance(message, m.PlantState))
                 assert isinstance(state, m.PlantState)
-                answer = command(k, U + 0.01, [U] * 5, answers=state.seq, run_id=state.run_id, period=0.02)
+                answer = command(k, U + 0.01, [U] * 5, answers=state.seq, run_id=state.run_id)
                 bus.publish(topics.COMMAND, answer)
                 stranger.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
             ear.until(health_of("plant", note="no fresh command and the plan has ended: safe input"))
@@ -225,7 +227,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
     sources = [state.source for state in ear.of(topics.PLANT_STATE)]
     order = [source for k, source in enumerate(sources) if k == 0 or sources[k - 1] != source]
     assert order[0] == "hold"
-    assert order[1] == "command"
+    assert "command" in order
     assert order[-2:] == ["plan", "safe"]
     applied = {state.applied[0] for state in ear.of(topics.PLANT_STATE) if state.applied}
     assert all(U - 1e-9 <= u <= U + 0.01 + 1e-9 for u in applied)

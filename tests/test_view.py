@@ -135,6 +135,7 @@ def test_counts_what_happened(monitor: Monitor):
     assert (now.ticks, now.late, now.skipped, now.fallback, now.soft) == (50, 1, 2, 1, 1)
     assert (now.adopted, now.refused, now.weights_version) == (1, 1, 3)
     assert now.elapsed == pytest.approx(2.5)
+    assert monitor.slots == 50
     assert now.measured_rate == pytest.approx(20.0)
     assert now.solve_ms == pytest.approx((2.45, 4.851))
     assert [g.value for g in now.states] == [0.3, 1.5, 1.1, 0.2]

@@ -1,0 +1,157 @@
+"""Signals, real-time priority with and without the privilege, garbage collection, health."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+from live import Ear, health_of, live_config, wait_for
+
+from node_runtime import clock
+from node_runtime.bus import Bus
+from node_runtime.health import HealthPublisher, run_info
+from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
+from node_runtime.realtime import GarbageCollection, punctual
+from node_runtime.router import Router
+from protocol import messages as m
+from protocol import topics
+
+STUBBORN = """
+import threading
+from node_runtime.lifecycle import stopped_by_signals
+with stopped_by_signals() as stop:
+    print("running", flush=True)
+    stop.wait()
+    print("told", flush=True)
+    threading.Event().wait()
+"""
+UNPRIVILEGED = """
+import logging, os, resource, sys
+from node_runtime.realtime import punctual
+logging.basicConfig(format="%(message)s")
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.geteuid() == 0:
+    os.setuid(65534)
+with punctual(50) as note:
+    print(note)
+"""
+
+
+def test_run_ids_are_fresh_and_fit_a_message() -> None:
+    ids = {new_run_id("controller") for _ in range(100)}
+    assert len(ids) == 100
+    assert all(run_id.startswith("controller-") and len(run_id) <= 64 for run_id in ids)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_first_signal_asks_and_a_later_one_ends(number: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "running\n"
+            first = clock.now()
+            process.send_signal(number)
+            process.send_signal(number)
+            assert process.stdout.readline() == "told\n"
+            # What comes at once is the same wish, so the process must still be there.
+            assert process.poll() is None
+            while process.poll() is None:
+                assert clock.now() - first < 20.0
+                clock.sleep_until(clock.now() + 0.1)
+                process.send_signal(number)
+            assert clock.now() - first > SAME_WISH
+            assert process.returncode == -number
+        finally:
+            process.kill()
+
+
+def test_signals_are_as_before_afterwards() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with stopped_by_signals() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.wait(10.0)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_outside_the_main_thread_signals_are_left_alone() -> None:
+    given, seen = threading.Event(), []
+
+    def work() -> None:
+        with stopped_by_signals(given) as stop:
+            seen.append(stop)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [given]
+
+
+def test_without_the_privilege_one_warning_and_a_note() -> None:
+    done = subprocess.run([sys.executable, "-c", UNPRIVILEGED], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "no privilege for SCHED_FIFO priority 50" in done.stdout
+    assert done.stderr.count("no privilege") == 1
+    assert "CAP_SYS_NICE" in done.stderr
+
+
+def test_everything_is_as_before_after_a_punctual_loop() -> None:
+    before = os.sched_getscheduler(0), sys.getswitchinterval(), gc.get_freeze_count()
+    with punctual(1) as note:
+        assert (os.sched_getscheduler(0) == os.SCHED_FIFO) == (note == "")
+        GarbageCollection().begin()
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert (os.sched_getscheduler(0), sys.getswitchinterval(), gc.get_freeze_count()) == before
+
+
+def test_priority_0_leaves_the_scheduler_alone() -> None:
+    with punctual(0) as note:
+        assert note == ""
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_garbage_is_collected_between_steps_only() -> None:
+    with punctual(0):
+        garbage = GarbageCollection(every=3)
+        garbage.begin()
+        collections = [sum(generation["collections"] for generation in gc.get_stats())]
+        for _ in range(6):
+            garbage.idle()
+            collections.append(sum(generation["collections"] for generation in gc.get_stats()))
+    assert [b - a for a, b in itertools.pairwise(collections)] == [0, 0, 1, 0, 0, 1]
+
+
+@pytest.mark.live
+def test_health_is_heard_regularly_and_at_every_change() -> None:
+    config = live_config()
+    with Router(config), Bus(config, "recorder", "r") as listener, Bus(config, "plant", "plant-a") as bus:
+        ear = Ear(listener)
+        wait_for(lambda: bus.matched(topics.HEALTH["plant"]) and bus.matched(topics.RUN_INFO["plant"]))
+        info = run_info(config, "plant", "plant-a", {"z": "1"})
+        with HealthPublisher(bus, info, lambda: {"samples": 7}, "standing note") as health:
+            ear.until(lambda message: isinstance(message, m.RunInfo))
+            first = ear.until(health_of("plant", status="starting", note="standing note"))
+            health.set("running")
+            health.set("running")
+            ear.until(health_of("plant", status="running"))
+            health.set("running", "changed")
+            changed = ear.until(health_of("plant", status="running", note="standing note; changed"))
+            began = clock.now()
+            for _ in range(2):
+                ear.until(health_of("plant", status="running"))
+            assert clock.now() - began < 5.0
+        ear.until(health_of("plant", status="stopping"))
+        assert isinstance(first, m.Health)
+        assert isinstance(changed, m.Health)
+        assert first.counters["samples"] == 7
+        heard = ear.of(topics.HEALTH["plant"])
+        assert [one.seq for one in heard] == list(range(len(heard)))
+        with pytest.raises(RuntimeError), HealthPublisher(bus, info):
+            raise RuntimeError("the model is broken")
+        ear.until(health_of("plant", status="failed", note="RuntimeError: the model is broken"))
