@@ -94,7 +94,23 @@ def build_controller(config: Config, realise: Realise | None = None) -> Controll
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
     solver = Solver(problem, chosen.max_iterations, chosen.tolerance, realise or _as_it_is)
-    return Controller(problem, solver, real_time=chosen.mode == "real_time")
+    controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
+    _warm_up(controller, config.seed)
+    return controller
+
+
+def _warm_up(controller: Controller, seed: int) -> None:
+    """Whatever is slow the first time is slow here and not in the first tick; leaves no trace in any result."""
+    x, solver = np.zeros(controller.model.d), controller.solver
+    state = controller.initial_state(seed)
+    theta = controller.oracle.theta(state.oracle)
+    # Far enough out that the QP is needed too.
+    edge = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
+    for start in (x, edge):
+        solver.solve(start, theta, state.plan.v)
+        if controller.real_time:
+            solver.prepare(start, theta, state.plan.v)
+            solver.feedback(start)
 
 
 def _as_it_is(function: ca.Function) -> ca.Function:
