@@ -287,7 +287,9 @@ def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
             waiting = health_of("controller", status="ready", note="no plant: waiting for its states")
             ear.until(waiting)
             wait_for(lambda: script.bus.matched(topics.PLANT_STATE))
-            good = []
+            # Whoever comes first is followed.
+            good = [script.send().seq]
+            ear.until(lambda message: isinstance(message, m.Tick))
             for _ in range(20):
                 script.period(config)
                 script.forge(script.state(run_id="plant-b"))

@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from science import compressor
 
 from lbmpc.model import ModelError, build_model, linearise
 from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
-from science import compressor
 
 
 def test_the_jacobian_is_that_of_the_equations_by_hand() -> None:
@@ -65,7 +65,7 @@ def test_without_poles_K_is_the_lqr_gain() -> None:
 
 
 def test_what_is_no_equilibrium_is_refused() -> None:
-    moved = dataclasses.replace(PLANT, x_e=PLANT.x_e + [0.1, 0, 0, 0])
+    moved = dataclasses.replace(PLANT, x_e=PLANT.x_e + np.array([0.1, 0, 0, 0]))
     with pytest.raises(ModelError, match="not an equilibrium"):
         build_model(moved, 0.05)
 

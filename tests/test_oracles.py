@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from science import compressor, describe, oracle_named
 
 from lbmpc.oracles import DnnOracle, L2nwOracle
 from lbmpc.oracles.base import function
 from protocol.network import hash_layers
-from science import compressor, describe, oracle_named
 
 MODEL = compressor()
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from science import compressor
 
 from lbmpc.oracles import LinearOracle
 from lbmpc.problem import build_problem, disturbance_set, input_set, state_set
 from lbmpc.sets.invariant import terminal_set
 from lbmpc.sets.polytope import EmptySetError, Polytope
 from lbmpc.sets.tube import tube_margins
-from science import compressor
 
 MODEL = compressor()
 SMALL = np.array([0.003, 0.0005, 1e-5, 1.1e-4])
@@ -96,7 +98,7 @@ def test_the_tube_is_hard_and_shrinks() -> None:
     problem = build_problem(MODEL, LinearOracle(4, 1), 20, "tube", SMALL)
     assert not problem.soft
     widths = [set_.upper[1] - set_.lower[1] for set_ in problem.states]
-    assert all(a > b for a, b in zip(widths[:-1], widths[1:], strict=True))
+    assert all(a > b for a, b in itertools.pairwise(widths))
     assert len(problem.states[-1].F) > 4
     assert problem.inputs[-1].upper[0] < problem.inputs[0].upper[0] == input_set(MODEL).upper[0]
 

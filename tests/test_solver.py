@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from science import compressor, describe, oracle_named, trained_theta
 
 from lbmpc.oracles import DnnOracle, LinearOracle
 from lbmpc.plants import Truth
@@ -17,7 +18,6 @@ from lbmpc.problem import build_problem, input_set
 from lbmpc.reference import ReferenceSolver
 from lbmpc.solution import Status
 from lbmpc.solver import Solver
-from science import compressor, describe, oracle_named, trained_theta
 
 MODEL = compressor()
 X0 = MODEL.plant.x0 - MODEL.plant.x_e
