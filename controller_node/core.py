@@ -209,6 +209,7 @@ class ControllerCore:
             oracle_norms=np.linalg.norm(state["K"], axis=0).tolist() if self._dnn else [],
             hidden_version=self._version(),
             hidden_sha256=self._hidden_hash,
+            input_delay=result.delay,
             weights_verdict=result.verdict,
         )
 

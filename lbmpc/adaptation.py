@@ -14,7 +14,8 @@ import numpy as np
 def project_columns(K: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Scale every column of K, (n, d), whose Euclidean norm exceeds its bound, (d,), back onto it."""
     norms = np.sqrt((K * K).sum(axis=0))
-    return K * np.where(norms > bounds, bounds / np.maximum(norms, np.finfo(float).tiny), 1.0)
+    # A norm below its bound needs no division, and zero could not stand one.
+    return K * np.where(norms > bounds, bounds / np.where(norms > bounds, norms, 1.0), 1.0)
 
 
 def adapt(K: np.ndarray, phi: np.ndarray, error: np.ndarray, gamma: float, bounds: np.ndarray) -> np.ndarray:

@@ -12,13 +12,15 @@ from typing import Literal, Protocol
 import numpy as np
 
 from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
-from lbmpc.model import Model, Pieces
+from lbmpc.model import Model, Pieces, discretise
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
 from lbmpc.solution import Solution
 
 Mode = Literal["solver", "shifted_plan", "feedback"]
+DELAY_GAIN = 0.2
+"""Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,8 @@ class ControllerState:
     """Its (source, sequence); sequence -1 when none is pending."""
     predicted: np.ndarray
     """The learned model's prediction of the next state, (d,)."""
+    delay: float
+    """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
     oracle: OracleState
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -70,6 +74,7 @@ class ControllerState:
             "pending.x": self.pending_x,
             "pending": np.array(self.pending, dtype=np.int64),
             "predicted": self.predicted,
+            "delay": np.array([self.delay]),
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -82,7 +87,14 @@ class ControllerState:
             name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
         }
         plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
-        return cls(plan, arrays["pending.x"], (source, sequence), arrays["predicted"], oracle)
+        return cls(
+            plan,
+            arrays["pending.x"],
+            (source, sequence),
+            arrays["predicted"],
+            float(arrays["delay"][0]),
+            oracle,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +118,8 @@ class StepResult:
     label: Label | None
     verdict: str
     """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
+    delay: float
+    """Seconds for which the sample was predicted ahead, to when the command acts."""
 
 
 class Solves(Protocol):
@@ -138,7 +152,7 @@ class Controller:
         oracle = self.oracle.initial_state(np.random.default_rng(seed))
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
-        return ControllerState(plan, nothing, (0, -1), nothing, oracle)
+        return ControllerState(plan, nothing, (0, -1), nothing, 0.0, oracle)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -156,14 +170,16 @@ class Controller:
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
         oracle, verdict = self._adopt(oracle, seen.hidden)
-        plan, mode, solution = self._plan(state, oracle, seen.x)
+        delay = self._delay(state.delay, seen)
+        start = self._when_it_acts(oracle, seen, delay)
+        plan, mode, solution = self._plan(state, oracle, start)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
-        x = seen.x if seen.x is not None else state.predicted
+        x = start if start is not None else state.predicted
         predicted = self.model.A @ x + self.model.B @ plan.v[0] + self.oracle.estimate(oracle, x, plan.v[0])
-        after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, oracle)
-        return after, StepResult(plan.v, mode, solution, label, verdict)
+        after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
+        return after, StepResult(plan.v, mode, solution, label, verdict, delay)
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
@@ -174,6 +190,26 @@ class Controller:
         h = self.model.label(x, u, seen.x, seen.pieces)
         label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u))
         return label, self.oracle.learn(state.oracle, x, u, h)
+
+    def _delay(self, delay: float, seen: Observation) -> float:
+        """The plant reports when the last command took over from the one before; its average, at most half a period."""
+        if len(seen.pieces) < 2:
+            return delay
+        measured = sum(seconds for seconds, _u in seen.pieces[:-1])
+        return min(delay + DELAY_GAIN * (measured - delay), 0.5 * self.model.period)
+
+    def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
+        """The state, (d,), at which the command that is being computed will begin to act.
+
+        Until then the plant goes on under the input it has, which the model knows; without this every millisecond
+        between sample and command would be a disturbance.
+        """
+        acting = seen.pieces[-1][1] if seen.pieces else seen.applied
+        if seen.x is None or acting is None or delay == 0.0:
+            return seen.x
+        phi, gamma = discretise(self.model.a, self.model.b, delay)
+        drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
+        return phi @ seen.x + gamma @ acting + drift
 
     def _adopt(self, oracle: OracleState, hidden: HiddenSet | None) -> tuple[OracleState, str]:
         if hidden is None:

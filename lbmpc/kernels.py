@@ -84,38 +84,43 @@ def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
 
 
 def build_rows(model: Model, n: int) -> ca.Function:
-    """(A, B, K, L) of `sweep` -> (Mv (m n, m n), Mz (d n, m n)): how v and zbar_1..n move with w."""
+    """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n): how v_0..n-1, then zbar_1..n, move with w; transposed."""
     return _propagation(model, n, follow_state=False)
 
 
 def build_tangent(model: Model, n: int) -> ca.Function:
-    """`build_rows`, and besides (Yv (m n, d), Yz (d n, d)): how v and zbar_1..n follow x when w stays."""
+    """`build_rows`, and besides Y' (d, (m + d) n): how v_0..n-1, then zbar_1..n, follow x when w stays."""
     return _propagation(model, n, follow_state=True)
 
 
 def _propagation(model: Model, n: int, follow_state: bool) -> ca.Function:
+    """Forward sensitivities, one row a direction: the blocks of all stages then lie side by side in memory."""
     d, m = model.d, model.m
-    a, b = ca.DM(model.A), ca.DM(model.B)
+    a, b = ca.DM(model.A).T, ca.DM(model.B).T
     a_all, b_all = ca.MX.sym("A", d, d * n), ca.MX.sym("B", d, m * n)
     k_all, l_all = ca.MX.sym("K", m, d * n), ca.MX.sym("L", m, m * n)
     a_i, b_i = ca.horzsplit(a_all, d), ca.horzsplit(b_all, m)
     k_i, l_i = ca.horzsplit(k_all, d), ca.horzsplit(l_all, m)
-    # Columns: the directions of x, where they are followed, then w_0, w_1, ... as they begin to act.
+    # Directions: those of x, where they are followed, then all of w.
     before = d if follow_state else 0
-    step = nominal = ca.MX.eye(d) if follow_state else ca.MX(d, 0)
-    pad = ca.MX.zeros(d, m)
+    rows = before + m * n
+    step = nominal = (
+        ca.densify(ca.vertcat(ca.DM.eye(before), ca.DM(m * n, d))) if before else ca.DM.zeros(rows, d)
+    )
+    step, nominal = ca.MX(step), ca.MX(nominal)
     moves, states = [], []
     for i in range(n):
-        move = ca.horzcat(k_i[i] @ step, l_i[i]) if step.shape[1] else l_i[i]
-        step = (ca.horzcat(a_i[i] @ step, pad) if step.shape[1] else pad) + b_i[i] @ move
-        nominal = (ca.horzcat(a @ nominal, pad) if nominal.shape[1] else pad) + b @ move
-        rest = m * (n - 1 - i)
-        moves.append(ca.horzcat(move, ca.MX.zeros(m, rest)))
-        states.append(ca.horzcat(nominal, ca.MX.zeros(d, rest)))
-    mv, mz = ca.densify(ca.vertcat(*moves)), ca.densify(ca.vertcat(*states))
-    outputs, names = [mv[:, before:], mz[:, before:]], ["Mv", "Mz"]
-    if follow_state:
-        outputs, names = [*outputs, mv[:, :before], mz[:, :before]], [*names, "Yv", "Yz"]
+        # w_i begins to act at stage i.
+        own = ca.vertcat(ca.MX(before + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
+        move = step @ k_i[i].T + own
+        step = step @ a_i[i].T + move @ b_i[i].T
+        nominal = nominal @ a + move @ b
+        moves.append(move)
+        states.append(nominal)
+    everything = ca.densify(ca.horzcat(*moves, *states))
+    outputs, names = (
+        ([everything[:before, :], everything[before:, :]], ["Y", "M"]) if before else ([everything], ["M"])
+    )
     name = "tangent" if follow_state else "rows"
     return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
 

@@ -22,6 +22,8 @@ class Rows:
         last = problem.states[-1]
         # The last step may carry the rows of a terminal set behind the rows that all steps share.
         self.terminal_rows = last.F[common:]
+        # Boxes throughout: the rows are the variables themselves.
+        self._plain = problem.states[0].is_box and not len(self.terminal_rows)
         parts = [*problem.inputs, *problem.states]
         self.lower = np.concatenate([part.lower for part in parts])
         self.upper = np.concatenate([part.upper for part in parts])
@@ -44,18 +46,19 @@ class Rows:
 
     def values(self, v: np.ndarray, zbar: np.ndarray) -> np.ndarray:
         """Row values of inputs v (m, n) and nominal states zbar (d, n)."""
-        parts = [(self.input_rows @ v).T.ravel(), (self.state_rows @ zbar).T.ravel()]
-        return np.concatenate([*parts, self.terminal_rows @ zbar[:, -1]])
+        return self.apply(np.concatenate([v.T.ravel(), zbar.T.ravel()]))
 
-    def slopes(self, mv: np.ndarray, mz: np.ndarray) -> np.ndarray:
-        """Row slopes from those of v (m n, k) and zbar (d n, k)."""
-        k = mv.shape[1]
-        parts = [
-            np.matmul(self.input_rows, mv.reshape(self.n, self.m, k)).reshape(-1, k),
-            np.matmul(self.state_rows, mz.reshape(self.n, self.d, k)).reshape(-1, k),
-            self.terminal_rows @ mz[-self.d :],
-        ]
-        return np.concatenate(parts)
+    def apply(self, y: np.ndarray) -> np.ndarray:
+        """The rows of y = (v_0..n-1, zbar_1..n), stage by stage: ((m + d) n,) -> (rows,), or for many columns."""
+        if self._plain:
+            return y
+        n, split = self.n, self.m * self.n
+        many = y.reshape(len(y), -1)
+        inputs = np.matmul(self.input_rows, many[:split].reshape(n, self.m, -1))
+        states = np.matmul(self.state_rows, many[split:].reshape(n, self.d, -1))
+        k = many.shape[1]
+        last = self.terminal_rows @ many[len(y) - self.d :]
+        return np.concatenate([inputs.reshape(-1, k), states.reshape(-1, k), last]).reshape(-1, *y.shape[1:])
 
     def slack(self, values: np.ndarray) -> tuple[float, str]:
         outside = violation(values, self.lower, self.upper)[self.count_inputs :]

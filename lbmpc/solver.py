@@ -15,7 +15,7 @@ import numpy as np
 
 from lbmpc.bound import Bound
 from lbmpc.kernels import build_rows, build_sweep, build_tangent
-from lbmpc.least_distance import PRIMAL_TOLERANCE, least_distance, violation
+from lbmpc.least_distance import NO_ROWS, Nearest, least_distance, violation
 from lbmpc.oracles.base import LinearOracle, Oracle
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
@@ -33,7 +33,7 @@ class Prepared:
     x: np.ndarray
     """Predicted state, (d,)."""
     status: Status
-    merit: float
+    cost: float
     values: np.ndarray
     """Row values at w = 0 and x, (rows,)."""
     slopes: np.ndarray
@@ -42,6 +42,24 @@ class Prepared:
     """Their slopes in x, (rows, d)."""
     free: np.ndarray
     """The unconstrained minimiser's inputs, (N, m)."""
+    slopes_v: np.ndarray
+    """How those move with w, (m N, m N)."""
+    follow_v: np.ndarray
+    """How they follow x, (m N, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Where one Gauss-Newton step leads."""
+
+    v: np.ndarray
+    """Inputs, (N, m)."""
+    values: np.ndarray
+    """Row values there, (rows,)."""
+    feasible: bool
+    """Whether the hard state rows can be met."""
+    seen: np.ndarray
+    """Rows that the QP was shown."""
 
 
 class Solver:
@@ -70,6 +88,7 @@ class Solver:
         nominal = LinearOracle(problem.model.d, problem.model.m)
         self._nominal_sweep = self._sweep if problem.oracle.name == nominal.name else self._bind(nominal)
         self._free, self._forced = _prediction(problem)
+        self._shape = (problem.horizon, problem.model.m)
         # Built at the first preparation: a controller that converges every tick does not need it.
         self._tangent: Bound | None = None
         self._prepared: Prepared | None = None
@@ -114,27 +133,33 @@ class Solver:
         if self._tangent is None:
             function = build_tangent(self.problem.model, self.problem.horizon)
             self._tangent = Bound(self._realise(function))
-        tangent, v = self._tangent, self._rows.clip(np.nan_to_num(warm_start))
+        tangent, rows, v = self._tangent, self._rows, self._rows.clip(np.nan_to_num(warm_start))
         with np.errstate(all="ignore"):
-            for sweep, theta, status in (
+            status = Status.NUMERICAL
+            for sweep, theta, trusted in (
                 (self._sweep, oracle_parameters, Status.REAL_TIME),
                 (self._nominal_sweep, np.zeros(0), Status.ORACLE_REFUSED),
             ):
                 self._load(sweep, x, theta, None, None)
-                merit = self._evaluate(sweep, x, v)
-                if np.isfinite(merit) and np.isfinite(sweep.outputs["zs"]).all():
-                    break
-                if sweep is self._nominal_sweep:
-                    status = Status.NUMERICAL
+                cost = self._linearise(sweep, v)
+                if np.isfinite(cost) and np.isfinite(sweep.outputs["zs"]).all():
+                    status = trusted
                     break
             for name in "ABKL":
                 tangent.inputs[name][:] = sweep.outputs[name]
             tangent()
-        slopes = self._rows.slopes(tangent.outputs["Mv"], tangent.outputs["Mz"])
-        follow = self._rows.slopes(tangent.outputs["Yv"], tangent.outputs["Yz"])
-        values = self._rows.values(sweep.outputs["vs"], sweep.outputs["zs"])
-        free = sweep.outputs["vs"].T.copy()
-        self._prepared = Prepared(np.array(x, dtype=float), status, merit, values, slopes, follow, free)
+            slopes, follow = tangent.outputs["M"].T, tangent.outputs["Y"].T
+            self._prepared = Prepared(
+                np.array(x, dtype=float),
+                status,
+                cost,
+                rows.values(sweep.outputs["vs"], sweep.outputs["zs"]),
+                rows.apply(slopes),
+                rows.apply(follow),
+                sweep.outputs["vs"].T.copy(),
+                slopes[: v.size],
+                follow[: v.size],
+            )
 
     def feedback(self, x: np.ndarray) -> Solution:
         """Complete the prepared step for the measured state x, (d,): a correction of x, and a few QP rows.
@@ -144,23 +169,22 @@ class Solver:
         Raises:
             RuntimeError: nothing was prepared.
         """
-        ready, tangent = self._prepared, self._tangent
-        if ready is None or tangent is None:
+        ready = self._prepared
+        if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
         rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow @ change
-            status, merit = ready.status, ready.merit
+            v, status = ready.free + (ready.follow_v @ change).reshape(self._shape), ready.status
             if status is Status.NUMERICAL or not np.isfinite(values).all():
                 return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
-            v = ready.free + (tangent.outputs["Yv"] @ change).reshape(ready.free.shape)
-            if (violation(values, rows.lower, rows.upper) > PRIMAL_TOLERANCE).any():
-                w, feasible = self._nearest(values, ready.slopes)
-                if w is None:
-                    return self._finish(Status.NUMERICAL, x, v, np.inf, 1)
-                v = v + (tangent.outputs["Mv"] @ w).reshape(v.shape)
+            if not ((values <= rows.upper) & (values >= rows.lower)).all():
+                nearest, feasible = self._nearest(values, ready.slopes, NO_ROWS)
+                if nearest is None:
+                    return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 1)
+                v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(self._shape))
                 status = status if feasible else Status.INFEASIBLE
-            return self._finish(status, x, rows.clip(v), merit, 1)
+            return self._finish(status, x, v, ready.cost, 1)
 
     # -- one Gauss-Newton step -------------------------------------------------------------------------------
 
@@ -175,38 +199,45 @@ class Solver:
     ) -> Solution:
         self._load(sweep, x, theta, xr, ur)
         v, merit = self._rows.clip(np.nan_to_num(warm_start)), np.inf
-        status = Status.ITERATION_LIMIT
-        self._evaluate(sweep, x, v)
+        self._linearise(sweep, v)
+        status, values, seen = Status.ITERATION_LIMIT, self._values(x, v), NO_ROWS
         iterations = 0
         while iterations < self.max_iterations:
             iterations += 1
-            target, feasible = self._subproblem(sweep)
+            target = self._subproblem(sweep, seen)
             if target is None:
                 break
-            target = self._rows.clip(target)
-            if not feasible:
+            seen = target.seen
+            if not target.feasible:
                 status = Status.INFEASIBLE
-            step = target - v
-            if np.isfinite(merit) and np.abs(step).max() < self.tolerance:
+            step = target.v - v
+            small = np.abs(step).max() < self.tolerance
+            if np.isfinite(merit) and small:
                 # Too small a step to be worth another linearisation, and v is feasible already.
-                v, status = target, Status.CONVERGED if feasible else status
+                v, status = target.v, Status.CONVERGED if target.feasible else status
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
-            trial_merit = self._evaluate(sweep, x, target)
+            trial, trial_values = target.v, target.values
+            trial_merit = self._merit(sweep, trial, trial_values)
             if not np.isfinite(trial_merit):
+                break
+            if sweep is self._nominal_sweep:
+                # The model is linear, and the step exact.
+                v, merit, status = trial, trial_merit, Status.CONVERGED if target.feasible else status
                 break
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and np.abs(step).max() >= self.tolerance:
+                # The rows are linear in v, so half a step has half the change.
                 step, halvings = 0.5 * step, halvings + 1
-                trial_merit = self._evaluate(sweep, x, v + step)
+                trial, trial_values = v + step, 0.5 * (values + trial_values)
+                trial_merit = self._merit(sweep, trial, trial_values)
             if not trial_merit <= merit:
                 # No descent is left at this precision: v is as good as this linearisation can tell.
-                status = Status.CONVERGED if feasible else status
+                status = Status.CONVERGED if target.feasible else status
                 break
-            v = target if halvings == 0 else v + step
-            merit = trial_merit
+            v, values, merit = trial, trial_values, trial_merit
             if np.abs(step).max() < self.tolerance:
-                status = Status.CONVERGED if feasible else status
+                status = Status.CONVERGED if target.feasible else status
                 break
         return self._finish(status, x, v, merit, iterations)
 
@@ -219,39 +250,52 @@ class Solver:
         sweep.inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
         sweep.inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
 
-    def _evaluate(self, sweep: Bound, x: np.ndarray, v: np.ndarray) -> float:
-        """Linearise at v, (N, m), and return its true cost, soft constraints included; inf when not usable."""
+    @staticmethod
+    def _linearise(sweep: Bound, v: np.ndarray) -> float:
+        """Linearise at v, (N, m), and return its true cost, soft constraints left out."""
         sweep.inputs["v"][:] = v.T
         sweep()
-        cost = float(sweep.outputs["cost"][0, 0])
-        outside = violation(self._rows.values(v.T, self._nominal(x, v)), self._rows.lower, self._rows.upper)
-        total = cost + self._rows.penalty.cost(outside)
+        return float(sweep.outputs["cost"][0, 0])
+
+    def _merit(self, sweep: Bound, v: np.ndarray, values: np.ndarray) -> float:
+        """Linearise at v, (N, m), with row values (rows,); its true cost, soft constraints included, or inf."""
+        cost = self._linearise(sweep, v)
+        total = cost + self._rows.penalty.cost(violation(values, self._rows.lower, self._rows.upper))
         return total if np.isfinite(total) else np.inf
 
-    def _subproblem(self, sweep: Bound) -> tuple[np.ndarray | None, bool]:
-        """The minimiser (N, m) of the linearised problem, and whether hard state rows can be met."""
+    def _subproblem(self, sweep: Bound, hint: np.ndarray) -> Target | None:
+        """The minimiser of the linearised problem; None when the numbers are unusable."""
         rows, outputs = self._rows, sweep.outputs
         free = outputs["vs"]
         values = rows.values(free, outputs["zs"])
         if not np.isfinite(values).all():
-            return None, True
-        if (violation(values, rows.lower, rows.upper) <= PRIMAL_TOLERANCE).all():
-            return free.T.copy(), True
+            return None
+        if ((values <= rows.upper) & (values >= rows.lower)).all():
+            return Target(free.T.copy(), values, True, hint)
         for name in "ABKL":
             self._move.inputs[name][:] = outputs[name]
         self._move()
-        mv, mz = self._move.outputs["Mv"], self._move.outputs["Mz"]
-        w, feasible = self._nearest(values, rows.slopes(mv, mz))
-        return (None if w is None else free.T + (mv @ w).reshape(free.T.shape)), feasible
+        slopes = self._move.outputs["M"].T
+        nearest, feasible = self._nearest(values, rows.apply(slopes), hint)
+        if nearest is None:
+            return None
+        v = free.T + (slopes[: free.size] @ nearest.w).reshape(self._shape)
+        return Target(rows.clip(v), nearest.values, feasible, nearest.seen)
 
-    def _nearest(self, values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray | None, bool]:
+    def _nearest(
+        self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray
+    ) -> tuple[Nearest | None, bool]:
         """The w nearest to 0 that the rows allow, softly where they are soft or contradict each other."""
         rows, soft = self._rows, self.problem.soft
         if not soft:
-            w = least_distance(values, slopes, rows.lower, rows.upper, None)
-            if w is not None:
-                return w, True
-        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty), soft
+            nearest = least_distance(values, slopes, rows.lower, rows.upper, None, hint)
+            if nearest is not None:
+                return nearest, True
+        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty, hint), soft
+
+    def _values(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Row values, (rows,), of inputs v, (N, m)."""
+        return self._rows.values(v.T, self._nominal(x, v))
 
     def _nominal(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """zbar_1..zbar_N under inputs v, (d, N)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import signal
 import threading
 import time
@@ -26,6 +27,7 @@ BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 LONG_LIFE_S = 20.0
 SHOW_S = 0.2
 GRACE_S = 0.5
+EXPLAIN_S = 5.0
 
 Show = Callable[[Snapshot], None]
 
@@ -161,7 +163,12 @@ class Supervisor:
         child = self.children[name]
         self.monitor.phase = f"the {name}"
         deadline = time.monotonic() + child.process.ready_s
+        explain_at = time.monotonic() + EXPLAIN_S
         while self.monitor.status(name) not in ("ready", "running") and not self.wish.stop:
+            if child.process.slow_because and time.monotonic() > explain_at:
+                explain_at = math.inf
+                self.monitor.phase = f"the {name}: {child.process.slow_because}"
+                self.monitor.say(self.monitor.phase, time.monotonic())
             self._fail_if_dead(*self.children)
             if time.monotonic() > deadline:
                 said = self.monitor.status(name)

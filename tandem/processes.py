@@ -24,15 +24,17 @@ class Process:
     when_it_dies: Literal["end the run", "go on", "restart"]
     ready_s: float
     """How long it may take until it says that it is ready."""
+    slow_because: str = ""
+    """What a person who waits should know."""
 
 
 # In the order of starting. The controller comes last: learning starts with its first tick.
 TABLE = (
     Process("router", "router", "end the run", 15.0),
     Process("recorder", "record", "go on", 30.0),
-    Process("trainer", "trainer", "restart", 60.0),
+    Process("trainer", "trainer", "restart", 60.0, "it loads torch"),
     Process("plant", "plant", "end the run", 30.0),
-    Process("controller", "controller", "end the run", 60.0),
+    Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
 # The recorder hears the others' last words; the router carries them.
 STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")

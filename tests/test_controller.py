@@ -6,6 +6,7 @@ import numpy as np
 from science import compressor, describe
 
 from lbmpc.controller import Controller, ControllerState, HiddenSet, Observation, same_memory
+from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
 from lbmpc.problem import build_problem
 from lbmpc.solution import Solution, Status
@@ -153,3 +154,37 @@ def test_the_memory_survives_freezing_and_thawing_bit_for_bit() -> None:
 def test_the_seed_decides_the_start_and_nothing_else_does() -> None:
     assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(3)) is None
     assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(4)) == "oracle.K"
+
+
+def late(x: np.ndarray, sequence: int, first: float, delay: float, then: float) -> Observation:
+    """A sample whose period began with the input `first` and went on with `then` after `delay` seconds."""
+    pieces = ((delay, np.array([first])), (0.05 - delay, np.array([then])))
+    mean = (delay * first + (0.05 - delay) * then) / 0.05
+    return Observation(x, np.array([mean]), 1, sequence, None, pieces)
+
+
+def test_the_problem_is_solved_from_where_the_command_will_act() -> None:
+    """With the true linear plant and a constant delay, the prediction meets what then happens."""
+    delay, x, acting = 0.004, np.array([0.1, 0.05, 0.0, 0.0]), 0.0
+    state = CONTROLLER.initial_state(0)
+    state = ControllerState.from_arrays(state.to_arrays() | {"oracle.K": np.zeros_like(state.oracle["K"])})
+    commanded, errors = 0.0, []
+    for i in range(60):
+        seen_now = seen(x, 0, None) if i == 0 else late(x, i, acting, delay, commanded)
+        acting = commanded
+        state, result = CONTROLLER.step(state, seen_now)
+        before, commanded = state.predicted, float(result.plan[0, 0])
+        x = MODEL.A @ x + (MODEL.answer(((delay, np.array([acting])), (0.05 - delay, np.array([commanded])))))
+        # Where the next command will act, under this one until then.
+        phi, gamma = discretise(MODEL.a, MODEL.b, delay)
+        errors.append(np.abs(phi @ x + gamma @ [commanded] - before).max())
+    assert abs(state.delay - delay) < 1e-6
+    assert max(errors[40:]) < 1e-6
+    assert max(errors[:3]) > 1e-4
+
+
+def test_in_lock_step_there_is_no_delay() -> None:
+    state = CONTROLLER.initial_state(0)
+    for i in range(4):
+        state, result = CONTROLLER.step(state, seen(X, i))
+        assert result.delay == 0.0
