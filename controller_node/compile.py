@@ -21,7 +21,7 @@ from controller_node.quicken import quicken
 
 log = logging.getLogger(__name__)
 
-FLAGS = ("-shared", "-fPIC", "-O2", "-march=native", "-fno-math-errno", "-lm")
+FLAGS = ("-shared", "-fPIC", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-lm")
 TIMEOUT = 300.0
 COST = "solves in CasADi's virtual machine instead, about 4 times slower"
 

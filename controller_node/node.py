@@ -23,11 +23,15 @@ from protocol import messages as m
 log = logging.getLogger(__name__)
 
 SAMPLES_BATCH = 5
+# Samples wait for each other this long, in seconds, where that makes larger batches.
+SAMPLES_WAIT = 0.1
 # A state older than this share of a period belongs to an earlier slot.
 OLDEST_STATE = 0.8
 # How long a slot waits for its state, as a share of a period.
 STATE_PATIENCE = 0.25
 LONGEST_PHASE = 0.5
+# Seconds, and share of a period at most.
+USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.1
 COUNTS = (
     "ticks",
     "late ticks",
@@ -64,7 +68,9 @@ class ControllerNode:
         self._counts = counts
         self._settings = core.config.controller
         self._period = core.config.period
-        self._phase = self._settings.phase_ms * 1e-3
+        self._phase = phase(core.config)
+        self._weights_every = topics.OUTPUT_WEIGHTS.every(self._period)
+        self._samples_batch = max(SAMPLES_BATCH, round(SAMPLES_WAIT / self._period))
         self._run_id = core.run_id
         self._states: Inbox[m.PlantState] = Inbox(
             bus, topics.PLANT_STATE, states=core.plant.d, inputs=core.plant.m, sent=lambda state: state.t
@@ -98,6 +104,7 @@ class ControllerNode:
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
+                self._core.prepare()
                 garbage.idle()
         self._send_samples()
         if self._keyframe_seq < self._seq:
@@ -106,7 +113,7 @@ class ControllerNode:
     # -- before the step ---------------------------------------------------------------------------------
 
     def _find_plant(self, stop: threading.Event) -> bool:
-        """Wait for a state and put the next slot `phase_ms` behind its arrival; False when told to stop.
+        """Wait for a state and put the next slot `phase` behind its arrival; False when told to stop.
 
         After an outage longer than the plan there is nothing left to say, so the loop comes back here.
         """
@@ -140,7 +147,7 @@ class ControllerNode:
             received = newer
 
     def _follow_phase(self, slot: Slot, latched: Latched) -> None:
-        """Keep the slots `phase_ms` behind the arrival of the plant's states."""
+        """Keep the slots `phase` behind the arrival of the plant's states."""
         if latched.verdict != "fresh" or latched.received is None:
             return
         received = latched.received
@@ -204,11 +211,12 @@ class ControllerNode:
         if outputs.sample is not None:
             self._outbox.add(outputs.sample)
             self._unsent.append(outputs.sample)
-            if len(self._unsent) >= SAMPLES_BATCH:
+            if len(self._unsent) >= self._samples_batch:
                 self._send_samples()
-        if outputs.output_weights is not None:
+        adopted = outputs.result.weights_verdict == "adopted"
+        if outputs.output_weights is not None and (adopted or self._seq % self._weights_every == 0):
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if outputs.result.weights_verdict == "adopted":
+        if adopted:
             self._remember_hidden()
         if (self._seq + 1) % self._settings.keyframe_every == 0:
             self._keyframe_seq = self._seq
@@ -260,9 +268,15 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     return 0
 
 
+def phase(config: Config) -> float:
+    """How far, in seconds, the slots lie behind the arrival of the plant's states."""
+    given = config.controller.phase_ms
+    return min(USUAL_PHASE, USUAL_PHASE_SHARE * config.period) if given is None else given * 1e-3
+
+
 def _check_phase(config: Config) -> None:
     longest = LONGEST_PHASE * config.period * 1e3
-    if config.controller.phase_ms > longest:
+    if phase(config) * 1e3 > longest:
         raise ConfigError(
             f"controller.phase_ms = {config.controller.phase_ms} is more than {LONGEST_PHASE} of a period; "
             f"at rate = {config.rate} Hz at most {longest:g} ms"

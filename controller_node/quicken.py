@@ -17,7 +17,7 @@ static inline tandem_v8 tandem_load(const double* p) { tandem_v8 v; memcpy(&v, p
 static inline void tandem_add(double* p, tandem_v8 v) { v += tandem_load(p); memcpy(p, &v, sizeof(v)); }
 """
 
-# CasADi's own product walks the result entry by entry with a dependent sum; this one keeps a tile of 8 x 4 sums in
+# CasADi's own product walks the result entry by entry with a dependent sum; this one keeps a tile of 8 x 8 sums in
 # registers.
 DENSE_PRODUCT = """\
 void casadi_mtimes_dense(const casadi_real* restrict x, casadi_int nrow_x, casadi_int ncol_x,
@@ -33,16 +33,19 @@ void casadi_mtimes_dense(const casadi_real* restrict x, casadi_int nrow_x, casad
     return;
   }
   for (j=0; j+8<=nrow_x; j+=8) {
-    for (i=0; i+4<=ncol_y; i+=4) {
+    for (i=0; i+8<=ncol_y; i+=8) {
       const casadi_real* a = x + j;
       const casadi_real* b = y + i*ncol_x;
-      tandem_v8 s0 = {0}, s1 = {0}, s2 = {0}, s3 = {0};
+      tandem_v8 s0 = {0}, s1 = {0}, s2 = {0}, s3 = {0}, s4 = {0}, s5 = {0}, s6 = {0}, s7 = {0};
+      casadi_real* r = z + j + i*nrow_x;
       for (k=0; k<ncol_x; ++k, a+=nrow_x, ++b) {
         tandem_v8 v = tandem_load(a);
         s0 += v*b[0]; s1 += v*b[ncol_x]; s2 += v*b[2*ncol_x]; s3 += v*b[3*ncol_x];
+        s4 += v*b[4*ncol_x]; s5 += v*b[5*ncol_x]; s6 += v*b[6*ncol_x]; s7 += v*b[7*ncol_x];
       }
-      tandem_add(z + j + i*nrow_x, s0); tandem_add(z + j + (i+1)*nrow_x, s1);
-      tandem_add(z + j + (i+2)*nrow_x, s2); tandem_add(z + j + (i+3)*nrow_x, s3);
+      tandem_add(r, s0); tandem_add(r + nrow_x, s1); tandem_add(r + 2*nrow_x, s2); tandem_add(r + 3*nrow_x, s3);
+      tandem_add(r + 4*nrow_x, s4); tandem_add(r + 5*nrow_x, s5);
+      tandem_add(r + 6*nrow_x, s6); tandem_add(r + 7*nrow_x, s7);
     }
     for (; i<ncol_y; ++i) {
       const casadi_real* a = x + j;

@@ -38,16 +38,72 @@ def violation(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.nd
     return np.maximum(np.maximum(lower - values, values - upper), 0.0)
 
 
+NO_ROWS: np.ndarray = np.zeros(0, dtype=np.intp)
+
+
+class Shown:
+    """The QP over some of the rows: set up once, then solved for one y after another.
+
+    Args:
+        M, lower, upper, penalty: as for `least_distance`.
+        seen: which rows, indices.
+    """
+
+    def __init__(
+        self, M: np.ndarray, lower: np.ndarray, upper: np.ndarray, penalty: Penalty | None, seen: np.ndarray
+    ):
+        self.seen = seen
+        rows = M[seen]
+        norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        self._usable = bool((norms > 1e-12).all())
+        if not self._usable:
+            return
+        # Rows of length 1, so that DAQP's tolerances and weights mean distances.
+        self._inverse = 1.0 / norms
+        self._rows = rows * self._inverse[:, None]
+        self._lower, self._upper = lower[seen] * self._inverse, upper[seen] * self._inverse
+        self._sense = np.zeros(len(seen), dtype=np.intc)
+        self._weights: tuple[np.ndarray, np.ndarray] | None = None
+        if penalty is not None:
+            self._sense[penalty.soft[seen]] = SOFT
+            unit = norms / penalty.scale[seen]
+            self._weights = 1.0 / (penalty.weight * unit * unit), penalty.weight * unit
+        self._model: daqp.Model | None = None
+
+    def solve(self, y: np.ndarray) -> np.ndarray | None:
+        """w (n,) for the row values y (rows,) at w = 0; None when the shown rows contradict each other."""
+        if not self._usable:
+            return None
+        offset = y[self.seen] * self._inverse
+        if self._model is None:
+            flag = self._set_up(offset)
+        else:
+            flag = self._model.update(bupper=self._upper - offset, blower=self._lower - offset)
+        if flag < 0 or self._model is None:
+            return None
+        w, _value, flag, _info = self._model.solve()
+        return w if flag > 0 and np.isfinite(w).all() else None
+
+    def _set_up(self, offset: np.ndarray) -> int:
+        n = self._rows.shape[1]
+        self._model = daqp.Model()
+        self._model.settings = {"primal_tol": PRIMAL_TOLERANCE}
+        flag, _time = self._model.setup(
+            np.eye(n), np.zeros(n), self._rows, self._upper - offset, self._lower - offset, self._sense
+        )
+        if flag >= 0 and self._weights is not None:
+            quadratic, linear = self._weights
+            self._model.soft_weights(quadratic, quadratic, linear, linear)
+        return int(flag)
+
+
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Minimiser w (n,), the row values y + M w (rows,) there, and the rows that the QP was shown."""
+    """Minimiser w (n,), the row values y + M w (rows,) there, and the QP that gave it."""
 
     w: np.ndarray
     values: np.ndarray
-    seen: np.ndarray
-
-
-NO_ROWS: np.ndarray = np.zeros(0, dtype=np.intp)
+    shown: Shown
 
 
 def least_distance(
@@ -57,6 +113,7 @@ def least_distance(
     upper: np.ndarray,
     penalty: Penalty | None,
     hint: np.ndarray = NO_ROWS,
+    ready: Shown | None = None,
 ) -> Nearest | None:
     """The minimiser, or None when hard rows contradict each other or the numbers are unusable.
 
@@ -66,60 +123,25 @@ def least_distance(
         lower, upper: bounds, (rows,).
         penalty: None when every row is hard.
         hint: indices of rows to show from the start; they change the time, not the result.
+        ready: a QP over rows of this very M, to begin with.
     """
-    n = M.shape[1]
-    identity, zero = np.eye(n), np.zeros(n)
-    w, values = zero, y
-    seen, unseen = hint, np.ones(len(y), dtype=bool)
-    unseen[hint] = False
+    low, high = lower - PRIMAL_TOLERANCE, upper + PRIMAL_TOLERANCE
+    seen = ready.seen if ready is not None else hint
+    unseen = np.ones(len(y), dtype=bool)
+    unseen[seen] = False
+    values, shown = y, ready
+    if shown is None:
+        seen = np.concatenate([seen, np.flatnonzero(((y > high) | (y < low)) & unseen)])
     # Each round adds a row at least, so the rows themselves bound the rounds.
     for _ in range(len(y) + 1):
-        new = np.flatnonzero(
-            ((values > upper + PRIMAL_TOLERANCE) | (values < lower - PRIMAL_TOLERANCE)) & unseen
-        )
-        if new.size == 0 and w is not zero:
-            return Nearest(w, values, seen)
-        unseen[new] = False
-        seen = np.concatenate([seen, new])
-        found = _solve_shown(identity, zero, y[seen], M[seen], lower[seen], upper[seen], penalty, seen)
-        if found is None:
+        shown = shown or Shown(M, lower, upper, penalty, seen)
+        w = shown.solve(y)
+        if w is None:
             return None
-        w = found
         values = y + M @ w
+        unseen[shown.seen] = False
+        new = np.flatnonzero(((values > high) | (values < low)) & unseen)
+        if new.size == 0:
+            return Nearest(w, values, shown)
+        seen, shown = np.concatenate([shown.seen, new]), None
     return None
-
-
-def _solve_shown(
-    identity: np.ndarray,
-    zero: np.ndarray,
-    y: np.ndarray,
-    rows: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    penalty: Penalty | None,
-    seen: np.ndarray,
-) -> np.ndarray | None:
-    norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
-    if not (norms > 1e-12).all():
-        return None
-    soft = np.where(penalty.soft[seen], SOFT, 0) if penalty is not None else np.zeros(len(seen))
-    model = daqp.Model()
-    model.settings = {"primal_tol": PRIMAL_TOLERANCE}
-    # Rows of length 1, so that DAQP's tolerances and weights mean distances.
-    inverse = 1.0 / norms
-    flag, _time = model.setup(
-        identity,
-        zero,
-        rows * inverse[:, None],
-        (upper - y) * inverse,
-        (lower - y) * inverse,
-        soft.astype(np.intc),
-    )
-    if flag < 0:
-        return None
-    if penalty is not None:
-        unit = norms / penalty.scale[seen]
-        linear, quadratic = penalty.weight * unit, 1.0 / (penalty.weight * unit * unit)
-        model.soft_weights(quadratic, quadratic, linear, linear)
-    w, _value, flag, _info = model.solve()
-    return w if flag > 0 and np.isfinite(w).all() else None

@@ -15,7 +15,7 @@ import numpy as np
 
 from lbmpc.bound import Bound
 from lbmpc.kernels import build_rows, build_sweep, build_tangent
-from lbmpc.least_distance import NO_ROWS, Nearest, least_distance, violation
+from lbmpc.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
 from lbmpc.oracles.base import LinearOracle, Oracle
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
@@ -24,6 +24,8 @@ from lbmpc.solution import Solution, Status
 # Above the QP's own tolerance; what a hard row may be off by before a solution is refused.
 HARD_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
+# Steps that shrink this fast need no watching: the next one will be this much smaller again.
+FAST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class Prepared:
     """How those move with w, (m N, m N)."""
     follow_v: np.ndarray
     """How they follow x, (m N, d)."""
+    shown: Shown | None
+    """The QP as it was solved at x; None where no row was violated there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,16 +153,22 @@ class Solver:
                 tangent.inputs[name][:] = sweep.outputs[name]
             tangent()
             slopes, follow = tangent.outputs["M"].T, tangent.outputs["Y"].T
+            values, all_slopes = rows.values(sweep.outputs["vs"], sweep.outputs["zs"]), rows.apply(slopes)
+            guess = None
+            if status is not Status.NUMERICAL and not self._inside(values):
+                # At the measured state mostly the same rows will matter.
+                guess, _feasible = self._nearest(values, all_slopes, NO_ROWS)
             self._prepared = Prepared(
                 np.array(x, dtype=float),
                 status,
                 cost,
-                rows.values(sweep.outputs["vs"], sweep.outputs["zs"]),
-                rows.apply(slopes),
+                values,
+                all_slopes,
                 rows.apply(follow),
                 sweep.outputs["vs"].T.copy(),
                 slopes[: v.size],
                 follow[: v.size],
+                guess.shown if guess is not None else None,
             )
 
     def feedback(self, x: np.ndarray) -> Solution:
@@ -169,7 +179,8 @@ class Solver:
         Raises:
             RuntimeError: nothing was prepared.
         """
-        ready = self._prepared
+        # Used once: a QP solved twice remembers, and the same calls must give the same bits.
+        ready, self._prepared = self._prepared, None
         if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
         rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
@@ -178,8 +189,8 @@ class Solver:
             v, status = ready.free + (ready.follow_v @ change).reshape(self._shape), ready.status
             if status is Status.NUMERICAL or not np.isfinite(values).all():
                 return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
-            if not ((values <= rows.upper) & (values >= rows.lower)).all():
-                nearest, feasible = self._nearest(values, ready.slopes, NO_ROWS)
+            if not self._inside(values):
+                nearest, feasible = self._nearest(values, ready.slopes, NO_ROWS, ready.shown)
                 if nearest is None:
                     return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 1)
                 v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(self._shape))
@@ -201,7 +212,7 @@ class Solver:
         v, merit = self._rows.clip(np.nan_to_num(warm_start)), np.inf
         self._linearise(sweep, v)
         status, values, seen = Status.ITERATION_LIMIT, self._values(x, v), NO_ROWS
-        iterations = 0
+        iterations, size = 0, 0.0
         while iterations < self.max_iterations:
             iterations += 1
             target = self._subproblem(sweep, seen)
@@ -211,9 +222,12 @@ class Solver:
             if not target.feasible:
                 status = Status.INFEASIBLE
             step = target.v - v
-            small = np.abs(step).max() < self.tolerance
-            if np.isfinite(merit) and small:
-                # Too small a step to be worth another linearisation, and v is feasible already.
+            size, before = float(np.abs(step).max()), size
+            rate = size / before if before > 0 else np.inf
+            if np.isfinite(merit) and (
+                size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
+            ):
+                # What is left to go is not worth another linearisation. v is feasible already.
                 v, status = target.v, Status.CONVERGED if target.feasible else status
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
@@ -270,7 +284,7 @@ class Solver:
         values = rows.values(free, outputs["zs"])
         if not np.isfinite(values).all():
             return None
-        if ((values <= rows.upper) & (values >= rows.lower)).all():
+        if self._inside(values):
             return Target(free.T.copy(), values, True, hint)
         for name in "ABKL":
             self._move.inputs[name][:] = outputs[name]
@@ -280,18 +294,21 @@ class Solver:
         if nearest is None:
             return None
         v = free.T + (slopes[: free.size] @ nearest.w).reshape(self._shape)
-        return Target(rows.clip(v), nearest.values, feasible, nearest.seen)
+        return Target(rows.clip(v), nearest.values, feasible, nearest.shown.seen)
 
     def _nearest(
-        self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray
+        self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray, ready: Shown | None = None
     ) -> tuple[Nearest | None, bool]:
         """The w nearest to 0 that the rows allow, softly where they are soft or contradict each other."""
         rows, soft = self._rows, self.problem.soft
-        if not soft:
-            nearest = least_distance(values, slopes, rows.lower, rows.upper, None, hint)
-            if nearest is not None:
-                return nearest, True
-        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty, hint), soft
+        first = rows.penalty if soft else None
+        nearest = least_distance(values, slopes, rows.lower, rows.upper, first, hint, ready)
+        if nearest is not None or soft:
+            return nearest, True
+        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty, hint), False
+
+    def _inside(self, values: np.ndarray) -> bool:
+        return bool(((values <= self._rows.upper) & (values >= self._rows.lower)).all())
 
     def _values(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Row values, (rows,), of inputs v, (N, m)."""

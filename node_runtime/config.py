@@ -72,8 +72,8 @@ class ControllerConfig(Section, frozen=True):
     """Ticks between keyframes in the log."""
     late_fraction: Unit = 0.2
     """A tick is late when it starts later than this share of a period after its slot."""
-    phase_ms: NonNegative = 1.0
-    """How long after a plant sample is due the controller's slot lies."""
+    phase_ms: NonNegative | None = None
+    """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a tenth of a period."""
     solver: SolverConfig = SolverConfig()
 
 

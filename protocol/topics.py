@@ -1,11 +1,13 @@
 """The one table of topics: what is published, on which lane, how large it may be.
 
 `control` is dropped rather than queued, sent at once, and never waits behind anything. `bulk` blocks, on a
-session and a thread of its own. Everything is logged.
+session and a thread of its own. Everything that travels is logged; what a fast loop leaves out of a topic, and out
+of the log's views for people, is stated here as a rate.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +27,14 @@ class Topic:
     lane: Lane
     writer: str
     max_bytes: int = 64 * 1024
+    max_hz: float = math.inf
+    """A loop that ticks faster publishes it at every n-th tick only, and where what it says has changed."""
+    view_hz: float = math.inf
+    """Messages a second that get a view in the log; their bytes are all in it, whatever the rate."""
+
+    def every(self, period: float) -> int:
+        """Ticks from one message to the next in a loop of this period, in seconds."""
+        return max(1, math.ceil(1.0 / (period * self.max_hz) - 1e-9))
 
     def key(self, plant: str) -> str:
         return f"{PREFIX}/{plant}/{self.name}"
@@ -32,13 +42,16 @@ class Topic:
 
 WEIGHTS_LIMIT = 16 * 1024 * 1024
 
-PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant")
-COMMAND = Topic("controller/command", m.Command, "control", "controller", 256 * 1024)
-TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT)
-RESULT = Topic("controller/result", m.TickResult, "bulk", "controller")
-TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller")
+# More points than that in a second no plot shows, and each costs as much as the logging itself.
+VIEW_HZ = 100.0
+
+PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ)
+COMMAND = Topic("controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ)
+TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ)
+RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ)
+TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ)
 SAMPLES = Topic("controller/samples", m.Samples, "bulk", "controller", 1024 * 1024)
-OUTPUT_WEIGHTS = Topic("controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT)
+OUTPUT_WEIGHTS = Topic("controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0)
 KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
 HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
 RUN_INFO = {name: Topic(f"{name}/run_info", m.RunInfo, "bulk", name) for name in PROCESSES}
