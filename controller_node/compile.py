@@ -71,6 +71,7 @@ class Compiler:
                 [self._command, str(text), "-o", str(built), *FLAGS],
                 check=True,
                 capture_output=True,
+                text=True,
                 timeout=TIMEOUT,
             )
             built.replace(library)
@@ -127,7 +128,7 @@ def _processor() -> str:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, subprocess.CalledProcessError):
-        lines = [line for line in error.stderr.decode(errors="replace").splitlines() if line.strip()]
+        lines = [line for line in str(error.stderr).splitlines() if line.strip()]
         return f"the C compiler failed ({lines[-1][:200] if lines else f'exit {error.returncode}'})"
     if isinstance(error, subprocess.TimeoutExpired):
         return f"the C compiler did not finish within {TIMEOUT:.0f} s"

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
-from lbmpc.model import Model, Pieces, discretise
+from lbmpc.model import Model, Pieces
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
@@ -207,7 +207,7 @@ class Controller:
         acting = seen.pieces[-1][1] if seen.pieces else seen.applied
         if seen.x is None or acting is None or delay == 0.0:
             return seen.x
-        phi, gamma = discretise(self.model.a, self.model.b, delay)
+        phi, gamma = self.model.hold(delay)
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
         return phi @ seen.x + gamma @ acting + drift
 

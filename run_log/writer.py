@@ -68,6 +68,7 @@ class LogWriter:
         self._raw: dict[str, int] = {}
         self._shown: dict[str, int] = {}
         self._next_view: dict[str, int] = {}
+        """When, in ns, a topic's next view is due; what comes earlier has none."""
         self._strangers = 0
         self._mcap = Writer(
             self._sink,  # write, tell and flush are all it uses
@@ -127,7 +128,9 @@ class LogWriter:
         if topic is not None and view is not None:
             try:
                 message = message or codec.decode(topic, payload)
-                shown = view.render(message) if self._view_due(topic, log_time) else None
+                if log_time >= self._next_view.get(name, log_time):
+                    shown = view.render(message)
+                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
         sequence = max(message.seq, 0) & 0xFFFFFFFF if message is not None else 0
@@ -136,13 +139,6 @@ class LogWriter:
             self._mcap.add_message(self._view_channel(view), log_time, shown, log_time, sequence)
         self.counters["messages"] += 1
         self.counters["bytes"] += len(payload)
-
-    def _view_due(self, topic: Topic, log_time: int) -> bool:
-        """Whether the topic's last view is long enough ago, as its row in the topic table says."""
-        if log_time < self._next_view.get(topic.name, log_time):
-            return False
-        self._next_view[topic.name] = log_time + int(1e9 / topic.view_hz)
-        return True
 
     def flush(self) -> bool:
         """End the chunk and hand all to the operating system; False when it does not take all of it."""
