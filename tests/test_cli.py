@@ -15,6 +15,7 @@ from tandem.cli import main
 
 COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
+    "health",
     "config show",
 )
 KEYS = {

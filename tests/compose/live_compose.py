@@ -1,0 +1,269 @@
+"""The containers for real: up, 200 ticks and adopted weights, each process killed, down, replay. `make compose-test`.
+
+Not collected by `make test`: it needs a Docker engine and some minutes. The tests build on each other, in order.
+What is waited for is heard on the bus, through a port that the test publishes.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+from live import Ear, health_of
+from project import Project, docker
+
+from node_runtime import clock
+from node_runtime.bus import Bus
+from node_runtime.config import Config, override
+from protocol import messages as m
+from protocol import topics
+
+MAIN, TEST = "docker-compose.yml", "tests/compose/docker-compose.test.yml"
+REMOTE = "docker-compose.remote.yml"
+SERVICES = {"router", "plant", "controller", "trainer", "recorder"}
+PATIENCE_S = 90.0
+
+
+class Watch:
+    """Listens from outside, and says how long things took."""
+
+    def __init__(self, bus: Bus):
+        self.ear = Ear(bus)
+
+    def until(self, what: str, wanted: Callable[[m.Message], bool]) -> m.Message:
+        began = clock.now()
+        message = self.ear.until(wanted, PATIENCE_S)
+        print(f"  {what}: after {clock.now() - began:.1f} s")
+        return message
+
+    def run_of(self, process: str) -> str:
+        """The run id in the newest health of a process."""
+        return self.ear.of(topics.HEALTH[process])[-1].run_id
+
+    def returned(self, process: str, before: str) -> m.Health:
+        """Wait until the next incarnation of a process is ready."""
+
+        def ready(message: m.Message) -> bool:
+            return (
+                isinstance(message, m.Health)
+                and message.process == process
+                and message.run_id != before
+                and message.status in ("ready", "running")
+            )
+
+        found = self.until(f"{process} is back", ready)
+        assert isinstance(found, m.Health)
+        return found
+
+    def goes_on(self, ticks: int = 40) -> None:
+        """Wait for so many ticks with a fresh state, and then for a plant that a fresh command drives."""
+        fresh = 0
+
+        def enough(message: m.Message) -> bool:
+            nonlocal fresh
+            fresh += isinstance(message, m.Tick) and message.state_verdict == "fresh"
+            return fresh >= ticks
+
+        self.until(f"{ticks} fresh ticks", enough)
+        self.until(
+            "a command drives the plant", lambda x: isinstance(x, m.PlantState) and x.source == "command"
+        )
+
+    def sources_since(self, mark: int) -> list[str]:
+        """What drove the plant, in order, without repetitions."""
+        found: list[str] = []
+        for _, message in self.ear.heard[mark:]:
+            if isinstance(message, m.PlantState) and found[-1:] != [message.source]:
+                found.append(message.source)
+        return found
+
+    def ticks_since(self, mark: int) -> list[m.Tick]:
+        return [message for _, message in self.ear.heard[mark:] if isinstance(message, m.Tick)]
+
+
+def adopted(message: m.Message) -> bool:
+    return isinstance(message, m.TickResult) and message.weights_verdict == "adopted"
+
+
+def tick(seq: int) -> Callable[[m.Message], bool]:
+    return lambda message: isinstance(message, m.Tick) and message.seq >= seq
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def listening(endpoint: str) -> Config:
+    return override(Config(), [f'bus.endpoint="{endpoint}"'])
+
+
+@pytest.fixture(scope="module")
+def project() -> Iterator[Project]:
+    """All containers, built and started."""
+    project = Project("tandem-test", [MAIN, TEST], TANDEM_TEST_PORT=str(free_port()))
+    project.compose("down", "-v", "--remove-orphans")
+    began = clock.now()
+    project.compose("build", timeout_s=1800.0)
+    print(f"\nbuilt in {clock.now() - began:.0f} s")
+    try:
+        yield project
+    finally:
+        project.compose("down", "-v", "--remove-orphans")
+
+
+@pytest.fixture(scope="module")
+def watch(project: Project) -> Iterator[Watch]:
+    began = clock.now()
+    project.compose("up", "-d")
+    print(f"up in {clock.now() - began:.0f} s")
+    port = docker("port", project.container("router"), "7447/tcp").split(":")[-1].strip()
+    with Bus(listening(f"tcp/127.0.0.1:{port}"), "monitor", "monitor-test") as bus:
+        watch = Watch(bus)
+        watch.until("200 ticks", tick(199))
+        print(f"200 ticks {clock.now() - began:.0f} s after up began")
+        yield watch
+
+
+def test_weights_are_adopted(project: Project, watch: Watch) -> None:
+    if not any(adopted(message) for _, message in watch.ear.heard):
+        watch.until("adopted weights", adopted)
+    assert set(project.services()) == SERVICES
+
+
+@pytest.mark.parametrize("service", sorted(SERVICES))
+def test_a_container_has_no_more_than_it_needs(project: Project, watch: Watch, service: str) -> None:
+    seen = project.inspect(service)
+    assert seen["State"]["Health"]["Status"] in ("healthy", "starting")
+    assert seen["HostConfig"]["ReadonlyRootfs"]
+    inside = "import os, importlib.util as u; print(os.getuid(), u.find_spec('torch') is None, os.sched_getscheduler(7))"
+    uid, without_torch, scheduler = docker("exec", seen["Id"], "python", "-c", inside).split()
+    assert uid == "10001"
+    assert (without_torch == "True") == (service != "trainer")
+    if service in ("router", "plant", "controller"):
+        note = watch.ear.of(topics.HEALTH[service])[-1].note
+        print(f"  {service}: scheduler {scheduler}, {note or 'no complaint'}")
+        assert "SCHED_FIFO" not in note
+
+
+def test_trainer_killed(project: Project, watch: Watch) -> None:
+    before, mark = watch.run_of("trainer"), len(watch.ear.heard)
+    project.kill("trainer")
+    back = watch.returned("trainer", before)
+
+    def from_the_new_one(message: m.Message) -> bool:
+        return (
+            isinstance(message, m.Tick)
+            and message.weights is not None
+            and message.weights.run_id == back.run_id
+        )
+
+    watch.until("its weights at the controller", from_the_new_one)
+    watch.until("adopted", adopted)
+    ticks = watch.ticks_since(mark)
+    assert [t.seq for t in ticks] == list(range(ticks[0].seq, ticks[-1].seq + 1))
+    assert watch.sources_since(mark) == ["command"]
+
+
+def test_plant_killed(project: Project, watch: Watch) -> None:
+    before, mark, controller = watch.run_of("plant"), len(watch.ear.heard), watch.run_of("controller")
+    project.kill("plant")
+    watch.returned("plant", before)
+    watch.goes_on()
+    assert watch.run_of("controller") == controller
+    assert watch.sources_since(mark)[-2:] == ["hold", "command"]
+
+
+def test_controller_killed(project: Project, watch: Watch) -> None:
+    before, mark, plant = watch.run_of("controller"), len(watch.ear.heard), watch.run_of("plant")
+    project.kill("controller")
+    watch.until("the plant follows the plan", lambda x: isinstance(x, m.PlantState) and x.source == "plan")
+    back = watch.returned("controller", before)
+    watch.goes_on()
+    sources = watch.sources_since(mark)
+    print(f"  the plant was driven by {', '.join(sources)}")
+    assert watch.run_of("plant") == plant
+    assert sources in (["command", "plan", "command"], ["command", "plan", "safe", "command"])
+    keyframes = [message for _, message in watch.ear.heard[mark:] if isinstance(message, m.Keyframe)]
+    assert (back.run_id, -1) in [(keyframe.run_id, keyframe.seq) for keyframe in keyframes]
+
+
+def test_recorder_killed(project: Project, watch: Watch) -> None:
+    before, mark, logs = watch.run_of("recorder"), len(watch.ear.heard), project.logs()
+    project.kill("recorder")
+    watch.returned("recorder", before)
+    watch.goes_on()
+    ticks = watch.ticks_since(mark)
+    assert [t.seq for t in ticks] == list(range(ticks[0].seq, ticks[-1].seq + 1))
+    assert watch.sources_since(mark) == ["command"]
+    assert len(project.logs()) == len(logs) + 1
+
+
+def test_router_killed(project: Project, watch: Watch) -> None:
+    before, mark, runs = (
+        watch.run_of("router"),
+        len(watch.ear.heard),
+        [watch.run_of(p) for p in ("plant", "controller")],
+    )
+    project.kill("router")
+    watch.returned("router", before)
+    # Two keyframes with whole ticks between them, for the replay of the second log.
+    watch.goes_on(220)
+    print(f"  the plant was driven by {', '.join(watch.sources_since(mark))}")
+    assert [watch.run_of(p) for p in ("plant", "controller")] == runs
+
+
+def test_it_ends_cleanly_with_a_readable_log(project: Project, watch: Watch) -> None:
+    began = clock.now()
+    project.compose("stop")
+    print(f"  stopped in {clock.now() - began:.1f} s")
+    said = project.compose("logs", "--no-color")
+    print("\n".join(said.splitlines()[-12:]))
+    assert {name: project.inspect(name)["State"]["ExitCode"] for name in SERVICES} == dict.fromkeys(
+        SERVICES, 0
+    )
+    assert "Traceback" not in said
+    assert "INFO: /logs/" in said  # the recorder's last word: which log, how many messages
+
+    last = watch.ear.of(topics.TICK)[-1].seq
+    first, second = project.logs()
+    whole = json.loads(project.recorder("replay", first, "--json"))
+    print(
+        f"  {first}: {whole['ticks']} ticks of {len(whole['run_ids'])} controllers, equal: {whole['equal']}"
+    )
+    assert whole["equal"]
+    assert len(whole["run_ids"]) == 2
+    assert whole["first_tick"] == 0
+    # The second began in the middle of a run, and has the gap in it that the router left.
+    part = json.loads(project.recorder("replay", second, "--from-tick", str(last - 20), "--json"))
+    print(f"  {second}: {part['ticks']} ticks from {part['first_tick']}, equal: {part['equal']}")
+    assert part["equal"]
+    assert part["ticks"] >= 20
+
+
+def test_a_trainer_elsewhere() -> None:
+    """Another project stands for another machine: it has only the published address in common with the first."""
+    gateway = json.loads(docker("network", "inspect", "bridge"))[0]["IPAM"]["Config"][0]["Gateway"]
+    here = Project("tandem-test-here", [MAIN, REMOTE], TANDEM_BIND=gateway)
+    there = Project("tandem-test-there", [MAIN, REMOTE], TANDEM_ENDPOINT=f"tcp/{gateway}:7447")
+    try:
+        here.compose("up", "-d", timeout_s=1800.0)
+        with Bus(listening(f"tcp/{gateway}:7447"), "monitor", "monitor-test") as bus:
+            watch = Watch(bus)
+            watch.until("the controller runs without a trainer", tick(60))
+            assert not any(message.process == "trainer" for message in watch.ear.of(topics.HEALTH["trainer"]))
+            there.compose("up", "-d", "--no-deps", "trainer", timeout_s=1800.0)
+            watch.until("the trainer from elsewhere", health_of("trainer", status="running"))
+            watch.until("its weights are adopted", adopted)
+        here.compose("stop")
+        (log,) = here.logs()
+        found = json.loads(here.recorder("replay", log, "--json"))
+        print(f"  {log}: {found['ticks']} ticks, equal: {found['equal']}")
+        assert found["equal"]
+        assert found["first_tick"] == 0
+    finally:
+        there.compose("down", "-v", "--remove-orphans")
+        here.compose("down", "-v", "--remove-orphans")

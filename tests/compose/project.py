@@ -1,0 +1,85 @@
+"""A compose project for a test: up, down, kill a container's process, read its logs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+KILL_ALL = "import os, signal; os.kill(-1, signal.SIGKILL)"
+
+
+def compose_command() -> list[str]:
+    """`docker compose` where there is one, else `docker-compose`."""
+    plugin = subprocess.run(["docker", "compose", "version"], capture_output=True, check=False)
+    if plugin.returncode == 0:
+        return ["docker", "compose"]
+    if shutil.which("docker-compose"):
+        return ["docker-compose"]
+    raise RuntimeError("neither `docker compose` nor `docker-compose` is installed")
+
+
+class Project:
+    """One project of its own name; `down` leaves no container, network or volume of it."""
+
+    def __init__(self, name: str, files: list[str], **environment: str):
+        self.name = name
+        self._command = [*compose_command(), "-p", name, *(part for file in files for part in ("-f", file))]
+        self._environment = {**os.environ, **environment}
+
+    def compose(self, *arguments: str, timeout_s: float = 300.0) -> str:
+        """Run a compose command; its standard output. Raises with all that it said when it fails."""
+        ran = subprocess.run(
+            [*self._command, *arguments],
+            cwd=ROOT,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+        if ran.returncode != 0:
+            raise AssertionError(
+                f"compose {' '.join(arguments)}: exit {ran.returncode}\n{ran.stdout}{ran.stderr}"
+            )
+        return ran.stdout
+
+    def container(self, service: str) -> str:
+        """The container's id."""
+        return self.compose("ps", "-a", "-q", service).strip()
+
+    def inspect(self, service: str) -> dict:
+        return json.loads(docker("inspect", self.container(service)))[0]
+
+    def services(self) -> list[str]:
+        return self.compose("ps", "--services").split()
+
+    def kill(self, service: str) -> None:
+        """kill -9 of everything in the container but its init, which ends with it: what a crash looks like.
+
+        `docker kill` is a person's wish to Docker, after which no restart policy applies.
+        """
+        # The shell that kills may be killed with the container.
+        subprocess.run(
+            ["docker", "exec", self.container(service), "python", "-c", KILL_ALL],
+            capture_output=True,
+            check=False,
+        )
+
+    def recorder(self, *arguments: str, entrypoint: str = "tandem") -> str:
+        """Run a command in the recorder's image, with the volume of the logs."""
+        return self.compose(
+            "run", "--rm", "--no-deps", "-T", "--entrypoint", entrypoint, "recorder", *arguments
+        )
+
+    def logs(self) -> list[str]:
+        """The logs in the volume, oldest first."""
+        return sorted(self.recorder("-c", "ls /logs/*.mcap", entrypoint="sh").split())
+
+
+def docker(*arguments: str) -> str:
+    """Run a docker command; its standard output."""
+    return subprocess.run(["docker", *arguments], capture_output=True, text=True, check=True).stdout

@@ -1,0 +1,98 @@
+"""`tandem health`: what it says and its exit code for each way a process can be."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+from live import live_config
+
+from node_runtime import clock
+from node_runtime.bus import Bus, session_config
+from node_runtime.config import Config
+from node_runtime.health import HealthPublisher, run_info
+from node_runtime.router import Router
+from protocol import topics
+from protocol.messages import ProcessStatus
+from tandem import health
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def config() -> Iterator[Config]:
+    """Of a bus with a router on it and nobody else."""
+    config = live_config()
+    with Router(config):
+        yield config
+
+
+@pytest.mark.parametrize(
+    ("status", "code"), [("starting", 1), ("ready", 0), ("running", 0), ("stopping", 1), ("failed", 1)]
+)
+def test_the_exit_code_follows_the_status(
+    config: Config, status: ProcessStatus, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        Bus(config, "plant", "plant-1") as bus,
+        HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,
+    ):
+        said.set(status, "held at x0")
+        assert health.run(config, "plant", 5.0, as_json=False) == code
+        assert capsys.readouterr().out == f"plant: {status}: held at x0\n"
+        assert health.run(config, "plant", 5.0, as_json=True) == code
+        shown = json.loads(capsys.readouterr().out)
+    assert (shown["process"], shown["run_id"], shown["status"]) == ("plant", "plant-1", status)
+
+
+def test_another_process_does_not_answer_for_it(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
+    with (
+        Bus(config, "plant", "plant-1") as bus,
+        HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,
+    ):
+        said.set("running")
+        assert health.run(config, "trainer", 1.0, as_json=False) == 1
+    assert "trainer: not heard of for 1 s at tcp/127.0.0.1:" in capsys.readouterr().out
+
+
+def test_garbage_is_not_health(config: Config) -> None:
+    topic, done = topics.HEALTH["plant"], threading.Event()
+    with (
+        Bus(config, "plant", "plant-1") as bus,
+        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as raw,
+    ):
+
+        def garble() -> None:
+            while not done.wait(0.01):
+                raw.put(topic.key(config.name), b"\xc1 not msgpack")
+
+        garbler = threading.Thread(target=garble)
+        garbler.start()
+        with HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said:
+            said.set("running")
+            heard = health.ask(config, "plant", 5.0)
+        done.set()
+        garbler.join()
+    assert heard is not None
+    assert heard.status == "running"
+
+
+def test_without_a_router_it_gives_up_in_time(capsys: pytest.CaptureFixture[str]) -> None:
+    began = clock.now()
+    assert health.run(live_config(), "router", 0.5, as_json=True) == 1
+    assert clock.now() - began < 5.0
+    assert json.loads(capsys.readouterr().out)["status"] is None
+
+
+def test_it_loads_nothing_heavy() -> None:
+    heavy = ("torch", "casadi", "scipy", "matplotlib", "mcap")
+    program = f"import sys, tandem.health; print([name for name in {heavy} if name in sys.modules])"
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert ran.stdout.strip() == "[]"
