@@ -10,6 +10,7 @@ import hashlib
 import math
 import platform
 import time
+import zlib
 from dataclasses import dataclass
 from importlib import metadata
 
@@ -23,6 +24,7 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.solution import Solution
 from node_runtime.config import Config, to_json
 from protocol import messages as m
+from protocol.codec import encode
 from protocol.network import hash_layers
 
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
@@ -209,6 +211,7 @@ class ControllerCore:
             oracle_norms=np.linalg.norm(state["K"], axis=0).tolist() if self._dnn else [],
             hidden_version=self._version(),
             hidden_sha256=self._hidden_hash,
+            tick_crc32=zlib.crc32(encode(tick)),
             input_delay=result.delay,
             weights_verdict=result.verdict,
         )

@@ -155,6 +155,8 @@ class TickResult(Message, frozen=True):
     """Norm of each column of K_t (dnn), else empty."""
     hidden_version: Sequence
     hidden_sha256: Digest
+    tick_crc32: Count
+    """Of the tick's bytes: a replay of a tick that was changed in any bit cannot reproduce this result."""
     input_delay: float
     """Seconds for which the state was predicted ahead before the problem was solved."""
     weights_verdict: str

@@ -51,7 +51,9 @@ TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, vie
 RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ)
 TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ)
 SAMPLES = Topic("controller/samples", m.Samples, "bulk", "controller", 1024 * 1024)
-OUTPUT_WEIGHTS = Topic("controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0)
+OUTPUT_WEIGHTS = Topic(
+    "controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0
+)
 KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
 HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
 RUN_INFO = {name: Topic(f"{name}/run_info", m.RunInfo, "bulk", name) for name in PROCESSES}

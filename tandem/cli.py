@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import tyro
 from tyro.conf import Positional, Suppress, UseAppendAction, arg, subcommand
 
-from node_runtime.choices import OracleName, TighteningName
+from node_runtime.choices import OracleName, ProcessName, TighteningName
 
 if TYPE_CHECKING:
     from node_runtime.config import Config
@@ -257,6 +257,22 @@ class Record(Configured):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Health(Configured):
+    """Ask the bus how a process is: exit code 0 when it is ready or running, 1 when not. Made for health checks."""
+
+    process: Annotated[Positional[ProcessName], arg(metavar="|".join(get_args(ProcessName)))]
+    """Which process."""
+    seconds: Annotated[float, arg(metavar="S")] = 3.0
+    """How long to listen; a process speaks twice a second."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from tandem import health
+
+        return health.run(config, self.process, self.seconds, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ConfigShow(Configured):
     """Print the whole configuration as it is resolved: file, then --set, then defaults."""
 
@@ -275,6 +291,28 @@ class ConfigCommand:
     action: Annotated[ConfigShow, subcommand("show")] | Annotated[None, Suppress]
 
 
+@dataclass(frozen=True, kw_only=True)
+class BenchSolver(Command):
+    """Time the solver beside others on the same recorded states: horizons, widths, oracles, modes. About 10 minutes."""
+
+    quick: bool = False
+    """A few cases only, within a minute."""
+    document: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Rewrite the figures between the marks in this Markdown file, and the picture beside it."""
+
+    def run(self) -> int:
+        from tandem import bench
+
+        return bench.solver(self.quick, self.document, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchCommand:
+    """Measure how fast it is."""
+
+    action: Annotated[BenchSolver, subcommand("solver")] | Annotated[None, Suppress]
+
+
 AnyCommand = (
     Annotated[Run, subcommand("run")]
     | Annotated[Simulate, subcommand("simulate")]
@@ -286,6 +324,8 @@ AnyCommand = (
     | Annotated[Trainer, subcommand("trainer")]
     | Annotated[Plant, subcommand("plant")]
     | Annotated[Record, subcommand("record")]
+    | Annotated[Health, subcommand("health")]
+    | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[ConfigCommand, subcommand("config")]
 )
 

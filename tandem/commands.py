@@ -97,7 +97,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
     plant = plant_of(config)
     console = terminal.console(as_json)
-    with _progress(console) as bar:
+    with progress_bar(console) as bar:
         task = bar.add_task(f"simulating, {config.controller.oracle}", total=steps)
         try:
             ran = lock_step(
@@ -107,10 +107,10 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
             terminal.complain(f"the plant was lost: {error}", as_json)
             return 1
     if log is not None:
-        from tandem.save import save
+        from run_log.save import save
 
         try:
-            save(ran, log, plant)
+            save(ran, log)
         except LogError as error:
             raise Refused(str(error)) from error
         ran.path = log
@@ -131,7 +131,7 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
     console = terminal.console(as_json)
     try:
         ran = read_run(file)
-        with _progress(console) as bar:
+        with progress_bar(console) as bar:
             task = bar.add_task("replaying", total=None)
             found = replay_run(
                 ran, from_tick, assignments, lambda done, total: bar.update(task, completed=done, total=total)
@@ -224,7 +224,7 @@ def config_show(config: Config, as_json: bool) -> int:
     return 0
 
 
-def _progress(console: Console) -> Progress:
+def progress_bar(console: Console) -> Progress:
     """A progress bar, on a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

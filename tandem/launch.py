@@ -242,15 +242,12 @@ class Supervisor:
             self._start(child.name)
         return None
 
-    def _listen(self, timeout_s: float = 0.05) -> None:
-        """Take what has arrived, waiting a little for it, and show it now and then."""
+    def _listen(self, timeout_s: float = 0.02) -> None:
+        """Take what arrives within a little time, together, and show it now and then."""
+        time.sleep(timeout_s)
         if self._mailbox is not None:
-            delivery = self._mailbox.get(timeout_s)
-            while delivery is not None:
+            for delivery in self._mailbox.drain():
                 self.monitor.feed(delivery)
-                delivery = self._mailbox.get()
-        else:
-            time.sleep(timeout_s)
         now = time.monotonic()
         if self._end is None and now >= self._next_show:
             self._next_show = now + SHOW_S

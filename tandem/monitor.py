@@ -23,6 +23,9 @@ RATE_WINDOW_S = 2.0
 SILENT_S = 2.0
 TREND_SECONDS = 40
 
+# Of no use here, and large: not even decoded.
+UNSEEN = (topics.KEYFRAME, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
+
 Weight = Literal["note", "good", "bad"]
 
 
@@ -146,11 +149,13 @@ class Monitor:
         self._bad_elsewhere: dict[str, int] = {}
 
     def feed(self, delivery: Delivery) -> m.Message | None:
-        """Take note of one message; returns it, or None when it must not be believed."""
+        """Take note of one message; returns it, or None when it is not shown or must not be believed."""
         topic = topics.topic_of(delivery.key)
         now = delivery.received_ns * 1e-9
         if topic is None:
             self.bad.count("unknown topic", "foreign", delivery.key)
+            return None
+        if topic in UNSEEN:
             return None
         try:
             message = codec.decode(topic, delivery.payload)

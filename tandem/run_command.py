@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.status import Status
 
 from node_runtime.config import Config, to_toml
+from node_runtime.realtime import quick_handover
 from run_log import report
 from run_log.errors import LogError
 from run_log.reader import read_run
@@ -37,7 +38,7 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> 
         raise terminal.Refused(f"--seconds {seconds:g}: less than one period of {config.period:g} s")
     plant = plant_of(config)
     console = terminal.console(as_json)
-    with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
+    with claimed(Path(config.log.path)) as (files, moved), wishes() as wish, quick_handover():
         for text in moved:
             console.print(text, style="dim", markup=False, soft_wrap=True)
         bus = config.bus if endpoint_given else msgspec.structs.replace(config.bus, endpoint=_free_endpoint())

@@ -102,6 +102,7 @@ def synthetic(config: Config | None = None, steps: int = 100, seed: int = 0) -> 
             oracle_norms=(np.ones(4) * 0.01).tolist(),
             hidden_version=version,
             hidden_sha256="0" * 64,
+            tick_crc32=0,
             input_delay=0.0,
             weights_verdict=verdict,
         )

@@ -128,19 +128,14 @@ def test_bad_ticks_replay_too(config: Config) -> None:
     assert replay(run).equal
 
 
-def test_several_controllers_in_one_log(run: Run, config: Config) -> None:
-    def renamed(message: m.Message) -> m.Message:
-        return msgspec.structs.replace(message, run_id="controller-2") if message.run_id == RUN else message
-
+def test_several_controllers_in_one_log(run: Run, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     both = copy.copy(run)
+    monkeypatch.setattr("tandem.simulate.CONTROLLER", "controller-2")
     later = simulate(override(config, ["seed=3"]), 30)
     both.streams = {
         name: [
             *run.streams.get(name, []),
-            *(
-                Entry(10**10 + e.log_time, codec.encode(renamed(e.message)), renamed(e.message))
-                for e in later.streams.get(name, [])
-            ),
+            *(Entry(10**10 + e.log_time, e.payload, e.message) for e in later.streams.get(name, [])),
         ]
         for name in run.streams
     }
@@ -165,6 +160,21 @@ def test_one_flipped_bit_in_a_tick_is_reported_with_its_tick(run: Run, seq: int,
     assert found.first_difference.tick == seq
     assert found.first_difference.run_id == RUN
     assert found.first_difference.recorded != found.first_difference.replayed
+
+
+@pytest.mark.parametrize("field", ["t", "lateness"])
+def test_a_flipped_bit_that_the_step_does_not_use_is_reported_too(run: Run, field: str) -> None:
+    changed = edited(
+        run,
+        topics.TICK,
+        7,
+        lambda tick: msgspec.structs.replace(tick, **{field: flip(getattr(tick, field), 0)}),
+    )
+    found = replay(changed)
+    assert found.differing_ticks == 1
+    assert found.first_difference is not None
+    assert found.first_difference.tick == 7
+    assert found.first_difference.field == "result.tick_crc32"
 
 
 def test_one_flipped_bit_in_the_file_survives_a_rewrite_and_is_reported(run: Run, tmp_path: Path) -> None:

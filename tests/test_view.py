@@ -89,6 +89,7 @@ def result(
         oracle_norms=[],
         hidden_version=3,
         hidden_sha256="",
+        tick_crc32=0,
         input_delay=0.0,
         weights_verdict=verdict,
     )
