@@ -6,10 +6,10 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate test lint format clean
+.PHONY: help setup run simulate bench test compose-test lint format clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
 
 setup: $(READY)  ## a virtual environment in .venv with everything in it
 
@@ -25,8 +25,14 @@ run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
 simulate: $(READY)  ## the same in lock-step, faster than real time
 	$(BIN)/tandem simulate $(ARGS)
 
+bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
+	$(BIN)/tandem bench solver --document docs/performance.md $(ARGS)
+
 test: $(READY)  ## all tests
 	$(BIN)/pytest $(ARGS)
+
+compose-test: $(READY)  ## the containers for real; needs a Docker engine
+	$(BIN)/pytest -x -s -o pythonpath=tests tests/compose/live_compose.py $(ARGS)
 
 lint: $(READY)  ## style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -104,7 +104,6 @@ class ControllerNode:
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
-                self._core.prepare()
                 garbage.idle()
         self._send_samples()
         if self._keyframe_seq < self._seq:
@@ -200,6 +199,8 @@ class ControllerNode:
             lateness_ms=lateness * 1e3,
             state_age_ms=latched.age * 1e3,
         )
+        # Before the bulk thread has something to do: it would compete for the interpreter.
+        self._core.prepare()
         self._bus.publish(topics.TICK, tick)
         self._bus.publish(topics.RESULT, outputs.result)
         self._bus.publish(topics.TIMING, timing)

@@ -30,13 +30,14 @@ class Orders:
     """
 
     def __init__(self, plant: Plant, command: Command, arrived: float, patience: float):
-        """`command` must have the plant's dimensions; its entries are clipped to [u_min, u_max]."""
+        """`command` must have the plant's dimensions; what acts of it is clipped to [u_min, u_max]."""
         self.seq = command.seq
         self.arrived = arrived
         self._period = command.period
         self._patience = patience
-        self._plan = np.clip([command.u, *command.plan[1:]], plant.u_min, plant.u_max)
-        self._safe = np.clip(plant.safe_input, plant.u_min, plant.u_max)
+        self._plant = plant
+        self._plan = [command.u, *command.plan[1:]]
+        self._first = self._within(command.u)
 
     def drive(self, t: float) -> Drive:
         """What acts at time t, `arrived` or later."""
@@ -44,9 +45,13 @@ class Orders:
         reached = t + 1e-9 * self._period + 4 * math.ulp(t)
         patience_ends = self.arrived + self._patience * self._period
         if patience_ends > reached:
-            return Drive(self._plan[0], "command", patience_ends)
+            return Drive(self._first, "command", patience_ends)
         for entry in range(math.floor(self._patience), len(self._plan)):
             ends = self.arrived + (entry + 1) * self._period
             if ends > reached:
-                return Drive(self._plan[entry], "plan", ends)
-        return Drive(self._safe, "safe", math.inf)
+                return Drive(self._within(self._plan[entry]), "plan", ends)
+        return Drive(self._within(self._plant.safe_input), "safe", math.inf)
+
+    def _within(self, u: list[float] | np.ndarray) -> np.ndarray:
+        # Entry by entry, as they are needed: most plans are never followed beyond their first.
+        return np.minimum(np.maximum(u, self._plant.u_min), self._plant.u_max)

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import TracebackType
 
@@ -130,7 +131,8 @@ class LogWriter:
                 message = message or codec.decode(topic, payload)
                 if log_time >= self._next_view.get(name, log_time):
                     shown = view.render(message)
-                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
+                    if math.isfinite(topic.view_hz):
+                        self._next_view[name] = log_time + int(1e9 / topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
         sequence = max(message.seq, 0) & 0xFFFFFFFF if message is not None else 0

@@ -246,8 +246,7 @@ class Supervisor:
         """Take what arrives within a little time, together, and show it now and then."""
         time.sleep(timeout_s)
         if self._mailbox is not None:
-            for delivery in self._mailbox.drain():
-                self.monitor.feed(delivery)
+            self.monitor.feed_all(self._mailbox.drain())
         now = time.monotonic()
         if self._end is None and now >= self._next_show:
             self._next_show = now + SHOW_S

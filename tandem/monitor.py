@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -25,6 +26,8 @@ TREND_SECONDS = 40
 
 # Of no use here, and large: not even decoded.
 UNSEEN = (topics.KEYFRAME, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
+# Nothing is counted over all of these: a fast loop's are looked at now and then.
+ONLY_SHOWN = (topics.PLANT_STATE, topics.COMMAND, topics.TIMING)
 
 Weight = Literal["note", "good", "bad"]
 
@@ -147,6 +150,16 @@ class Monitor:
         self._events: deque[Event] = deque(maxlen=200)
         self._new_events: deque[Event] = deque(maxlen=200)
         self._bad_elsewhere: dict[str, int] = {}
+
+    def feed_all(self, deliveries: Sequence[Delivery]) -> None:
+        """Take note of what arrived together, in order; of what is only shown, the newest is enough."""
+        newest = {delivery.key: i for i, delivery in enumerate(deliveries)}
+        shown = (
+            {topic.key(self.config.name) for topic in ONLY_SHOWN} if self.first_command is not None else ()
+        )
+        for i, delivery in enumerate(deliveries):
+            if delivery.key not in shown or newest[delivery.key] == i:
+                self.feed(delivery)
 
     def feed(self, delivery: Delivery) -> m.Message | None:
         """Take note of one message; returns it, or None when it is not shown or must not be believed."""

@@ -17,6 +17,7 @@ COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
     "health",
     "config show",
+    "bench solver",
 )
 KEYS = {
     *("ticks", "late_ticks", "weights_adopted", "weights_refused", "fallback_ticks", "soft_ticks"),

@@ -17,7 +17,7 @@ from node_runtime import clock
 from node_runtime.bus import Bus
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
-from node_runtime.realtime import GarbageCollection, punctual
+from node_runtime.realtime import GarbageCollection, punctual, quick_handover
 from node_runtime.router import Router
 from protocol import messages as m
 from protocol import topics
@@ -108,6 +108,13 @@ def test_everything_is_as_before_after_a_punctual_loop() -> None:
         assert not gc.isenabled()
     assert gc.isenabled()
     assert (os.sched_getscheduler(0), sys.getswitchinterval(), gc.get_freeze_count()) == before
+
+
+def test_threads_give_way_quickly_and_later_as_before() -> None:
+    before = sys.getswitchinterval()
+    with quick_handover():
+        assert sys.getswitchinterval() <= 1e-4
+    assert sys.getswitchinterval() == before
 
 
 def test_priority_0_leaves_the_scheduler_alone() -> None:

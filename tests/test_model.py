@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from science import compressor
 
-from lbmpc.model import ModelError, build_model, linearise
+from lbmpc.model import ModelError, build_model, discretise, linearise
 from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
 
@@ -25,6 +25,16 @@ def test_the_jacobian_is_that_of_the_equations_by_hand() -> None:
     ]
     np.testing.assert_allclose(a, expected, atol=1e-12)
     np.testing.assert_allclose(b.ravel(), [0, 0, 0, w2])
+
+
+@pytest.mark.parametrize("period", [0.05, 0.001])
+def test_a_part_of_a_period_is_discretised_exactly(period: float) -> None:
+    model = compressor(period)
+    for share in (0.0, 1e-6, 0.1, 0.37, 1.0, 1.9, 2.0, 3.5):
+        for quick, exact in zip(
+            model.hold(share * period), discretise(model.a, model.b, share * period), strict=True
+        ):
+            np.testing.assert_allclose(quick, exact, rtol=0, atol=1e-13 * max(1.0, np.abs(exact).max()))
 
 
 def test_discretisation_is_exact() -> None:

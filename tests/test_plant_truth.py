@@ -36,6 +36,22 @@ def test_a_step_is_within_1e_9_of_a_tight_reference(period: float) -> None:
         assert np.abs(truth.step(x, u, period) - reference.y[:, -1]).max() < 1e-9
 
 
+def test_a_short_period_is_one_step_of_the_same_method_with_the_same_tolerance() -> None:
+    truth = Truth(PLANT)
+    for _ in range(20):
+        x, u = RNG.uniform(PLANT.x_min, PLANT.x_max), RNG.uniform(PLANT.u_min, PLANT.u_max)
+        whole = truth._in_one(x, u, 0.001)
+        assert whole is not None
+        assert np.abs(whole - truth._in_many(x, u, 0.001)).max() < 1e-12
+        # Too far for one step: its error estimate says so.
+        assert truth._in_one(x, u, 0.05) is None
+
+
+def test_a_step_that_leaves_the_domain_is_never_taken_in_one() -> None:
+    x = np.array([-3.0, 1e-4, 1.0, 0.0])
+    assert Truth(PLANT)._in_one(x, PLANT.u_e, 0.001) is None
+
+
 def test_the_equilibrium_stays_where_it_is() -> None:
     assert np.abs(Truth(PLANT).step(PLANT.x_e, PLANT.u_e, 10.0) - PLANT.x_e).max() < 1e-4
     # The paper's printed digits, (0.5, 1.6875, 1.1547, 0), are the same point.

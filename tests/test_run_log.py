@@ -174,6 +174,28 @@ def test_garbage_is_logged_as_it_came(tmp_path: Path, config: Config) -> None:
     assert [topic for topic, _ in found].count("view/plant/state") == 1
 
 
+@pytest.mark.parametrize(("rate", "views"), [(20, 40), (100, 200), (1000, 200)])
+def test_a_fast_loop_has_all_its_bytes_in_the_log_and_a_view_a_hundred_times_a_second(
+    tmp_path: Path, config: Config, rate: int, views: int
+) -> None:
+    path = tmp_path / "run.mcap"
+    weights = m.OutputWeights(
+        run_id="c", seq=0, hidden_version=0, hidden_sha256="", K=m.Array.of(np.zeros((3, PLANT.d)))
+    )
+    with LogWriter(path, config, PLANT) as writer:
+        for i in range(2 * rate):
+            state = m.PlantState(
+                run_id="p", seq=i, t=i / rate, x=[0.0] * 4, applied=None, source="hold", command_seq=-1
+            )
+            writer.write("plant/state", codec.encode(state), i * 1_000_000_000 // rate)
+            # Of topics without such a limit nothing is left out.
+            writer.write("controller/output_weights", codec.encode(weights), i * 1_000_000_000 // rate)
+    with path.open("rb") as stream:
+        found = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
+    assert [found.count(name) for name in ("raw/plant/state", "view/plant/state")] == [2 * rate, views]
+    assert found.count("view/controller/output_weights") == 2 * rate
+
+
 def test_a_simulation_saves_the_same_log_twice(
     tmp_path: Path, config: Config, messages: list[Logged]
 ) -> None:

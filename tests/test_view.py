@@ -224,3 +224,30 @@ def test_bars_fall_with_the_error():
     bars = view.spark([1e-2, 1e-3, 1e-4, 1e-5], 10).plain
     assert list(bars) == sorted(bars, reverse=True)
     assert len(view.spark([1.0] * 50, 10).plain) == 10
+
+
+def test_of_what_comes_together_every_tick_counts_and_only_the_newest_state_is_read() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    seen.feed_all([delivery(topics.COMMAND, command(0), START)])
+    assert seen.first_command == pytest.approx(START)
+    batch = []
+    for k in range(1, 20):
+        at = START + 0.001 * k
+        batch += [
+            delivery(topics.PLANT_STATE, state(k, z=0.01 * k), at),
+            delivery(topics.COMMAND, command(k), at),
+            delivery(topics.TICK, tick(k, late=k == 7), at),
+            delivery(topics.RESULT, result(k, verdict="adopted" if k == 5 else "none"), at),
+            delivery(topics.OUTPUT_WEIGHTS, command(k), at),
+        ]
+    seen.feed_all(batch)
+    now = seen.snapshot(START + 0.1)
+    assert (now.ticks, now.late, now.adopted) == (19, 1, 1)
+    assert now.states[0].value == pytest.approx(0.19)
+    assert seen.bad.total == 0
+
+
+def test_the_first_command_is_not_overlooked_among_others() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    seen.feed_all([delivery(topics.COMMAND, command(k), START + 0.001 * k) for k in range(5)])
+    assert seen.first_command == pytest.approx(START)

@@ -18,6 +18,7 @@ from node_runtime.config import Config
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.inbox import Inbox
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.realtime import quick_handover
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.network import NetworkDescription, hash_layers
@@ -33,6 +34,9 @@ JOIN_EVERY = 0.5
 """Seconds between two questions for the hidden layers, at least."""
 REFILL_EVERY = 1.0
 """Seconds between two questions for missed samples, at least."""
+TRAIN_EVERY = 0.4
+"""Seconds between the beginnings of two trainings, at least: a fast loop's samples would keep a core busy for good,
+and it is the loop that needs it."""
 ADOPTION_PATIENCE = 2.0
 """Seconds that a controller may go on with other hidden layers than those it was sent."""
 OUTBOX = 20_000
@@ -77,6 +81,7 @@ class TrainerNode:
         self._gap: int | None = None
         self._refill_at = 0.0
         self._unadopted_since: float | None = None
+        self._train_at = 0.0
 
     @property
     def trainer(self) -> Trainer | None:
@@ -102,7 +107,8 @@ class TrainerNode:
         if self._gap is not None and now >= self._refill_at:
             self._refill_at = now + REFILL_EVERY
             self._refill(self._gap)
-        if self._may_train():
+        if now >= self._train_at and self._may_train():
+            self._train_at = now + TRAIN_EVERY
             self._train()
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))
@@ -268,7 +274,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     use_one_thread()
     run_id = new_run_id("trainer")
     counts = dict.fromkeys(NAMES, 0)
-    with stopped_by_signals(stop) as stopping:
+    with stopped_by_signals(stop) as stopping, quick_handover():
         try:
             with (
                 Bus(config, "trainer", run_id, stopping) as bus,
