@@ -95,7 +95,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
     from tandem.checks import plant_of
     from tandem.simulate import simulate as lock_step
 
-    plant = plant_of(config)
+    plant_of(config)
     console = terminal.console(as_json)
     with progress_bar(console) as bar:
         task = bar.add_task(f"simulating, {config.controller.oracle}", total=steps)

@@ -102,6 +102,21 @@ def test_other_oracles(config: Config, oracle: str) -> None:
     assert replay(run, 30).equal
 
 
+def test_the_real_time_iteration_replays_too_whether_it_was_prepared_in_time_or_not(config: Config) -> None:
+    """Live the next tick is prepared in the idle time; lock-step and replay prepare when the tick is there."""
+    fast = override(config, ["controller.solver.mode=real_time"])
+    run = simulate(fast, 60)
+    assert sum(result.status == "real-time iteration" for result in run.results) >= 55
+    assert replay(run).equal
+    later = replay(run, from_tick=45)
+    assert later.equal
+    assert later.ticks < 60
+    core = ControllerCore(run.config, run.commands[0].run_id)
+    for tick, entry in zip(run.ticks, run.entries(topics.COMMAND), strict=True):
+        assert codec.encode(core.step(tick).command) == entry.payload
+        core.prepare()
+
+
 def test_bad_ticks_replay_too(config: Config) -> None:
     """Stale and missing states, refused weights: whatever a tick held, the log has it."""
     from controller_node.core import ControllerCore
