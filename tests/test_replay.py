@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from controller_node.core import ControllerCore
 from node_runtime.config import Config, ConfigError, override
 from protocol import codec, topics
 from protocol import messages as m
