@@ -21,6 +21,7 @@ COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("cold ms", lambda row: milliseconds(row.cold_median_ms)),
     ("iterations", lambda row: f"{row.iterations:.1f}"),
     ("error", lambda row: f"{row.error:.0e}"),
+    ("stopped", lambda row: f"{row.failures} of {row.solves}" if row.failures else "-"),
 )
 TEXT = 3
 """So many columns from the left are words, the rest numbers."""

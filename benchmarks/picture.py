@@ -14,7 +14,7 @@ from run_log.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
 # (solver, mode, oracle, compiled), label, colour, marker, line
 Curve = tuple[tuple[str, str, str, bool], str, str, str, str]
 CURVES: tuple[Curve, ...] = (
-    (("ipopt", "converged", "dnn", False), "network, IPOPT", BLACK, "s", "-"),
+    (("ipopt-hard", "converged", "dnn", False), "network, IPOPT", BLACK, "s", "-"),
     (("ipopt-hard", "converged", "linear", False), "linear, IPOPT", GREY, "s", ":"),
     (("sqpmethod-daqp", "converged", "dnn", False), "network, sqpmethod with DAQP", GREY, "v", "-"),
     (("tandem", "converged", "dnn", False), "network, converged, no compiler", SKY, "o", "--"),

@@ -33,7 +33,7 @@ class Plan:
     """What is measured."""
 
     ticks: int = 60
-    rounds: int = 5
+    rounds: int = 3
     """How often each tick is repeated by what is quick."""
     horizons: tuple[int, ...] = (10, 20, 60, 100, 200)
     """With networks of width 32."""
@@ -76,7 +76,7 @@ class Row(msgspec.Struct, frozen=True):
     """Largest distance of the first input from the tight optimum, input units."""
     solves: int
     failures: int
-    """Solves that did not end as they should have."""
+    """Solves that ended otherwise than they should, at the iteration limit for instance."""
 
 
 class Report(msgspec.Struct, frozen=True):

@@ -9,6 +9,9 @@ import msgspec
 from tandem import terminal
 from tandem.terminal import Refused
 
+TABLE = 132
+"""Characters that the table of all figures needs."""
+
 
 def solver(quick: bool, document: Path | None, as_json: bool) -> int:
     """Measure, show, and put the figures into a document where one is given."""
@@ -33,6 +36,8 @@ def solver(quick: bool, document: Path | None, as_json: bool) -> int:
                 QUICK if quick else Plan(),
                 lambda what, done, of: bar.update(task, description=what, completed=done, total=of),
             )
+        # A table cut to the width of a narrow terminal, or of a pipe, would lose its digits.
+        console.width = max(console.width, TABLE)
         console.print(figures.table(report))
         console.print()
         console.print(figures.ratio_table(report))

@@ -77,7 +77,7 @@ def test_a_real_time_iteration_comes_close(report: Report) -> None:
     for oracle in ("linear", "dnn"):
         row = report.find("tandem", "feedback", oracle, 10, 32 if oracle == "dnn" else None, False)
         assert row is not None
-        assert row.error < 1e-2
+        assert row.error < 1e-4
         assert row.failures == 0
 
 
@@ -112,8 +112,9 @@ def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Pa
 
 
 def test_a_document_without_marks_is_refused_before_anything_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("benchmarks.solver.measure", lambda *_: pytest.fail("measured all the same"))
     path = tmp_path / "notes.md"
     path.write_text("nothing here\n")
     assert main(["bench", "solver", "--document", str(path)]) == 2
