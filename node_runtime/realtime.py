@@ -13,6 +13,10 @@ import threadpoolctl
 
 log = logging.getLogger(__name__)
 
+READER_PRIORITY = 1
+"""SCHED_FIFO priority of what reads everything on the bus: below the loops, above all that is not real-time. A reader
+that gets no core fills its link, and then the router waits, with everybody's messages."""
+
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
@@ -38,7 +42,7 @@ def quick_handover() -> Iterator[None]:
 
 
 @contextmanager
-def punctual(priority: int) -> Iterator[str]:
+def punctual(priority: int, *, silent: bool = False) -> Iterator[str]:
     """Make the calling thread, and all threads it starts from here on, punctual.
 
     Enter it before the bus opens, whose threads inherit the priority. Without the privilege the loop runs at
@@ -46,29 +50,27 @@ def punctual(priority: int) -> Iterator[str]:
 
     Args:
         priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduler alone.
+        silent: no warning; for a process beside others that warn.
     """
     before = (os.sched_getscheduler(0), os.sched_getparam(0))
-    note = _raise_priority(priority)
-    collecting = gc.isenabled()
-    with one_blas_thread(), quick_handover():
+    note = _raise_priority(priority, silent)
+    with one_blas_thread(), quick_handover(), collection_as_before():
         try:
             yield note
         finally:
-            gc.unfreeze()
-            if collecting:
-                gc.enable()
             if priority and not note:
                 os.sched_setscheduler(0, *before)
 
 
-def _raise_priority(priority: int) -> str:
+def _raise_priority(priority: int, silent: bool) -> str:
     if priority == 0:
         return ""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         note = f"no privilege for SCHED_FIFO priority {priority}; slots may be late beside other load"
-        log.warning(
+        log.log(
+            logging.DEBUG if silent else logging.WARNING,
             "%s. Grant it with CAP_SYS_NICE or an rtprio limit, or set realtime.priority = 0 to go without.",
             note,
         )
@@ -76,8 +78,24 @@ def _raise_priority(priority: int) -> str:
     return ""
 
 
+@contextmanager
+def collection_as_before() -> Iterator[None]:
+    """Undoes, at its end, what a `GarbageCollection` inside it has set."""
+    collecting = gc.isenabled()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if collecting:
+            gc.enable()
+
+
 class GarbageCollection:
-    """Garbage is collected between steps, where there is time, instead of inside one."""
+    """Garbage is collected between steps, where there is time, instead of inside one.
+
+    A full collection in a process that has loaded much stops all its threads for 100 ms; in one that reads the bus,
+    that stops the router's messages to everybody.
+    """
 
     def __init__(self, every: int = 20):
         """`every`: calls of `idle` between two collections."""

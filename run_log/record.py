@@ -12,7 +12,7 @@ from node_runtime.bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.realtime import punctual
+from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from protocol import topics
 from run_log.errors import LogError
 from run_log.writer import LogWriter
@@ -23,8 +23,6 @@ EXIT_CANNOT = 2
 EXIT_NOTHING_WRITTEN = 4
 # After Ctrl-C the other processes still say their last words; listen for that long.
 QUIET_S = 0.25
-# Below the loops, above everything that is not real-time: the log of a fast loop beside a busy trainer is whole too.
-PRIORITY = 1
 LAST_WORDS_S = 1.5
 # Messages are fetched together: to wake for each costs more than to log it.
 GATHER_S = 0.02
@@ -40,7 +38,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     """
     with (
         stopped_by_signals(stop) as stopping,
-        punctual(min(PRIORITY, config.realtime.priority)) as punctuality,
+        punctual(min(READER_PRIORITY, config.realtime.priority), silent=True) as punctuality,
     ):
         try:
             plant = get_plant(config.plant.model)
@@ -78,6 +76,8 @@ def _record(
     said: str | None = ""
     end: float | None = None
     last_arrival = clock.now()
+    garbage = GarbageCollection()
+    garbage.begin()
     while end is None or clock.now() < min(end, last_arrival + QUIET_S):
         if end is None and stopping.is_set():
             last_arrival = clock.now()
@@ -86,6 +86,7 @@ def _record(
         for delivery in mailbox.drain():
             last_arrival = clock.now()
             writer.write(delivery.key.removeprefix(prefix), delivery.payload, delivery.received_ns + to_unix)
+        garbage.idle()
         if clock.now() >= next_flush:
             writer.flush()
             next_flush = clock.now() + flush_s

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.status import Status
 
 from node_runtime.config import Config, to_toml
-from node_runtime.realtime import quick_handover
+from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from run_log import report
 from run_log.errors import LogError
 from run_log.reader import read_run
@@ -21,7 +21,7 @@ from tandem import figures, terminal
 from tandem.checks import plant_of
 from tandem.files import RunFiles, claimed
 from tandem.launch import Impatient, StartError, Supervisor, Wish, wishes
-from tandem.monitor import Monitor
+from tandem.monitor import Monitor, Snapshot
 from tandem.screen import Screen
 
 INTERRUPTED = 130
@@ -38,7 +38,7 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> 
         raise terminal.Refused(f"--seconds {seconds:g}: less than one period of {config.period:g} s")
     plant = plant_of(config)
     console = terminal.console(as_json)
-    with claimed(Path(config.log.path)) as (files, moved), wishes() as wish, quick_handover():
+    with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
         for text in moved:
             console.print(text, style="dim", markup=False, soft_wrap=True)
         bus = config.bus if endpoint_given else msgspec.structs.replace(config.bus, endpoint=_free_endpoint())
@@ -62,8 +62,16 @@ def _supervise(
     config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console
 ) -> tuple[str | None, bool]:
     """Why the run ended badly, or None; and whether its log is whole."""
-    with Screen(console, monitor.new_events) as screen:
-        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, screen.show)
+    priority = min(READER_PRIORITY, config.realtime.priority)
+    with Screen(console, monitor.new_events) as screen, punctual(priority, silent=True):
+        garbage = GarbageCollection()
+        garbage.begin()
+
+        def show(now: Snapshot) -> None:
+            screen.show(now)
+            garbage.idle()
+
+        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, show)
         trouble = supervisor.run()
         return trouble, not supervisor.recorder_died
 

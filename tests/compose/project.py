@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -87,6 +88,7 @@ def docker(*arguments: str) -> str:
     return subprocess.run(["docker", *arguments], capture_output=True, text=True, check=True).stdout
 
 
+@functools.cache
 def limits() -> dict[str, str]:
     """The environment for an engine that may not raise limits, as in a sandbox; else {}."""
     probe = ["docker", "run", "--rm", "--ulimit", "rtprio=99", "--ulimit", "memlock=-1", BASE, "true"]
