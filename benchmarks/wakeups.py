@@ -17,6 +17,8 @@ import numpy as np
 import tyro
 
 from node_runtime import clock
+from node_runtime.choices import AwakeMode
+from node_runtime.config import Config, RealtimeConfig
 from node_runtime.pacer import Grid, Pacer
 from node_runtime.realtime import punctual
 
@@ -32,13 +34,18 @@ class Wakeups:
     """SCHED_FIFO; 0: none."""
     late_fraction: float = 0.2
     """A slot is late when it begins later than this share of a period, as in the configuration."""
+    awake: AwakeMode = "auto"
+    """As `realtime.awake` in the configuration."""
 
 
 def measure(settings: Wakeups) -> dict[str, float | int]:
     """Late and skipped slots in percent of all, and lateness in ms."""
     period = 1.0 / settings.rate
     lateness: list[float] = []
-    with punctual(settings.priority):
+    config = Config(
+        rate=settings.rate, realtime=RealtimeConfig(priority=settings.priority, awake=settings.awake)
+    )
+    with punctual(settings.priority, keep_awake=config.awake):
         pacer = Pacer(Grid(period, clock.now() + period), threading.Event())
         for _ in range(round(settings.seconds * settings.rate)):
             turn = pacer.next()

@@ -256,7 +256,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
             _check_phase(config)
             core = ControllerCore(config, run_id)
             with (
-                punctual(config.realtime.priority) as note,
+                punctual(config.realtime.priority, keep_awake=config.awake) as note,
                 Bus(config, "controller", run_id, stopping) as bus,
                 HealthPublisher(bus, core.run_info(time.time()), lambda: counts, note) as health,
             ):

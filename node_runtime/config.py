@@ -17,7 +17,7 @@ import msgspec
 import tomli_w
 
 from node_runtime import config_words
-from node_runtime.choices import CompileMode, OracleName, SolverMode, Strategy, TighteningName
+from node_runtime.choices import AwakeMode, CompileMode, OracleName, SolverMode, Strategy, TighteningName
 from protocol.codec import first_non_finite
 from protocol.network import BOUNDED, Activation, Width
 
@@ -28,6 +28,10 @@ Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 
 
 Fail = Callable[[str, str], NoReturn]
+
+AWAKE_BELOW = 0.01
+"""Seconds. Waking a sleeping core takes up to a few tenths of a millisecond: little of a longer period, but power all
+the time if it is avoided."""
 
 
 class ConfigError(ValueError):
@@ -136,7 +140,9 @@ class LogConfig(Section, frozen=True):
 
 class RealtimeConfig(Section, frozen=True):
     priority: Annotated[int, msgspec.Meta(ge=0, le=99)] = 50
-    """SCHED_FIFO priority of controller and plant; 0: leave the scheduler alone."""
+    """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
+    awake: AwakeMode = "auto"
+    """Keep the cores from sleeping between slots; "auto": where there is a priority and the period is below 10 ms."""
 
 
 class Config(Section, frozen=True):
@@ -161,6 +167,12 @@ class Config(Section, frozen=True):
     def period(self) -> float:
         """Seconds between samples."""
         return 1.0 / self.rate
+
+    @property
+    def awake(self) -> bool:
+        """Whether `realtime.awake` keeps the cores from sleeping at this rate."""
+        mode, needed = self.realtime.awake, self.realtime.priority > 0 and self.period < AWAKE_BELOW
+        return mode == "always" or (mode == "auto" and needed)
 
 
 def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:

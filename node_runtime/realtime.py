@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import struct
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ log = logging.getLogger(__name__)
 READER_PRIORITY = 1
 """SCHED_FIFO priority of what reads everything on the bus: below the loops, above all that is not real-time. A reader
 that gets no core fills its link, and then the router waits, with everybody's messages."""
+WAKE_LATENCY = "/dev/cpu_dma_latency"
+"""Linux holds the wake-up latency, in microseconds, that was written here for as long as the file stays open."""
 
 
 @contextmanager
@@ -42,7 +45,28 @@ def quick_handover() -> Iterator[None]:
 
 
 @contextmanager
-def punctual(priority: int, *, silent: bool = False) -> Iterator[str]:
+def awake(wanted: bool = True, device: str = WAKE_LATENCY) -> Iterator[str]:
+    """Keep the cores of this machine from sleeping, so that a wake-up takes microseconds; it costs power.
+
+    Where that is not permitted: one warning, and the text that is yielded, for `Health.note`, says so; else it is "".
+    """
+    if not wanted:
+        yield ""
+        return
+    try:
+        file = open(device, "r+b", buffering=0)  # noqa: SIM115 - whether it opens decides what is yielded
+    except OSError as error:
+        note = f"{device} cannot be opened ({error.strerror}); cores may sleep between slots and wake late"
+        log.warning("%s. Run as root or give access to it, or set realtime.awake = never.", note)
+        yield note
+        return
+    with file:
+        file.write(struct.pack("@i", 0))
+        yield ""
+
+
+@contextmanager
+def punctual(priority: int, *, keep_awake: bool = False, silent: bool = False) -> Iterator[str]:
     """Make the calling thread, and all threads it starts from here on, punctual.
 
     Enter it before the bus opens, whose threads inherit the priority. Without the privilege the loop runs at
@@ -50,13 +74,14 @@ def punctual(priority: int, *, silent: bool = False) -> Iterator[str]:
 
     Args:
         priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduler alone.
+        keep_awake: see `awake`.
         silent: no warning; for a process beside others that warn.
     """
     before = (os.sched_getscheduler(0), os.sched_getparam(0))
     note = _raise_priority(priority, silent)
-    with one_blas_thread(), quick_handover(), collection_as_before():
+    with awake(keep_awake) as sleepy, one_blas_thread(), quick_handover(), collection_as_before():
         try:
-            yield note
+            yield "; ".join(filter(None, (note, sleepy)))
         finally:
             if priority and not note:
                 os.sched_setscheduler(0, *before)

@@ -57,7 +57,10 @@ class Router:
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it is none."""
     # Every state and every command passes through here, so the router must be as punctual as the loops.
-    with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:
+    with (
+        stopped_by_signals(stop) as stopping,
+        punctual(config.realtime.priority, keep_awake=config.awake) as note,
+    ):
         try:
             with Router(config) as router:
                 log.info("router listening on %s", config.bus.endpoint)

@@ -102,7 +102,10 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | None) -> int:
     names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
     counts = dict.fromkeys(names, 0)
-    with stopped_by_signals(stop) as stopping, punctual(config.realtime.priority) as note:
+    with (
+        stopped_by_signals(stop) as stopping,
+        punctual(config.realtime.priority, keep_awake=config.awake) as note,
+    ):
         info = run_info(config, "plant", run_id, sim.plant.units)
         try:
             with (

@@ -9,21 +9,24 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 from live import Ear, health_of, live_config, wait_for
 
 from node_runtime import clock
 from node_runtime.bus import Bus
+from node_runtime.config import Config, override
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
-from node_runtime.realtime import GarbageCollection, punctual, quick_handover
+from node_runtime.realtime import GarbageCollection, awake, punctual, quick_handover
 from node_runtime.router import Router
 from protocol import messages as m
 from protocol import topics
 
 STUBBORN = """
 import threading
+from pathlib import Path
 from node_runtime.lifecycle import stopped_by_signals
 with stopped_by_signals() as stop:
     print("running", flush=True)
@@ -98,6 +101,45 @@ def test_without_the_privilege_one_warning_and_a_note() -> None:
     assert "no privilege for SCHED_FIFO priority 50" in done.stdout
     assert done.stderr.count("no privilege") == 1
     assert "CAP_SYS_NICE" in done.stderr
+
+
+def test_the_cores_stay_awake_for_as_long_as_the_loop_runs(tmp_path: Path) -> None:
+    device = tmp_path / "cpu_dma_latency"
+    device.touch()
+    with awake(device=str(device)) as note:
+        assert note == ""
+        assert device.read_bytes() == bytes(4)
+        opened = [os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")]
+        assert str(device) in opened
+    opened = [os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")]
+    assert str(device) not in opened
+
+
+def test_where_cores_may_sleep_the_loop_runs_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with awake(device=str(tmp_path / "missing")) as note:
+        assert "cores may sleep" in note
+    assert len(caplog.records) == 1
+    assert "realtime.awake = never" in caplog.text
+    with awake(False, device=str(tmp_path / "missing")) as note:
+        assert note == ""
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    ("assignments", "awake"),
+    [
+        (["rate=20"], False),
+        (["rate=1000"], True),
+        (["rate=1000", "realtime.priority=0"], False),
+        (["rate=1000", "realtime.awake=never"], False),
+        (["rate=20", "realtime.awake=always"], True),
+        (["rate=20", "realtime.awake=always", "realtime.priority=0"], True),
+    ],
+)
+def test_cores_are_kept_awake_where_it_pays(assignments: list[str], awake: bool) -> None:
+    assert override(Config(), assignments).awake is awake
 
 
 def test_everything_is_as_before_after_a_punctual_loop() -> None:
