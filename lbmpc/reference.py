@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from lbmpc.oracles.base import follow_symbols, remembered
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
 from lbmpc.solution import Solution, Status
@@ -18,21 +19,25 @@ class ReferenceSolver:
         self._rows = rows = Rows(problem)
         model, n = problem.model, problem.horizon
         d, m = model.d, model.m
-        x, theta = ca.MX.sym("x", d), ca.MX.sym("theta", problem.oracle.parameters)
+        x, theta = (
+            ca.MX.sym("x", d + remembered(problem.oracle)),
+            ca.MX.sym("theta", problem.oracle.parameters),
+        )
         v = ca.MX.sym("v", m, n)
         e = ca.MX.sym("e", int(rows.penalty.soft.sum()) if problem.soft else 0)
         a, b, q, r, p = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R, model.P))
         parts = problem.oracle.split(theta)
-        z, nominal, cost = x, x, ca.MX(0)
+        s, nominal, cost = x, x[:d], ca.MX(0)
         values_v, values_z = [], []
         for i in range(n):
-            vi = v[:, i]
+            vi, z = v[:, i], s[:d]
             cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, vi, vi))
-            z = a @ z + b @ vi + problem.oracle.value(ca.vertcat(z, vi), parts)
+            after = a @ z + b @ vi + problem.oracle.value(ca.vertcat(s, vi), parts)
+            s = follow_symbols(s, vi, after)
             nominal = a @ nominal + b @ vi
             values_v.append(ca.DM(rows.input_rows) @ vi)
             values_z.append(ca.DM(rows.state_rows) @ nominal)
-        cost += 0.5 * ca.bilin(p, z, z)
+        cost += 0.5 * ca.bilin(p, s[:d], s[:d])
         values = ca.vertcat(*values_v, *values_z, ca.DM(rows.terminal_rows) @ nominal)
         count = rows.count_inputs
         slack = (
@@ -79,7 +84,7 @@ class ReferenceSolver:
             lbx=self._lbx,
         )
         v = np.array(result["x"]).ravel()[: n * m].reshape(n, m)
-        zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)
+        zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)[: self.problem.model.d]
         for i in range(n):
             state = zbar[i] = self.problem.model.A @ state + self.problem.model.B @ v[i]
         slack, row = self._rows.slack(self._rows.values(v.T, zbar.T))

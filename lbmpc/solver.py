@@ -16,7 +16,7 @@ import numpy as np
 from lbmpc.bound import Bound
 from lbmpc.kernels import build_rows, build_sweep, build_tangent
 from lbmpc.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
-from lbmpc.oracles.base import LinearOracle, Oracle
+from lbmpc.oracles.base import LinearOracle, Oracle, remembered
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
 from lbmpc.solution import Solution, Status
@@ -33,7 +33,7 @@ class Prepared:
     """A linearisation about a predicted state, waiting for the measured one."""
 
     x: np.ndarray
-    """Predicted state, (d,)."""
+    """Predicted state, (D,)."""
     status: Status
     cost: float
     values: np.ndarray
@@ -41,13 +41,13 @@ class Prepared:
     slopes: np.ndarray
     """Their slopes in w, (rows, m N)."""
     follow: np.ndarray
-    """Their slopes in x, (rows, d)."""
+    """Their slopes in x, (rows, D)."""
     free: np.ndarray
     """The unconstrained minimiser's inputs, (N, m)."""
     slopes_v: np.ndarray
     """How those move with w, (m N, m N)."""
     follow_v: np.ndarray
-    """How they follow x, (m N, d)."""
+    """How they follow x, (m N, D)."""
     shown: Shown | None
     """The QP as it was solved at x; None where no row was violated there."""
 
@@ -87,9 +87,10 @@ class Solver:
         self.max_iterations, self.tolerance = max_iterations, tolerance
         self._realise = realise
         self._rows = Rows(problem)
-        self._move = Bound(realise(build_rows(problem.model, problem.horizon)))
+        self._behind = remembered(problem.oracle)
+        self._move = Bound(realise(build_rows(problem.model, problem.horizon, self._behind)))
         self._sweep = self._bind(problem.oracle)
-        nominal = LinearOracle(problem.model.d, problem.model.m)
+        nominal = LinearOracle(problem.model.d, problem.model.m, problem.oracle.pairs)
         self._nominal_sweep = self._sweep if problem.oracle.name == nominal.name else self._bind(nominal)
         self._free, self._forced = _prediction(problem)
         self._shape = (problem.horizon, problem.model.m)
@@ -111,7 +112,8 @@ class Solver:
         """Minimise from x_t = x.
 
         Args:
-            x: measured state, (d,), deviation coordinates.
+            x: measured state, (d,), deviation coordinates; where the oracle looks back, the past pairs behind it:
+                s of `lbmpc.oracles.base`, (D,).
             oracle_parameters: theta, as the oracle packs it.
             warm_start: inputs to start from, (N, m); they need not be feasible.
             xr, ur: references over the horizon, (N + 1, d) and (N, m); the equilibrium by default.
@@ -130,12 +132,12 @@ class Solver:
     # -- real-time iteration --------------------------------------------------------------------------------
 
     def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
-        """Linearise ahead of the sample, about a predicted state x, (d,); everything that needs no x_t is done here.
+        """Linearise ahead of the sample, about a predicted state x, (D,); everything that needs no x_t is done here.
 
         Arguments as for `solve`. One Gauss-Newton step is left for `feedback`.
         """
         if self._tangent is None:
-            function = build_tangent(self.problem.model, self.problem.horizon)
+            function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
         tangent, rows, v = self._tangent, self._rows, self._rows.clip(np.nan_to_num(warm_start))
         with np.errstate(all="ignore"):
@@ -172,7 +174,7 @@ class Solver:
             )
 
     def feedback(self, x: np.ndarray) -> Solution:
-        """Complete the prepared step for the measured state x, (d,): a correction of x, and a few QP rows.
+        """Complete the prepared step for the measured state x, (D,): a correction of x, and a few QP rows.
 
         The nominal trajectory is linear in x, so the constraints hold for x itself, not for its prediction.
 
@@ -316,7 +318,7 @@ class Solver:
 
     def _nominal(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """zbar_1..zbar_N under inputs v, (d, N)."""
-        return (self._free @ x + self._forced @ v.ravel()).reshape(len(v), -1).T
+        return (self._free @ x[: self._free.shape[1]] + self._forced @ v.ravel()).reshape(len(v), -1).T
 
     def _finish(
         self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int

@@ -2,24 +2,36 @@
 
     h_hat(x, u) = output_scale * K' phi(x, u),        phi = (1, psi_L[W_{L-1}' (1, psi_{L-1}[ ... ])])
 
-(e:NN_structure) of the paper. The input is (x, u) in deviation coordinates divided by `input_scale`. Every weight
-matrix carries its bias as its first row, and every layer's activations carry a leading 1, the output layer's
-included. The last hidden activation is bounded, so phi is: |phi|^2 <= 1 + n_L = sigma^2.
+(e:NN_structure) of the paper. The input is (x, u) in deviation coordinates divided by `input_scale`, or a window of
+the last k such pairs. Every weight matrix carries its bias as its first row, and every layer's activations carry a
+leading 1, the output layer's included. How the hidden layers act on the window is their architecture, a file of
+`protocol/architectures`. The last hidden activation is bounded, so phi is: |phi|^2 <= 1 + n_L = sigma^2.
 """
 
 from __future__ import annotations
 
 import hashlib
-import itertools
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
-Activation = Literal["tanh", "sigmoid", "softsign", "softplus", "relu"]
-BOUNDED: tuple[Activation, ...] = ("tanh", "sigmoid", "softsign")
+from protocol.architecture import BOUNDED, Activation, Sizes, get_architecture
+
+__all__ = [
+    "BOUNDED",
+    "Activation",
+    "NetworkDescription",
+    "Width",
+    "hash_layers",
+    "initial_hidden",
+    "why_unacceptable",
+]
+
 Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+# Fields that came later are left out of the hash at these values: weights in older logs keep their network's hash.
+_FIRST: dict[str, Any] = {"architecture": "mlp", "window": 1, "options": {}}
 
 
 class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -37,6 +49,12 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Units of h that count as 1, one for each state."""
     max_layer_norm: Positive = 100.0
     """Largest Frobenius norm of a hidden layer that a controller accepts."""
+    architecture: str = "mlp"
+    """A file of `protocol/architectures`."""
+    window: Width = 1
+    """k, the pairs (x, u) that the network sees: the present one and k - 1 before it."""
+    options: dict[str, int] = {}
+    """The architecture's own settings, all of them."""
 
     def __post_init__(self) -> None:
         if not self.hidden:
@@ -53,20 +71,38 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
             )
         if len(self.output_scale) != self.states:
             raise ValueError(f"output_scale has {len(self.output_scale)} entries, h has {self.states}")
+        known = get_architecture(self.architecture).options
+        if self.options.keys() != known.keys():
+            raise ValueError(
+                f"the options of {self.architecture} are {sorted(known) or 'none'}, not {sorted(self.options)}"
+            )
+        _ = self.layer_shapes
+
+    @property
+    def pair(self) -> int:
+        """Length of (x, u), d + m."""
+        return self.states + self.inputs
+
+    @property
+    def sizes(self) -> Sizes:
+        """What an architecture needs to know."""
+        return Sizes(self.pair, self.window, tuple(self.hidden), tuple(self.activations), self.options)
 
     @property
     def layer_shapes(self) -> list[tuple[int, int]]:
-        """Shapes of W_1..W_{L-1}: (1 + n_{i-1}, n_i)."""
-        sizes = [self.states + self.inputs, *self.hidden]
-        return [(1 + a, b) for a, b in itertools.pairwise(sizes)]
+        """Shapes of the hidden weights, the bias of each as its first row; for an mlp (1 + n_{i-1}, n_i)."""
+        return get_architecture(self.architecture).shapes(self.sizes)
 
     @property
     def features(self) -> int:
         """Length of phi, 1 + n_L."""
-        return 1 + self.hidden[-1]
+        return 1 + get_architecture(self.architecture).outputs(self.sizes)
 
     def sha256(self) -> str:
-        return hashlib.sha256(msgspec.json.encode(self)).hexdigest()
+        """Of all fields."""
+        fields = msgspec.to_builtins(self)
+        kept = {name: value for name, value in fields.items() if name not in _FIRST or value != _FIRST[name]}
+        return hashlib.sha256(msgspec.json.encode(kept)).hexdigest()
 
 
 def initial_hidden(description: NetworkDescription, rng: np.random.Generator) -> list[np.ndarray]:

@@ -2,48 +2,25 @@
 
     h_hat(x, u) = s * K' phi_j(x, u),    phi_j = (1, psi_L[W_{L-1}' (1, psi_{L-1}[ ... (1, (x, u) / scale)])])
 
-(e:NN_structure). `protocol.network` describes it; the trainer builds the same function in torch.
+(e:NN_structure), or another architecture on a window of the last k pairs. `protocol.network` describes it; the
+trainer builds the same function in torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.adaptation import adapt, project_columns
 from lbmpc.oracles import base
+from lbmpc.oracles.backends import ACTIVATIONS, Numbers, Symbols
 from lbmpc.oracles.base import OracleState
-from protocol.network import Activation, NetworkDescription, hash_layers, initial_hidden, why_unacceptable
+from protocol.architecture import get_architecture
+from protocol.network import NetworkDescription, hash_layers, initial_hidden, why_unacceptable
 
-
-class _Activation(NamedTuple):
-    """psi and its derivative, in CasADi and in numpy; the derivative takes (input, psi(input))."""
-
-    value: Callable[[ca.MX], ca.MX]
-    slope: Callable[[ca.MX, ca.MX], ca.MX]
-    numpy: Callable[[np.ndarray], np.ndarray]
-
-
-ACTIVATIONS: dict[Activation, _Activation] = {
-    "tanh": _Activation(ca.tanh, lambda a, s: 1 - s * s, np.tanh),
-    "sigmoid": _Activation(
-        lambda a: 0.5 + 0.5 * ca.tanh(0.5 * a),
-        lambda a, s: s * (1 - s),
-        lambda a: 0.5 + 0.5 * np.tanh(0.5 * a),
-    ),
-    "softsign": _Activation(
-        lambda a: a / (1 + ca.fabs(a)), lambda a, s: 1 / (1 + ca.fabs(a)) ** 2, lambda a: a / (1 + np.abs(a))
-    ),
-    "softplus": _Activation(
-        lambda a: ca.fmax(a, 0) + ca.log1p(ca.exp(-ca.fabs(a))),
-        lambda a, s: 0.5 + 0.5 * ca.tanh(0.5 * a),
-        lambda a: np.logaddexp(a, 0.0),
-    ),
-    "relu": _Activation(lambda a: ca.fmax(a, 0), lambda a, s: a > 0, lambda a: np.maximum(a, 0.0)),
-}
+SYMBOLS, NUMBERS = Symbols(), Numbers()
 
 
 class DnnOracle:
@@ -74,7 +51,9 @@ class DnnOracle:
         self.initial_scale = initial_scale
         self.shapes = [*description.layer_shapes, (description.features, self.d)]
         self.parameters = sum(rows * columns for rows, columns in self.shapes)
-        self._psi = [ACTIVATIONS[name] for name in description.activations]
+        self.pairs = description.window
+        self._architecture, self._sizes = get_architecture(description.architecture), description.sizes
+        self._dense = description.architecture == "mlp" and self.pairs == 1
 
     # -- expressions ---------------------------------------------------------------------------------------------
 
@@ -87,19 +66,40 @@ class DnnOracle:
             start += rows * columns
         return parts
 
-    def value(self, xu: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        activation = xu / self.input_scale
-        for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], self._psi, strict=True):
-            activation = psi.value(_affine(bias, weights, activation))
-        return _affine(parts[-2], parts[-1], activation) * self.output_scale
+    def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
+        layers = list(zip(parts[::2], parts[1::2], strict=True))
+        activation = self._architecture.forward(SYMBOLS, self._sizes, layers[:-1], self._window(su))
+        return SYMBOLS.affine(layers[-1], activation) * self.output_scale
 
-    def jacobian(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+    def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+        return self._forward_mode(su, parts) if self._dense else self._reverse_mode(su, parts)
+
+    def _window(self, su: ca.MX) -> list[ca.MX]:
+        """The network's input pair by pair, scaled, from points (s, u), (D + m, n)."""
+        start = self.d + base.remembered(self)
+        ordered = ca.vertcat(su[self.d : start, :], su[: self.d, :], su[start:, :]) if self.pairs > 1 else su
+        scaled = ordered / np.tile(self.input_scale, self.pairs)
+        return ca.vertsplit(scaled, self.d + self.m) if self.pairs > 1 else [scaled]
+
+    def _reverse_mode(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+        """Any architecture: one sweep back for each entry of h_hat, for all points at once."""
+        rows, points = su.shape
+        symbols = [ca.MX.sym("su", rows, points), *(ca.MX.sym("part", *part.shape) for part in parts)]
+        h = self.value(symbols[0], symbols[1:])
+        seeds = [ca.DM(np.outer(row, np.ones(points))) for row in np.eye(self.d)]
+        swept = ca.vertcat(*(ca.jtimes(h, symbols[0], seed, True) for seed in seeds))
+        gradients = ca.Function("gradients", symbols, [swept])(su, *parts)
+        return [ca.reshape(column, rows, self.d).T for column in ca.horzsplit(gradients)]
+
+    def _forward_mode(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+        """Dense layers on one pair, where (x, u) is hardly longer than h: the fewest products of all."""
         points, variables = xu.shape[1], self.d + self.m
         activation = xu / self.input_scale
-        # Forward mode, all directions and all points side by side: each layer is one matrix product.
+        # All directions and all points side by side: each layer is one matrix product.
         tangent: ca.MX | None = None
-        for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], self._psi, strict=True):
-            total = _affine(bias, weights, activation)
+        psis = [ACTIVATIONS[name] for name in self.description.activations]
+        for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], psis, strict=True):
+            total = SYMBOLS.affine((bias, weights), activation)
             activation = psi.value(total)
             slope = psi.slope(total, activation)
             if tangent is None:
@@ -108,10 +108,10 @@ class DnnOracle:
             else:
                 tangent = weights @ tangent
             tangent = tangent * ca.repmat(slope, 1, variables)
-        return ca.horzsplit(parts[-1] @ tangent * self.output_scale, points)
+        return base.by_point(ca.horzsplit(parts[-1] @ tangent * self.output_scale, points))
 
     def function(self) -> ca.Function:
-        """(x, u, theta) -> h_hat and Jacobian."""
+        """(s, u, theta) -> h_hat and Jacobian."""
         return base.function(self)
 
     # -- state ---------------------------------------------------------------------------------------------------
@@ -122,11 +122,21 @@ class DnnOracle:
         state = {f"W{i + 1}": layer for i, layer in enumerate(hidden)}
         state["K"] = project_columns(k, self.bounds)
         state["version"] = np.zeros(1, dtype=np.int64)
+        if self.pairs > 1:
+            state["past"] = np.zeros((self.pairs - 1, self.d + self.m))
         return state
+
+    def begin(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
+        if self.pairs == 1:
+            return state
+        return {**state, "past": np.tile(np.concatenate([x, u]), (self.pairs - 1, 1))}
+
+    def past(self, state: OracleState) -> np.ndarray:
+        return state["past"] if self.pairs > 1 else np.zeros((0, self.d + self.m))
 
     def hidden(self, state: OracleState) -> list[np.ndarray]:
         """W_1..W_{L-1}."""
-        return [state[f"W{i + 1}"] for i in range(len(self._psi))]
+        return [state[f"W{i + 1}"] for i in range(len(self.shapes) - 1)]
 
     def pack(self, hidden: list[np.ndarray], K: np.ndarray) -> np.ndarray:
         """theta from hidden layers and scaled output weights K, (1 + n_L, d)."""
@@ -136,11 +146,14 @@ class DnnOracle:
         return self.pack(self.hidden(state), state["K"])
 
     def features(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """phi_j(x, u), (1 + n_L,), with phi[0] = 1."""
-        activation = np.concatenate([x, u]) / self.input_scale
-        for weights, psi in zip(self.hidden(state), self._psi, strict=True):
-            activation = psi.numpy(weights[0] + activation @ weights[1:])
-        return np.concatenate([[1.0], activation])
+        """phi_j(x, u) with the past in this state, (1 + n_L,), with phi[0] = 1."""
+        return self.features_of(self.hidden(state), np.vstack([self.past(state), np.concatenate([x, u])]))
+
+    def features_of(self, hidden: Sequence[np.ndarray], window: np.ndarray) -> np.ndarray:
+        """phi of a window, (k, d + m), oldest pair first, under hidden layers; or of many, (points, k, d + m)."""
+        pairs = list(np.moveaxis(window / self.input_scale, -2, 0))
+        activation = self._architecture.forward(NUMBERS, self._sizes, hidden, pairs)
+        return np.concatenate([np.ones((*activation.shape[:-1], 1)), activation], axis=-1)
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return self.output_scale * (self.features(state, x, u) @ state["K"])
@@ -148,7 +161,10 @@ class DnnOracle:
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
         phi = self.features(state, x, u)
         error = phi @ state["K"] - h / self.output_scale
-        return {**state, "K": adapt(state["K"], phi, error, self.gamma, self.bounds)}
+        learned = {**state, "K": adapt(state["K"], phi, error, self.gamma, self.bounds)}
+        if self.pairs > 1:
+            learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
+        return learned
 
     def adopt(
         self, state: OracleState, version: int, layers: list[np.ndarray], sha256: str, network_sha256: str
@@ -170,9 +186,3 @@ class DnnOracle:
             return state, "refused: sha256 does not match the layers"
         swapped = {f"W{i + 1}": layer.astype(float) for i, layer in enumerate(layers)}
         return {**state, **swapped, "version": np.array([version], dtype=np.int64)}, "adopted"
-
-
-def _affine(bias: ca.MX, weights: ca.MX, activation: ca.MX) -> ca.MX:
-    """b + V a for many points: (k,), (k, n), (n, points) -> (k, points)."""
-    product = weights @ activation
-    return product + (bias if activation.shape[1] == 1 else ca.repmat(bias, 1, activation.shape[1]))

@@ -11,10 +11,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from lbmpc.oracles.base import OracleState
+from lbmpc.oracles.base import Memoryless, OracleState, by_point
 
 
-class L2nwOracle:
+class L2nwOracle(Memoryless):
     """Kernel regression on some of the states and inputs.
 
     Args:
@@ -41,15 +41,15 @@ class L2nwOracle:
         table = ca.reshape(theta, self.rows, self.window)
         return [table[:n, :].T, table[n : n + self.d, :], table[n + self.d, :].T]
 
-    def value(self, xu: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        return self._value_and_slopes(xu, parts)[0]
+    def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
+        return self._value_and_slopes(su, parts)[0]
 
-    def jacobian(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        slopes = self._value_and_slopes(xu, parts)[1]
-        zero = ca.MX.zeros(self.d, xu.shape[1])
-        return [
-            slopes[self.variables.index(k)] if k in self.variables else zero for k in range(self.d + self.m)
-        ]
+    def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+        slopes = self._value_and_slopes(su, parts)[1]
+        zero = ca.MX.zeros(self.d, su.shape[1])
+        return by_point(
+            [slopes[self.variables.index(k)] if k in self.variables else zero for k in range(self.d + self.m)]
+        )
 
     def _value_and_slopes(self, xu: ca.MX, parts: list[ca.MX]) -> tuple[ca.MX, list[ca.MX]]:
         points, labels, valid = parts
