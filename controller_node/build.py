@@ -15,6 +15,7 @@ from lbmpc.problem import build_problem
 from lbmpc.sets.polytope import EmptySetError
 from lbmpc.solver import Solver
 from node_runtime.config import Config, ConfigError
+from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription
 
 Realise = Callable[[ca.Function], ca.Function]
@@ -38,16 +39,25 @@ def initial_state(config: Config, plant: Plant) -> np.ndarray:
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
-    """The network of the configuration for this plant; inputs are scaled by the half-widths of X and U."""
+    """The network of the configuration for this plant; inputs are scaled by the half-widths of X and U.
+
+    Raises:
+        ValueError: the sizes or the options do not fit the architecture, or there is none of that name.
+    """
     half_widths = np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
+    network = config.network
+    architecture = get_architecture(network.architecture)
     return NetworkDescription(
         states=plant.d,
         inputs=plant.m,
-        hidden=config.network.hidden,
-        activations=[config.network.activation] * len(config.network.hidden),
+        hidden=network.hidden,
+        activations=[network.activation] * len(network.hidden),
         input_scale=half_widths.tolist(),
-        output_scale=[config.network.output_scale * config.period] * plant.d,
-        max_layer_norm=config.network.max_layer_norm,
+        output_scale=[network.output_scale * config.period] * plant.d,
+        max_layer_norm=network.max_layer_norm,
+        architecture=network.architecture,
+        window=architecture.window if network.window is None else network.window,
+        options={**architecture.options, **network.options},
     )
 
 
@@ -101,11 +111,12 @@ def build_controller(config: Config, realise: Realise | None = None) -> Controll
 
 def _warm_up(controller: Controller, seed: int) -> None:
     """Whatever is slow the first time is slow here and not in the first tick; leaves no trace in any result."""
-    x, solver = np.zeros(controller.model.d), controller.solver
-    state = controller.initial_state(seed)
+    solver, state = controller.solver, controller.initial_state(seed)
+    x = np.zeros_like(state.predicted)
     theta = controller.oracle.theta(state.oracle)
     # Far enough out that the QP is needed too.
-    edge = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
+    edge = x.copy()
+    edge[: controller.model.d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
     for start in (x, edge):
         solver.solve(start, theta, state.plan.v)
         if controller.real_time:

@@ -221,7 +221,8 @@ class ControllerCore:
         if label is None:
             return None
         # The label of tick t is complete at tick t + 1.
-        return m.Sample(tick.seq - 1, label.x.tolist(), label.u.tolist(), label.h.tolist())
+        x, u, h, past = label.x.tolist(), label.u.tolist(), label.h.tolist(), label.past.tolist()
+        return m.Sample(tick.seq - 1, x, u, h, past)
 
     def _weights(self, tick: m.Tick) -> m.OutputWeights | None:
         if self._dnn is None:

@@ -37,8 +37,9 @@ class Outbox:
         return found
 
     def batches(self, samples: list[Sample]) -> list[Samples]:
-        """The same samples as messages of at most `BATCH` each."""
-        parts = (samples[i : i + BATCH] for i in range(0, len(samples), BATCH))
+        """The same samples as messages of at most `BATCH` pairs each, those of their past included."""
+        size = max(1, BATCH // (1 + len(samples[0].past))) if samples else BATCH
+        parts = (samples[i : i + size] for i in range(0, len(samples), size))
         return [Samples(run_id=self.run_id, seq=part[-1].seq, samples=part) for part in parts]
 
     def answer(self, parameters: dict[str, str]) -> list[bytes]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
 from lbmpc.model import Model, Pieces
-from lbmpc.oracles.base import OracleState
+from lbmpc.oracles.base import OracleState, follow
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
 from lbmpc.solution import Solution
@@ -62,7 +62,7 @@ class ControllerState:
     pending: tuple[int, int]
     """Its (source, sequence); sequence -1 when none is pending."""
     predicted: np.ndarray
-    """The learned model's prediction of the next state, (d,)."""
+    """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
     delay: float
     """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
     oracle: OracleState
@@ -106,6 +106,8 @@ class Label:
     h: np.ndarray
     h_hat: np.ndarray
     """The oracle's estimate before it learned this sample."""
+    past: np.ndarray
+    """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,7 @@ class Controller:
         oracle = self.oracle.initial_state(np.random.default_rng(seed))
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
-        return ControllerState(plan, nothing, (0, -1), nothing, 0.0, oracle)
+        return ControllerState(plan, nothing, (0, -1), self._with_past(oracle, nothing), 0.0, oracle)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -176,19 +178,26 @@ class Controller:
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
-        x = start if start is not None else state.predicted
-        predicted = self.model.A @ x + self.model.B @ plan.v[0] + self.oracle.estimate(oracle, x, plan.v[0])
+        s = self._with_past(oracle, start) if start is not None else state.predicted
+        x, u = s[: self.model.d], plan.v[0]
+        predicted = follow(s, u, self.model.A @ x + self.model.B @ u + self.oracle.estimate(oracle, x, u))
         after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
         return after, StepResult(plan.v, mode, solution, label, verdict, delay)
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
         follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
-        if seen.x is None or seen.applied is None or not follows:
+        if seen.x is None:
             return None, state.oracle
+        if seen.applied is None or not follows:
+            # What came before x is not known, at the start and after a gap.
+            acting = _acting(seen)
+            u = np.zeros(self.model.m) if acting is None else acting
+            return None, self.oracle.begin(state.oracle, seen.x, u)
         x, u = state.pending_x, seen.applied
         h = self.model.label(x, u, seen.x, seen.pieces)
-        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u))
+        past = self.oracle.past(state.oracle)
+        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u), past)
         return label, self.oracle.learn(state.oracle, x, u, h)
 
     def _delay(self, delay: float, seen: Observation) -> float:
@@ -204,7 +213,7 @@ class Controller:
         Until then the plant goes on under the input it has, which the model knows; without this every millisecond
         between sample and command would be a disturbance.
         """
-        acting = seen.pieces[-1][1] if seen.pieces else seen.applied
+        acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:
             return seen.x
         phi, gamma = self.model.hold(delay)
@@ -235,16 +244,26 @@ class Controller:
         return Plan(feedback_plan(self.model, x, horizon), 0), "feedback", solution
 
     def _solve(self, state: ControllerState, oracle: OracleState, x: np.ndarray) -> Solution:
+        s = self._with_past(oracle, x)
         if not self.real_time or state.plan.left == 0:
             # Without a plan to start from, one step is not enough.
-            return self.solver.solve(x, self.oracle.theta(oracle), state.plan.v)
+            return self.solver.solve(s, self.oracle.theta(oracle), state.plan.v)
         self.prepare(state)
         self._prepared_for = None
-        return self.solver.feedback(x)
+        return self.solver.feedback(s)
+
+    def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
+        """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
+        return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
 
     def _shifted(self, plan: Plan, solution: Solution | None) -> Plan:
         end = solution.zbar[-1] if solution is not None and solution.usable else np.zeros(self.model.d)
         return shift(plan, self.model.K @ end)
+
+
+def _acting(seen: Observation) -> np.ndarray | None:
+    """The input that the plant has when it is seen, (m,)."""
+    return seen.pieces[-1][1] if seen.pieces else seen.applied
 
 
 def same_memory(a: ControllerState, b: ControllerState) -> str | None:

@@ -18,8 +18,9 @@ import tomli_w
 
 from node_runtime import config_words
 from node_runtime.choices import AwakeMode, CompileMode, OracleName, SolverMode, Strategy, TighteningName
+from protocol.architecture import BOUNDED, Activation, get_architecture
 from protocol.codec import first_non_finite
-from protocol.network import BOUNDED, Activation, Width
+from protocol.network import Width
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -82,6 +83,12 @@ class ControllerConfig(Section, frozen=True):
 
 
 class NetworkConfig(Section, frozen=True):
+    architecture: str = "mlp"
+    """How the hidden layers act on the window: a file of `protocol/architectures`."""
+    window: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None
+    """k, the pairs (x, u) that the network sees, the present one included; None: the architecture's own."""
+    options: dict[str, int] = msgspec.field(default_factory=dict)
+    """The architecture's own settings, where they are not its defaults."""
     hidden: list[Width] = msgspec.field(default_factory=lambda: [64, 64])
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
@@ -227,6 +234,7 @@ def from_tree(
             f"network.activation = {activation!r} is unbounded, and the last layer must be bounded; "
             f"one of {', '.join(BOUNDED)}",
         )
+    _check_architecture(config.network, fail)
     if config.trainer.min_samples > config.trainer.capacity:
         fail(
             "trainer.min_samples",
@@ -234,6 +242,21 @@ def from_tree(
             f"{config.trainer.capacity}: the first training would never come",
         )
     return config
+
+
+def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
+    try:
+        known = get_architecture(network.architecture).options
+    except ValueError as error:
+        fail("network.architecture", f"network.architecture: {error}")
+    for key in network.options:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known) or 'none'}"
+            fail(
+                f"network.options.{key}",
+                f"network.options.{key}: {network.architecture} has no such option; {hint}",
+            )
 
 
 def from_json(text: str) -> Config:

@@ -120,6 +120,8 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                 expect("x", sample.x, d)
                 expect("u", sample.u, m_inputs)
                 expect("h", sample.h, d)
+                for i, pair in enumerate(sample.past):
+                    expect(f"past[{i}]", pair, d + m_inputs)
         case m.OutputWeights():
             if len(message.K.shape) != 2 or message.K.shape[1] != d:
                 raise BadMessage(

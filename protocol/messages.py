@@ -172,13 +172,15 @@ class TickTiming(Message, frozen=True):
     state_age_ms: float
 
 
-class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One labelled pair: x_t, the input applied from t to t+1, and h(x_t, u_t); deviation coordinates."""
 
     seq: Count
     x: list[float]
     u: list[float]
     h: list[float]
+    past: list[list[float]] = msgspec.field(default_factory=list)
+    """The k - 1 pairs (x, u) before this one, oldest first, as the controller's network saw them; empty for k = 1."""
 
 
 class Samples(Message, frozen=True):

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lbmpc.oracles.dnn import DnnOracle
-from protocol.network import BOUNDED, Activation, NetworkDescription
+from protocol.architecture import BOUNDED, Activation, architecture_names, get_architecture
+from protocol.network import NetworkDescription
 from trainer_node.network import Network
 
 ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
@@ -23,6 +24,9 @@ def descriptions(draw: st.DrawFn) -> NetworkDescription:
     layers = draw(st.integers(1, 4))
     states, inputs = draw(st.integers(1, 6)), draw(st.integers(1, 3))
     scale = st.floats(1e-3, 1e3)
+    architecture = draw(st.sampled_from(architecture_names()))
+    window = draw(st.integers(1 if architecture == "mlp" else 2, 5))
+    options = {"kernel": draw(st.integers(1, window))} if architecture == "cnn" else {}
     return NetworkDescription(
         states=states,
         inputs=inputs,
@@ -33,33 +37,54 @@ def descriptions(draw: st.DrawFn) -> NetworkDescription:
         ],
         input_scale=draw(st.lists(scale, min_size=states + inputs, max_size=states + inputs)),
         output_scale=draw(st.lists(scale, min_size=states, max_size=states)),
+        architecture=architecture,
+        window=window,
+        options=options,
     )
 
 
-@settings(max_examples=60, deadline=None)
+def test_all_three_of_the_paper_are_there() -> None:
+    assert set(architecture_names()) >= {"mlp", "rnn", "cnn"}
+    assert get_architecture("cnn").options == {"kernel": 3}
+
+
+@settings(max_examples=80, deadline=None)
 @given(descriptions(), st.integers(0, 2**32 - 1), st.sampled_from([0.1, 1.0, 10.0]))
-def test_torch_and_casadi_agree_to_1e_12_in_float64(
+def test_torch_casadi_and_numpy_agree_to_1e_12_in_float64(
     description: NetworkDescription, seed: int, size: float
 ) -> None:
+    """The value; and its slope along every entry of the window, by CasADi and by torch."""
     rng = np.random.default_rng(seed)
+    d, points = description.states, 5
     hidden = [size * rng.standard_normal(shape) / np.sqrt(shape[0]) for shape in description.layer_shapes]
-    K = rng.standard_normal((description.features, description.states)) / description.features
-    x = rng.standard_normal((5, description.states)) * description.input_scale[: description.states]
-    u = rng.standard_normal((5, description.inputs)) * description.input_scale[description.states :]
+    K = rng.standard_normal((description.features, d)) / description.features
+    windows = rng.standard_normal((points, description.window, description.pair)) * description.input_scale
 
     network = Network(description, torch.float64)
     network.load(hidden)
-    with torch.no_grad():
-        ours = network(network.tensor(x), network.tensor(u), network.tensor(K)).numpy()
+    rows = network.tensor(windows.reshape(points, -1)).requires_grad_()
+    values = network(rows, network.tensor(K))
+    slopes = [torch.autograd.grad(values[:, i].sum(), rows, retain_graph=True)[0].numpy() for i in range(d)]
+
     oracle = DnnOracle(description)
     function, theta = oracle.function(), oracle.pack(hidden, K)
-    theirs = np.array([np.asarray(function(a, b, theta)[0]).ravel() for a, b in zip(x, u, strict=True)])
-    # In units of the output scale, so that neither a large unit nor a small one decides.
-    difference = np.abs(ours - theirs) / description.output_scale
-    assert difference.max() < 1e-12
+    in_numpy = oracle.output_scale * (oracle.features_of(hidden, windows) @ K)
+    for p, window in enumerate(windows):
+        s, u = np.concatenate([window[-1, :d], window[:-1].ravel()]), window[-1, d:]
+        h, jacobian = (np.array(part) for part in function(s, u, theta))
+        # In units of the scales, so that neither a large unit nor a small one decides.
+        ours = values[p].detach().numpy() / description.output_scale
+        assert np.abs(h.ravel() / description.output_scale - ours).max() < 1e-12
+        assert np.abs(in_numpy[p] / description.output_scale - ours).max() < 1e-12
+        behind = jacobian.shape[1] - len(u)
+        along_window = np.hstack([jacobian[:, d:behind], jacobian[:, :d], jacobian[:, behind:]])
+        per_unit = np.tile(description.input_scale, description.window) / oracle.output_scale[:, None]
+        found = np.array([slope[p] for slope in slopes])
+        bound = 1e-12 * (1 + np.abs(found * per_unit).max())
+        assert (np.abs(along_window - found) * per_unit).max() < bound
 
-    phi = network.features(network.tensor(x), network.tensor(u))
-    assert phi.shape == (5, description.features)
+    phi = network.features(rows)
+    assert phi.shape == (points, description.features)
     assert bool((phi[:, 0] == 1.0).all())
     assert bool((phi.square().sum(dim=1) <= description.features).all())
 
@@ -78,7 +103,7 @@ def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> N
     network.load(hidden)
     function, theta = oracle.function(), oracle.pack(hidden, K)
     for x in (-60.0, -5.0, 0.0, 19.9, 20.1, 21.0, 30.0, 49.0, 51.0, 600.0):
-        ours = network(network.tensor([[x]]), network.tensor([[0.0]]), network.tensor(K)).item()
+        ours = network(network.tensor([[x, 0.0]]), network.tensor(K)).item()
         assert abs(ours - float(function([x], [0.0], theta)[0])) < 1e-12
 
 

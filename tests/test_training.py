@@ -17,7 +17,7 @@ from node_runtime.config import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
 from protocol.network import NetworkDescription, hash_layers, initial_hidden
 from trainer_node import training
-from trainer_node.network import Loss, Network
+from trainer_node.network import DenseLoss, Network
 from trainer_node.training import Trainer, TrainerError, pick_device
 
 DESCRIPTION = NetworkDescription(
@@ -179,14 +179,14 @@ def test_samples_that_cannot_be_right_never_reach_the_buffer() -> None:
     assert np.isfinite(trained(trainer).loss_after)
 
 
-def broken_loss(value: float) -> Callable[[Loss], torch.Tensor]:
-    def gradient(self: Loss) -> torch.Tensor:
+def broken_loss(value: float) -> Callable[[DenseLoss], torch.Tensor]:
+    def gradient(self: DenseLoss) -> torch.Tensor:
         return torch.full_like(self._gradient, value)
 
     return gradient
 
 
-def flipped(self: Loss, right: Callable[[Loss], torch.Tensor] = Loss.gradient) -> torch.Tensor:
+def flipped(self: DenseLoss, right: Callable[[DenseLoss], torch.Tensor] = DenseLoss.gradient) -> torch.Tensor:
     return right(self).neg()
 
 
@@ -202,7 +202,7 @@ def test_a_training_that_goes_wrong_leaves_the_old_layers(
     monkeypatch: pytest.MonkeyPatch, gradient: Any, reason: str
 ) -> None:
     trainer = make()
-    monkeypatch.setattr(Loss, "gradient", gradient)
+    monkeypatch.setattr(DenseLoss, "gradient", gradient)
     assert trainer.train(output(trainer), "controller-1") is None
     assert trainer.counters[reason] == 1
     assert trainer.sha256 == hash_layers(HIDDEN)
@@ -280,9 +280,8 @@ def test_the_gradient_written_out_is_that_of_autograd(activations: Any) -> None:
     network = Network(description, torch.float64)
     network.load([rng.normal(size=shape) for shape in description.layer_shapes])
     weights, xu, h = rng.normal(size=(6, 4)), rng.normal(size=(50, 5)), 0.01 * rng.normal(size=(50, 4))
-    by_hand = Loss(network, xu, h, weights)
-    x, u = network.tensor(xu[:, :4]), network.tensor(xu[:, 4:])
-    error = network.scaled_targets(network(x, u, network.tensor(weights)) - network.tensor(h))
+    by_hand = DenseLoss(network, xu, h, weights)
+    error = network.scaled_targets(network(network.tensor(xu), network.tensor(weights)) - network.tensor(h))
     loss = error.square().sum(dim=1).mean()
     loss.backward()
     assert by_hand.value() == pytest.approx(loss.item(), rel=1e-12)

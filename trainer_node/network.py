@@ -1,19 +1,21 @@
 """The network of protocol/network.py in torch, for training its hidden layers under a fixed output layer.
 
 A layer is (1 + n_{i-1}, n_i) with its bias as the first row. All layers lie one behind the other in a single
-parameter, and the gradient is written out by hand: with layers of this size nearly all the time of a training
-step is the cost of calling torch, and this makes the fewest calls: about half the time of autograd.
+parameter. The gradient of dense layers is written out by hand: with layers of this size nearly all the time of a
+training step is the cost of calling torch, and this makes the fewest calls: about half the time of autograd, which
+does every other architecture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 
-from protocol.network import Activation, NetworkDescription
+from protocol.architecture import Activation, get_architecture
+from protocol.network import NetworkDescription
 
 # torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
 _ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
@@ -34,8 +36,23 @@ _BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 }
 
 
+class _Tensors:
+    """The operations of `protocol.architecture`: a value is (M, n), a layer (1 + n_a, n), its bias first."""
+
+    def affine(self, layer: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
+        return torch.addmm(layer[0], a, layer[1:])
+
+    def activate(self, name: Activation, a: torch.Tensor) -> torch.Tensor:
+        return _ACTIVATIONS[name](a)
+
+    def join(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        return torch.cat(list(parts), dim=1)
+
+
 class Network(torch.nn.Module):
     """h_hat(x, u) = output_scale * K' phi(x, u), with W_1..W_{L-1} as its only parameter and K given.
+
+    What it is given is (x, u) (M, d + m), or a window of k pairs, oldest first, (M, k (d + m)): one row a sample.
 
     Args:
         description: sizes, activations and scaling.
@@ -55,7 +72,8 @@ class Network(torch.nn.Module):
         self.device = torch.device(device)
         shapes = description.layer_shapes
         self.flat = torch.nn.Parameter(self.tensor(np.zeros(sum(rows * columns for rows, columns in shapes))))
-        self._input_scale = self.tensor(description.input_scale)
+        self._architecture, self._sizes = get_architecture(description.architecture), description.sizes
+        self._input_scale = self.tensor(description.input_scale * description.window)
         self._output_scale = self.tensor(description.output_scale)
 
     def tensor(self, values: np.ndarray | list[float] | list[list[float]]) -> torch.Tensor:
@@ -84,44 +102,94 @@ class Network(torch.nn.Module):
         """W_1..W_{L-1} as float64 arrays, (1 + n_{i-1}, n_i) each."""
         return [layer.detach().cpu().numpy().astype(np.float64) for layer in self.layers()]
 
-    def scaled(self, xu: torch.Tensor) -> torch.Tensor:
-        """(x, u) of shape (M, d + m) in units of `input_scale`."""
-        return xu / self._input_scale
+    def scaled(self, window: torch.Tensor) -> torch.Tensor:
+        """Windows in units of `input_scale`."""
+        return window / self._input_scale
 
-    def features(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-        """phi(x, u), (M, 1 + n_L), for x (M, d) and u (M, m) in deviation coordinates and plant units."""
-        psi = self.scaled(torch.cat([x, u], dim=1))
-        for layer, activation in zip(self.layers(), self.description.activations, strict=True):
-            psi = _ACTIVATIONS[activation](torch.addmm(layer[0], psi, layer[1:]))
+    def activations(self, scaled: torch.Tensor, layers: Sequence[torch.Tensor]) -> torch.Tensor:
+        """phi without its leading 1, (M, n_L), of scaled windows under these layers."""
+        pairs = scaled.split(self.description.pair, dim=1)
+        return self._architecture.forward(_Tensors(), self._sizes, layers, pairs)
+
+    def features(self, window: torch.Tensor) -> torch.Tensor:
+        """phi, (M, 1 + n_L), of windows in deviation coordinates and plant units."""
+        psi = self.activations(self.scaled(window), self.layers())
         return torch.cat([torch.ones_like(psi[:, :1]), psi], dim=1)
 
-    def forward(self, x: torch.Tensor, u: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-        """h_hat(x, u), (M, d), in units of h, for K of shape (1 + n_L, d)."""
-        return self._output_scale * (self.features(x, u) @ K)
+    def forward(self, window: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+        """h_hat, (M, d), in units of h, for K of shape (1 + n_L, d)."""
+        return self._output_scale * (self.features(window) @ K)
 
     def scaled_targets(self, h: torch.Tensor) -> torch.Tensor:
         """h, (M, d), in units of `output_scale`."""
         return h / self._output_scale
 
 
-class Loss:
-    """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient.
+class Loss(Protocol):
+    """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient."""
+
+    def value(self) -> float:
+        """The loss at the present hidden layers."""
+
+    def gradient(self) -> torch.Tensor:
+        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
+
+
+def build_loss(network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray) -> Loss:
+    """The loss of a network whose hidden layers are trained.
 
     Args:
-        network: whose hidden layers are trained.
-        xu: (x, u), (M, d + m), plant units.
+        network: the network.
+        window: what it is given, (M, k (d + m)), plant units.
         h: (M, d), units of h.
         K: (1 + n_L, d), fixed; a copy is kept.
     """
+    kind = DenseLoss if network.description.architecture == "mlp" else AutogradLoss
+    return kind(network, window, h, K)
 
-    def __init__(self, network: Network, xu: np.ndarray, h: np.ndarray, K: np.ndarray):
+
+class AutogradLoss:
+    """`Loss` of any architecture; arguments as for `build_loss`."""
+
+    def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
         self._network = network
         output = network.tensor(K)
-        self._inputs = network.scaled(network.tensor(xu))
+        self._inputs = network.scaled(network.tensor(window))
+        self._offset = output[0] - network.scaled_targets(network.tensor(h))
+        self._weights = output[1:]
+        # Leaves of their own on the same memory: views of one parameter would each give a gradient of its full length.
+        self._leaves = [layer.detach().requires_grad_() for layer in network.layers()]
+        self._gradient = torch.zeros_like(network.flat, requires_grad=False)
+        self._parts = network.layers(self._gradient)
+
+    def _loss(self) -> torch.Tensor:
+        psi = self._network.activations(self._inputs, self._leaves)
+        residual = torch.addmm(self._offset, psi, self._weights)
+        return residual.square().sum() / len(self._inputs)
+
+    @torch.no_grad()
+    def value(self) -> float:
+        return float(self._loss())
+
+    def gradient(self) -> torch.Tensor:
+        with torch.enable_grad():
+            gradients = torch.autograd.grad(self._loss(), self._leaves)
+        for part, gradient in zip(self._parts, gradients, strict=True):
+            part.copy_(gradient)
+        return self._gradient
+
+
+class DenseLoss:
+    """`Loss` of dense layers, its gradient by hand; arguments as for `build_loss`."""
+
+    def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
+        self._network = network
+        output = network.tensor(K)
+        self._inputs = network.scaled(network.tensor(window))
         # K' phi - h is one fused call when the targets are folded into the bias of the output layer.
         self._offset = output[0] - network.scaled_targets(network.tensor(h))
         self._weights = output[1:]
-        self._samples = len(xu)
+        self._samples = len(window)
         self._back = (2.0 / self._samples) * self._weights.T.contiguous()
         self._gradient = torch.zeros_like(network.flat, requires_grad=False)
         self._layers = [
@@ -143,13 +211,11 @@ class Loss:
 
     @torch.no_grad()
     def value(self) -> float:
-        """The loss at the present hidden layers."""
         _, residual = self._forward()
         return float(residual.square().sum()) / self._samples
 
     @torch.no_grad()
     def gradient(self) -> torch.Tensor:
-        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
         values, residual = self._forward()
         towards = residual @ self._back
         for i in reversed(range(len(self._layers))):

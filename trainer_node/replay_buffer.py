@@ -53,7 +53,7 @@ class Seen:
 
 
 class ReplayBuffer:
-    """Up to `capacity` samples (x, u, h).
+    """Up to `capacity` samples (x, u, h), or (window, h) where the network sees more pairs than (x, u).
 
     Strategies, once the buffer is full:
         fifo: the oldest makes room.
@@ -67,7 +67,7 @@ class ReplayBuffer:
         capacity: p_max.
         strategy: one of the above.
         seed: of the reservoir's draws.
-        scale: units of (x, u) that count as 1, (d + m,).
+        scale: units of (x, u) that count as 1, (d + m,), or those of a window of k pairs, (k (d + m),).
 
     The same samples in the same order with the same seed leave the same buffer, byte for byte.
     """
@@ -97,16 +97,27 @@ class ReplayBuffer:
         """The newest sequence number met of a run, -1 when there is none."""
         return self._seen.last(run_id)
 
-    def add(self, run_id: str, seq: int, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> bool:
+    def add(
+        self,
+        run_id: str,
+        seq: int,
+        x: np.ndarray,
+        u: np.ndarray,
+        h: np.ndarray,
+        past: np.ndarray | None = None,
+    ) -> bool:
         """Offer a sample: x (d,), u (m,), h (d,), all finite. Returns whether it was not met before.
+
+        past: the pairs of the window before (x, u), (k - 1, d + m), oldest first.
 
         Raises:
             ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
         """
-        xu, h = np.concatenate([x, u]).astype(np.float64), np.asarray(h, dtype=np.float64)
+        before = np.zeros(0) if past is None else np.ravel(past)
+        xu, h = np.concatenate([before, x, u]).astype(np.float64), np.asarray(h, dtype=np.float64)
         expected = self._h.shape[1] if self._length else len(h)
         if xu.shape != self._scale.shape or h.shape != (expected,):
-            raise ValueError(f"(x, u) has {len(xu)} entries, expected {len(self._scale)}; h has {len(h)}")
+            raise ValueError(f"the window has {len(xu)} entries, expected {len(self._scale)}; h has {len(h)}")
         if not (np.isfinite(xu).all() and np.isfinite(h).all()):
             raise ValueError("not finite")
         if not self._seen.add(run_id, seq):
@@ -118,12 +129,12 @@ class ReplayBuffer:
         return True
 
     def sample(self, M: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """M different samples at random, all when there are fewer: (x, u) (M, d + m), and h (M, d)."""
+        """M different samples at random, all when there are fewer: windows (M, k (d + m)), and h (M, d)."""
         chosen = rng.permutation(self._length)[:M]
         return self._xu[chosen], self._h[chosen]
 
     def contents(self) -> tuple[np.ndarray, np.ndarray]:
-        """Copies of all that is stored: (x, u) (len, d + m), and h (len, d)."""
+        """Copies of all that is stored: windows (len, k (d + m)), and h (len, d)."""
         return self._xu[: self._length].copy(), self._h[: self._length].copy()
 
     def _slot(self, scaled: np.ndarray) -> int | None:

@@ -17,7 +17,7 @@ from torch.optim.adam import adam
 from node_runtime.config import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
 from protocol.network import NetworkDescription, hash_layers, why_unacceptable
-from trainer_node.network import Loss, Network
+from trainer_node.network import Loss, Network, build_loss
 from trainer_node.replay_buffer import ReplayBuffer
 
 BASES = 8
@@ -79,7 +79,8 @@ class Trainer:
         self.version = version
         """Of the newest hidden layers; never falls."""
         self.counters: Counter[str] = Counter()
-        self.buffer = ReplayBuffer(config.capacity, config.strategy, seed, description.input_scale)
+        scale = description.input_scale * description.window
+        self.buffer = ReplayBuffer(config.capacity, config.strategy, seed, scale)
         self._draws = np.random.default_rng([seed, 0xD8A3])
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
@@ -118,9 +119,8 @@ class Trainer:
         new = 0
         for sample in samples:
             try:
-                known = not self.buffer.add(
-                    run_id, sample.seq, np.array(sample.x), np.array(sample.u), np.array(sample.h)
-                )
+                x, u, h, past = (np.array(part) for part in (sample.x, sample.u, sample.h, sample.past))
+                known = not self.buffer.add(run_id, sample.seq, x, u, h, past)
             except ValueError:
                 self.counters["bad samples"] += 1
                 continue
@@ -172,7 +172,7 @@ class Trainer:
             raise _Kept("no samples")
         xu, h = self.buffer.sample(self.config.batch, self._draws)
         self._network.load(base)
-        before, after = self._descend(Loss(self._network, xu, h, K))
+        before, after = self._descend(build_loss(self._network, xu, h, K))
         trained = self._network.hidden()
         why = why_unacceptable(self.description, trained)
         if why is not None:
