@@ -21,6 +21,7 @@ from controller_node.build import build_controller
 from controller_node.compile import Compiler
 from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
+from lbmpc.rows import Box
 from lbmpc.solution import Solution
 from node_runtime.config import Config, to_json
 from protocol import messages as m
@@ -37,18 +38,25 @@ class _Timed:
         self._solver = solver
         self.seconds = 0.0
 
-    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.solve(x, oracle_parameters, warm_start)
+        solution = self._solver.solve(x, oracle_parameters, warm_start, first=first)
         self.seconds = time.perf_counter() - before
         return solution
 
     def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
         self._solver.prepare(x, oracle_parameters, warm_start)
 
-    def feedback(self, x: np.ndarray) -> Solution:
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.feedback(x)
+        solution = self._solver.feedback(x, first)
         self.seconds = time.perf_counter() - before
         return solution
 
@@ -214,6 +222,8 @@ class ControllerCore:
             tick_crc32=zlib.crc32(encode(tick)),
             input_delay=result.delay,
             weights_verdict=result.verdict,
+            set_margin=result.first.margin if result.first else None,
+            set_piece=result.first.piece if result.first else -1,
         )
 
     def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:

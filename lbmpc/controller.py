@@ -16,6 +16,8 @@ from lbmpc.model import Model, Pieces
 from lbmpc.oracles.base import OracleState, follow
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.problem import Problem
+from lbmpc.rows import Box
+from lbmpc.sets.guard import FirstInputs
 from lbmpc.solution import Solution
 
 Mode = Literal["solver", "shifted_plan", "feedback"]
@@ -122,16 +124,25 @@ class StepResult:
     """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
     delay: float
     """Seconds for which the sample was predicted ahead, to when the command acts."""
+    first: FirstInputs | None
+    """What is certified of v_0; None where there are no certified sets, or no state."""
 
 
 class Solves(Protocol):
     """The seam to the solver: `lbmpc.solver.Solver`, or whatever stands in its place."""
 
-    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution: ...
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution: ...
 
     def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None: ...
 
-    def feedback(self, x: np.ndarray) -> Solution: ...
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
 
 
 class Controller:
@@ -174,7 +185,9 @@ class Controller:
         oracle, verdict = self._adopt(oracle, seen.hidden)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
-        plan, mode, solution = self._plan(state, oracle, start)
+        guard = self.problem.guard
+        first = None if guard is None or start is None else guard.first_inputs(start)
+        plan, mode, solution = self._plan(state, oracle, start, first)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
@@ -182,7 +195,7 @@ class Controller:
         x, u = s[: self.model.d], plan.v[0]
         predicted = follow(s, u, self.model.A @ x + self.model.B @ u + self.oracle.estimate(oracle, x, u))
         after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
-        return after, StepResult(plan.v, mode, solution, label, verdict, delay)
+        return after, StepResult(plan.v, mode, solution, label, verdict, delay, first)
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
@@ -228,29 +241,37 @@ class Controller:
         return self.oracle.adopt(oracle, hidden.version, hidden.layers, hidden.sha256, hidden.network_sha256)
 
     def _plan(
-        self, state: ControllerState, oracle: OracleState, x: np.ndarray | None
+        self,
+        state: ControllerState,
+        oracle: OracleState,
+        x: np.ndarray | None,
+        certified: FirstInputs | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
+        first = _box(certified)
         solution = None
         if x is not None:
-            solution = self._solve(state, oracle, x)
+            solution = self._solve(state, oracle, x, first)
             if solution.usable:
                 return Plan(solution.v, horizon), "solver", solution
         if plan.left > 0:
-            return plan, "shifted_plan", solution
+            return _begun_within(plan, first), "shifted_plan", solution
         if x is None:
             # Neither a plan nor a state: the equilibrium input is all that is left.
             return Plan(np.zeros((horizon, self.model.m)), 0), "feedback", solution
-        return Plan(feedback_plan(self.model, x, horizon), 0), "feedback", solution
+        fed_back = Plan(feedback_plan(self.model, x, horizon), 0)
+        return _begun_within(fed_back, first), "feedback", solution
 
-    def _solve(self, state: ControllerState, oracle: OracleState, x: np.ndarray) -> Solution:
+    def _solve(
+        self, state: ControllerState, oracle: OracleState, x: np.ndarray, first: Box | None
+    ) -> Solution:
         s = self._with_past(oracle, x)
         if not self.real_time or state.plan.left == 0:
             # Without a plan to start from, one step is not enough.
-            return self.solver.solve(s, self.oracle.theta(oracle), state.plan.v)
+            return self.solver.solve(s, self.oracle.theta(oracle), state.plan.v, first=first)
         self.prepare(state)
         self._prepared_for = None
-        return self.solver.feedback(s)
+        return self.solver.feedback(s, first)
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
@@ -264,6 +285,19 @@ class Controller:
 def _acting(seen: Observation) -> np.ndarray | None:
     """The input that the plant has when it is seen, (m,)."""
     return seen.pieces[-1][1] if seen.pieces else seen.applied
+
+
+def _box(first: FirstInputs | None) -> Box | None:
+    if first is None or first.lower is None or first.upper is None:
+        return None
+    return first.lower, first.upper
+
+
+def _begun_within(plan: Plan, first: Box | None) -> Plan:
+    """The plan with its first input brought inside the bounds: what is certified holds without a solution too."""
+    if first is None:
+        return plan
+    return Plan(np.vstack([np.clip(plan.v[:1], *first), plan.v[1:]]), plan.left)
 
 
 def same_memory(a: ControllerState, b: ControllerState) -> str | None:

@@ -18,11 +18,13 @@ import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle
+from lbmpc.sets.certificate import Certificate, CertificateError, require_match
+from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariant import terminal_set
 from lbmpc.sets.polytope import EmptySetError, Polytope
 from lbmpc.sets.tube import tighten, tube_margins
 
-Tightening = Literal["none", "first_step", "tube"]
+Tightening = Literal["none", "first_step", "tube", "invariant"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Problem:
     inputs: tuple[Polytope, ...]
     soft: bool
     penalty: float
+    guard: Guard | None = None
+    """Bounds v_0 by a certified family of sets; None: nothing is certified."""
 
     @property
     def X(self) -> Polytope:
@@ -74,6 +78,7 @@ def build_problem(
     tightening: Tightening = "first_step",
     W: np.ndarray | None = None,
     penalty: float = 1e4,
+    certificate: Certificate | None = None,
 ) -> Problem:
     """Lay out the constraints of the named tightening.
 
@@ -81,10 +86,21 @@ def build_problem(
     * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows soft.
     * `tube`: zbar_i in X - R_i, v_i in U - K R_i, zbar_N in Omega - R_N with Omega disturbance invariant; state rows
       hard, since from every state where they can be met once they can be met for ever.
+    * `invariant`: v_0 bounded so that the next state stays in the sets of `certificate`, hard; later rows, and all rows
+      outside of the sets, as for `first_step`.
 
     Raises:
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
+        CertificateError: `invariant` without a certificate, or with that of another model.
     """
+    guard = None
+    if tightening == "invariant":
+        if certificate is None:
+            raise CertificateError(
+                "the tightening `invariant` needs certified sets: tandem sets compute makes them"
+            )
+        require_match(certificate, model)
+        guard = Guard(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
     n = horizon
     if tightening == "tube":
@@ -94,12 +110,12 @@ def build_problem(
         states[-1] = _terminal(model, x_set, u_set, w_set, states[-1], n)
         return Problem(model, oracle, n, tightening, tuple(states), tuple(inputs), False, penalty)
     states = [x_set] * n
-    if tightening == "first_step":
+    if tightening in ("first_step", "invariant"):
         low = np.array([w_set.support(-row) for row in x_set.F])
         high = np.array([w_set.support(row) for row in x_set.F])
         states[0] = x_set.minus(low, high)
         states[0].require_rows(1, "state")
-    return Problem(model, oracle, n, tightening, tuple(states), (u_set,) * n, True, penalty)
+    return Problem(model, oracle, n, tightening, tuple(states), (u_set,) * n, True, penalty, guard)
 
 
 def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytope, n: int) -> Polytope:

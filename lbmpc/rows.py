@@ -7,6 +7,9 @@ import numpy as np
 from lbmpc.least_distance import Penalty, violation
 from lbmpc.problem import Problem
 
+Box = tuple[np.ndarray, np.ndarray]
+"""Lower and upper bounds, (m,) each."""
+
 
 class Rows:
     """The rows' bounds, their values, their slopes, and what their violation costs."""
@@ -28,6 +31,7 @@ class Rows:
         self.lower = np.concatenate([part.lower for part in parts])
         self.upper = np.concatenate([part.upper for part in parts])
         self.count_inputs = len(self.input_rows) * n
+        self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
         width = self.upper - self.lower
         scale = np.where(np.isfinite(width), 0.5 * width, np.maximum(np.abs(self.upper), 1e-3))
         # The scale of a row is that of its plain set: tightening must not make a violation weigh more.
@@ -38,6 +42,12 @@ class Rows:
         self.names = [
             f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
         ]
+
+    def bound_first(self, first: Box | None) -> None:
+        """Bounds on v_0 from now on; None: those of the problem. Always inside these."""
+        low, high = self._first
+        self.lower[: self.m] = low if first is None else np.clip(first[0], low, high)
+        self.upper[: self.m] = high if first is None else np.clip(first[1], low, high)
 
     def clip(self, v: np.ndarray) -> np.ndarray:
         """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""

@@ -18,7 +18,7 @@ from lbmpc.kernels import build_rows, build_sweep, build_tangent
 from lbmpc.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
 from lbmpc.oracles.base import LinearOracle, Oracle, remembered
 from lbmpc.problem import Problem
-from lbmpc.rows import Rows
+from lbmpc.rows import Box, Rows
 from lbmpc.solution import Solution, Status
 
 # Above the QP's own tolerance; what a hard row may be off by before a solution is refused.
@@ -108,6 +108,7 @@ class Solver:
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        first: Box | None = None,
     ) -> Solution:
         """Minimise from x_t = x.
 
@@ -117,10 +118,12 @@ class Solver:
             oracle_parameters: theta, as the oracle packs it.
             warm_start: inputs to start from, (N, m); they need not be feasible.
             xr, ur: references over the horizon, (N + 1, d) and (N, m); the equilibrium by default.
+            first: hard bounds on v_0 for this solve, (m,) each, inside U; U itself by default.
 
         Returns:
             A `Solution`; never raises for numbers, whatever they are.
         """
+        self._rows.bound_first(first)
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
             solution = self._solve(self._sweep, x, oracle_parameters, warm_start, xr, ur)
@@ -139,6 +142,7 @@ class Solver:
         if self._tangent is None:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
+        self._rows.bound_first(None)
         tangent, rows, v = self._tangent, self._rows, self._rows.clip(np.nan_to_num(warm_start))
         with np.errstate(all="ignore"):
             status = Status.NUMERICAL
@@ -173,8 +177,10 @@ class Solver:
                 guess.shown if guess is not None else None,
             )
 
-    def feedback(self, x: np.ndarray) -> Solution:
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         """Complete the prepared step for the measured state x, (D,): a correction of x, and a few QP rows.
+
+        `first` as for `solve`: it depends on x, so that the preparation does not know it.
 
         The nominal trajectory is linear in x, so the constraints hold for x itself, not for its prediction.
 
@@ -186,13 +192,18 @@ class Solver:
         if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
         rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
+        rows.bound_first(first)
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow @ change
             v, status = ready.free + (ready.follow_v @ change).reshape(self._shape), ready.status
             if status is Status.NUMERICAL or not np.isfinite(values).all():
                 return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
             if not self._inside(values):
-                nearest, feasible = self._nearest(values, ready.slopes, NO_ROWS, ready.shown)
+                shown, hint = ready.shown, NO_ROWS
+                if shown is not None and first is not None and (shown.seen < rows.m).any():
+                    # It was set up with other bounds on v_0.
+                    hint, shown = shown.seen, None
+                nearest, feasible = self._nearest(values, ready.slopes, hint, shown)
                 if nearest is None:
                     return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 1)
                 v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(self._shape))

@@ -161,6 +161,11 @@ class TickResult(Message, frozen=True):
     """Seconds for which the state was predicted ahead before the problem was solved."""
     weights_verdict: str
     """"none", "adopted", or "refused: <reason>"."""
+    set_margin: float | None = None
+    """Distance of the state to the boundary of the certified sets, as a share of X's half-widths, negative outside;
+    None where there are no such sets, or no state."""
+    set_piece: int = -1
+    """Which of the certified sets the state is in; -1: none."""
 
 
 class TickTiming(Message, frozen=True):

@@ -9,6 +9,7 @@ from lbmpc.controller import Controller, ControllerState, HiddenSet, Observation
 from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
 from lbmpc.problem import build_problem
+from lbmpc.rows import Box
 from lbmpc.solution import Solution, Status
 from lbmpc.solver import Solver
 from protocol.network import hash_layers
@@ -95,7 +96,14 @@ class Failing:
     def __init__(self, good: int):
         self.good, self.real = good, Solver(PROBLEM)
 
-    def solve(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> Solution:
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution:
         self.good -= 1
         if self.good >= 0:
             return self.real.solve(x, oracle_parameters, warm_start)

@@ -8,7 +8,11 @@ import numpy as np
 from scipy.optimize import linprog
 
 
-class EmptySetError(ValueError):
+class SetError(ValueError):
+    """A set is not what an operation needs; the text says what it is instead."""
+
+
+class EmptySetError(SetError):
     """A set that should hold something is empty; the text names the step, the constraint and the margin."""
 
 
