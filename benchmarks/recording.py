@@ -100,7 +100,7 @@ def build_case(
     """Let an oracle learn along the recording, and solve every tick tightly."""
     config = configure(oracle, horizon, width)
     settings = config.controller
-    model, learner = recording.model, build_oracle(config, recording.model.plant)
+    model, learner = recording.model, build_oracle(config, recording.model)
     problem = build_problem(model, learner, horizon, settings.tightening, penalty=settings.solver.penalty)
     solver = Solver(problem, TIGHT_ITERATIONS, TIGHT, realise)
     case = Case(oracle, horizon, width, problem, recording.x, [], [], [], [])

@@ -9,7 +9,8 @@ import numpy as np
 
 from lbmpc.controller import Controller
 from lbmpc.model import Model, ModelError, build_model
-from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle
+from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
+from lbmpc.oracles.dnn import Refit
 from lbmpc.plants import Plant, get_plant
 from lbmpc.problem import build_problem
 from lbmpc.sets.polytope import EmptySetError
@@ -61,10 +62,13 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
     )
 
 
-def build_oracle(config: Config, plant: Plant) -> Oracle:
+def build_oracle(config: Config, model: Model) -> Oracle:
     """The oracle named by the configuration. Raises `ConfigError`."""
+    plant = model.plant
     if config.controller.oracle == "linear":
         return LinearOracle(plant.d, plant.m)
+    if config.controller.oracle == "perfect":
+        return PerfectOracle(model)
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
         chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)
@@ -81,8 +85,14 @@ def build_oracle(config: Config, plant: Plant) -> Oracle:
     except ValueError as error:
         raise ConfigError(f"network: {error}") from error
     adaptation, period = config.adaptation, config.period
+    again = Refit(adaptation.refit.window, adaptation.refit.ridge)
     return DnnOracle(
-        description, adaptation.gamma, adaptation.column_bound * period, adaptation.initial_scale * period
+        description,
+        adaptation.gamma if adaptation.enabled else 0.0,
+        adaptation.column_bound * period,
+        adaptation.initial_scale * period,
+        adaptation.start,
+        again if adaptation.at_adoption == "refit" else None,
     )
 
 
@@ -94,7 +104,7 @@ def build_controller(config: Config, realise: Realise | None = None) -> Controll
         model = _model(config, plant)
         problem = build_problem(
             model,
-            build_oracle(config, plant),
+            build_oracle(config, model),
             settings.horizon,
             settings.tightening,
             None if settings.W is None else np.array(settings.W, dtype=float),

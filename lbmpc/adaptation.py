@@ -32,3 +32,25 @@ def adapt(K: np.ndarray, phi: np.ndarray, error: np.ndarray, gamma: float, bound
         K_{t+1}, (n, d).
     """
     return project_columns(K - (gamma / (phi @ phi)) * np.outer(phi, error), bounds)
+
+
+def refit(K: np.ndarray, phi: np.ndarray, h: np.ndarray, ridge: float, bounds: np.ndarray) -> np.ndarray:
+    """The output weights that explain n samples best under new features, then projected.
+
+        argmin over K'    |phi K' - h|^2 / n + ridge |K' - K|^2
+
+    The ridge holds what the samples say nothing about where it was.
+
+    Args:
+        K: output weights before, (f, d).
+        phi: features of the samples, (n, f).
+        h: their labels, (n, d), in the units of K' phi.
+        ridge: above 0.
+        bounds: Wbar_i, (d,), in the same units.
+
+    Returns:
+        (f, d).
+    """
+    samples, features = phi.shape
+    gram = phi.T @ phi / samples + ridge * np.eye(features)
+    return project_columns(K + np.linalg.solve(gram, phi.T @ (h - phi @ K) / samples), bounds)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-OracleName = Literal["linear", "l2nw", "dnn"]
+OracleName = Literal["linear", "l2nw", "dnn", "perfect"]
 TighteningName = Literal["none", "first_step", "tube"]
 Strategy = Literal["fifo", "reservoir", "novelty"]
+StartName = Literal["random", "zero", "pretrained"]
+AdoptionName = Literal["keep", "refit"]
 SolverMode = Literal["converged", "real_time"]
 CompileMode = Literal["auto", "never"]
 AwakeMode = Literal["auto", "always", "never"]

@@ -17,7 +17,16 @@ import msgspec
 import tomli_w
 
 from node_runtime import config_words
-from node_runtime.choices import AwakeMode, CompileMode, OracleName, SolverMode, Strategy, TighteningName
+from node_runtime.choices import (
+    AdoptionName,
+    AwakeMode,
+    CompileMode,
+    OracleName,
+    SolverMode,
+    StartName,
+    Strategy,
+    TighteningName,
+)
 from protocol.architecture import BOUNDED, Activation, get_architecture
 from protocol.codec import first_non_finite
 from protocol.network import Width
@@ -97,13 +106,29 @@ class NetworkConfig(Section, frozen=True):
     max_layer_norm: Positive = 100.0
 
 
+class RefitConfig(Section, frozen=True):
+    """Of K at an adoption; used where `adaptation.at_adoption` is "refit"."""
+
+    window: PositiveInt = 200
+    """Newest samples that the controller remembers for it."""
+    ridge: Positive = 1e-4
+    """Weight that holds K where it was."""
+
+
 class AdaptationConfig(Section, frozen=True):
+    enabled: bool = True
+    """False: the last layer stays at K_0 (hidden layers only)."""
     gamma: Unit = 0.8
     """Learning rate of the last layer, 0 < gamma < 1."""
     column_bound: Positive = 1.0
     """Bound on the norm of each column of K, as h per second of period."""
     initial_scale: NonNegative = 6e-3
     """Standard deviation of the entries of K_0, as h per second of period."""
+    start: StartName = "random"
+    """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
+    at_adoption: AdoptionName = "keep"
+    """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
+    refit: RefitConfig = RefitConfig()
 
 
 class L2nwConfig(Section, frozen=True):

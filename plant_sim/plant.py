@@ -52,6 +52,11 @@ class PlantSim:
         """False while held at x0."""
         return self._orders is not None
 
+    def change(self, plant: Plant) -> None:
+        """From the last sample on the true motion is that of `plant`: an experiment with a plant that drifts."""
+        self._truth = Truth(plant)
+        self._memo = {}
+
     def command(self, command: Command, t: float) -> CommandVerdict:
         """Let `command` act from time t on, or from the last sample if t lies before it.
 

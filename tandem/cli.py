@@ -79,9 +79,9 @@ class Run(Configured):
 
     seconds: Annotated[float, arg(metavar="S")] = 20.0
     """How long, counted from the first command."""
-    oracle: Annotated[OracleName | None, arg(metavar="linear|l2nw|dnn", help_behavior_hint=FROM_CONFIG)] = (
-        None
-    )
+    oracle: Annotated[
+        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+    ] = None
     """What the controller learns with."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
     """Samples a second."""
@@ -109,9 +109,9 @@ class Run(Configured):
 class Simulate(Configured):
     """Controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
 
-    oracle: Annotated[OracleName | None, arg(metavar="linear|l2nw|dnn", help_behavior_hint=FROM_CONFIG)] = (
-        None
-    )
+    oracle: Annotated[
+        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+    ] = None
     """What the controller learns with."""
     steps: Annotated[int, arg(metavar="INT")] = 200
     """How many ticks."""

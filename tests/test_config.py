@@ -63,7 +63,7 @@ def test_commented_values_of_the_shipped_file_are_valid():
     [
         (
             "controller.oracle=dn",
-            "controller.oracle = 'dn' is not one of dnn, l2nw, linear; did you mean 'dnn'?",
+            "controller.oracle = 'dn' is not one of dnn, l2nw, linear, perfect; did you mean 'dnn'?",
         ),
         ("controller.oracle=7", "controller.oracle = 7 is not one of dnn, l2nw, linear"),
         ("trainer.batch=0", "trainer.batch = 0 is not an integer of at least 1"),

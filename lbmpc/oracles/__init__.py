@@ -3,5 +3,6 @@
 from lbmpc.oracles.base import LinearOracle, Oracle, OracleState
 from lbmpc.oracles.dnn import DnnOracle
 from lbmpc.oracles.l2nw import L2nwOracle
+from lbmpc.oracles.perfect import PerfectOracle
 
-__all__ = ["DnnOracle", "L2nwOracle", "LinearOracle", "Oracle", "OracleState"]
+__all__ = ["DnnOracle", "L2nwOracle", "LinearOracle", "Oracle", "OracleState", "PerfectOracle"]

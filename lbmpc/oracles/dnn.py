@@ -9,11 +9,13 @@ trainer builds the same function in torch.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 
-from lbmpc.adaptation import adapt, project_columns
+from lbmpc.adaptation import adapt, project_columns, refit
 from lbmpc.oracles import base
 from lbmpc.oracles.backends import ACTIVATIONS, Numbers, Symbols
 from lbmpc.oracles.base import OracleState
@@ -21,6 +23,18 @@ from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription, hash_layers, initial_hidden, why_unacceptable
 
 SYMBOLS, NUMBERS = Symbols(), Numbers()
+Start = Literal["random", "zero", "pretrained"]
+"""K_0: drawn with `initial_scale`; all zero; or drawn, then fitted to h = 0, the middle of W, all over X x U."""
+PRETRAINING, PRETRAINING_RIDGE = 2000, 1e-4
+
+
+@dataclass(frozen=True)
+class Refit:
+    """At an adoption K is fitted to the newest samples under the new features; see `lbmpc.adaptation.refit`."""
+
+    window: int
+    """Samples remembered for it."""
+    ridge: float
 
 
 class DnnOracle:
@@ -28,9 +42,11 @@ class DnnOracle:
 
     Args:
         description: sizes, activations and scaling.
-        gamma: learning rate of the last layer.
+        gamma: learning rate of the last layer; 0: it stays as it is.
         column_bound: Wbar_i, in units of h.
         initial_scale: standard deviation of the entries of K_0, in units of h.
+        start: how K_0 comes about.
+        refit: what happens to K when hidden layers are adopted; None: it is kept.
     """
 
     name = "dnn"
@@ -41,6 +57,8 @@ class DnnOracle:
         gamma: float = 0.5,
         column_bound: float = 0.05,
         initial_scale: float = 1e-3,
+        start: Start = "random",
+        refit: Refit | None = None,
     ):
         self.description = description
         self.d, self.m = description.states, description.inputs
@@ -48,7 +66,7 @@ class DnnOracle:
         self.output_scale = np.array(description.output_scale)
         self.input_scale = np.array(description.input_scale)
         self.bounds = column_bound / self.output_scale
-        self.initial_scale = initial_scale
+        self.initial_scale, self.start, self.refit = initial_scale, start, refit
         self.shapes = [*description.layer_shapes, (description.features, self.d)]
         self.parameters = sum(rows * columns for rows, columns in self.shapes)
         self.pairs = description.window
@@ -118,13 +136,26 @@ class DnnOracle:
 
     def initial_state(self, rng: np.random.Generator) -> OracleState:
         hidden = initial_hidden(self.description, rng)
-        k = rng.standard_normal(self.shapes[-1]) * (self.initial_scale / self.output_scale)
         state = {f"W{i + 1}": layer for i, layer in enumerate(hidden)}
-        state["K"] = project_columns(k, self.bounds)
+        state["K"] = self._first_K(hidden, rng)
         state["version"] = np.zeros(1, dtype=np.int64)
         if self.pairs > 1:
             state["past"] = np.zeros((self.pairs - 1, self.d + self.m))
+        if self.refit is not None:
+            state["samples"] = np.zeros((self.refit.window, self.pairs * (self.d + self.m) + self.d))
+            state["sampled"] = np.zeros(1, dtype=np.int64)
         return state
+
+    def _first_K(self, hidden: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+        """K_0, scaled, (1 + n_L, d)."""
+        drawn = rng.standard_normal(self.shapes[-1]) * (self.initial_scale / self.output_scale)
+        if self.start == "zero":
+            return np.zeros_like(drawn)
+        if self.start == "random":
+            return project_columns(drawn, self.bounds)
+        shape = (PRETRAINING, self.pairs, self.d + self.m)
+        phi = self.features_of(hidden, rng.uniform(-1.0, 1.0, shape) * self.input_scale)
+        return refit(drawn, phi, np.zeros((PRETRAINING, self.d)), PRETRAINING_RIDGE, self.bounds)
 
     def begin(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
         if self.pairs == 1:
@@ -164,12 +195,19 @@ class DnnOracle:
         learned = {**state, "K": adapt(state["K"], phi, error, self.gamma, self.bounds)}
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
+        if self.refit is not None:
+            number = int(state["sampled"][0])
+            learned["samples"] = state["samples"].copy()
+            learned["samples"][number % self.refit.window] = np.concatenate(
+                [self.past(state).ravel(), x, u, h / self.output_scale]
+            )
+            learned["sampled"] = np.array([number + 1], dtype=np.int64)
         return learned
 
     def adopt(
         self, state: OracleState, version: int, layers: list[np.ndarray], sha256: str, network_sha256: str
     ) -> tuple[OracleState, str]:
-        """Swap in a new set of hidden weights; K is kept.
+        """Swap in a new set of hidden weights; K is kept, or refitted to the samples remembered.
 
         Returns:
             The state and "adopted", or the state unchanged and "refused: <reason>".
@@ -185,4 +223,16 @@ class DnnOracle:
         if hash_layers(layers) != sha256:
             return state, "refused: sha256 does not match the layers"
         swapped = {f"W{i + 1}": layer.astype(float) for i, layer in enumerate(layers)}
-        return {**state, **swapped, "version": np.array([version], dtype=np.int64)}, "adopted"
+        swapped["version"] = np.array([version], dtype=np.int64)
+        return {**state, **swapped, "K": self._K_under(self.hidden(swapped), state)}, "adopted"
+
+    def _K_under(self, hidden: list[np.ndarray], state: OracleState) -> np.ndarray:
+        """K for new hidden layers, scaled, (1 + n_L, d)."""
+        if self.refit is None:
+            return state["K"]
+        known = state["samples"][: int(state["sampled"][0])]
+        if not len(known):
+            return state["K"]
+        windows = known[:, : -self.d].reshape(len(known), self.pairs, self.d + self.m)
+        phi = self.features_of(hidden, windows)
+        return refit(state["K"], phi, known[:, -self.d :], self.refit.ridge, self.bounds)

@@ -5,9 +5,9 @@ Bring your own plant as one file beside this one: give `rhs` in CasADi operation
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.integrate import DOP853
 from lbmpc.bound import Bound
 
 INTEGRATION_TOLERANCE = 1e-12
+Rhs = Callable[[Any, Any], list[Any]]
 
 
 class PlantError(ArithmeticError):
@@ -43,7 +44,7 @@ class Plant:
     inputs: tuple[str, ...]
     units: dict[str, str]
     """Unit of every state, input and of time, by name."""
-    rhs: Callable[[Any, Any], list[Any]]
+    rhs: Rhs
     """f(x, u) written with CasADi operations; x and u are indexable."""
     x_e: np.ndarray
     """Equilibrium about which the model is linearised."""
@@ -64,6 +65,23 @@ class Plant:
     poles: tuple[complex, ...] | None = None
     """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
     positive: tuple[Domain, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """What the equations are built with, by name; empty where they cannot be varied."""
+    equations: Callable[..., Rhs] | None = None
+    """`rhs` from `parameters`, given by name."""
+
+    def varied(self, **changes: float) -> Plant:
+        """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
+
+        Raises:
+            KeyError: there is no such parameter; names those there are.
+        """
+        unknown = [name for name in changes if name not in self.parameters]
+        if unknown or self.equations is None:
+            known = ", ".join(self.parameters) or "none that can be varied"
+            raise KeyError(f"{self.name} has no parameter {', '.join(unknown)}; it has {known}")
+        parameters = {**self.parameters, **changes}
+        return replace(self, parameters=parameters, rhs=self.equations(**parameters))
 
     @property
     def d(self) -> int:
@@ -159,6 +177,21 @@ class Truth:
             raise PlantError(f"{self.plant.name}: the state is not finite: {np.asarray(x).tolist()}")
 
 
+class Stepped(NamedTuple):
+    """One step of DOP853: x(dt) and the slopes at its stages."""
+
+    after: ca.SX
+    slopes: list[ca.SX]
+
+
+def dop853(f: ca.Function, x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
+    """A single step of DOP853 along dx/dt = f(x, u), as one expression."""
+    slopes = [f(x, u)]
+    for weights in DOP853.A[1 : DOP853.n_stages]:
+        slopes.append(f(x + dt * _weighted(weights, slopes), u))
+    return Stepped(x + dt * _weighted(DOP853.B, slopes), slopes)
+
+
 def _whole_step(plant: Plant) -> ca.Function:
     """(x, u, dt) -> (x(dt) by a single step of DOP853, its error in units of what is tolerated).
 
@@ -166,11 +199,8 @@ def _whole_step(plant: Plant) -> ca.Function:
     """
     f = plant.function()
     x, u, dt = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m), ca.SX.sym("dt")
-    slopes = [f(x, u)]
-    for weights in DOP853.A[1 : DOP853.n_stages]:
-        slopes.append(f(x + dt * _weighted(weights, slopes), u))
-    after = x + dt * _weighted(DOP853.B, slopes)
-    slopes.append(f(after, u))
+    after, slopes = dop853(f, x, u, dt)
+    slopes = [*slopes, f(after, u)]
     scale = INTEGRATION_TOLERANCE * (1 + ca.fmax(ca.fabs(x), ca.fabs(after)))
     fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (DOP853.E5, DOP853.E3))
     bound = plant.d * (fifth + 0.01 * third)

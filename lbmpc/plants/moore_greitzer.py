@@ -10,22 +10,31 @@ only sqrt(y) makes (0.5, 1.6875, 1.1547, 0) an equilibrium.
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import Domain, Plant
+from lbmpc.plants.base import Domain, Plant, Rhs
 
-BETA, Z_C, ZETA, OMEGA_N = 1.0, 0.0, 1 / np.sqrt(2.0), 10 * np.sqrt(10.0)
+ZETA, OMEGA_N = 1 / np.sqrt(2.0), 10 * np.sqrt(10.0)
+PARAMETERS = {"beta": 1.0, "z_c": 0.0, "slope": 1.5}
+"""beta, z_c, and the slope 3/2 of the compressor's characteristic."""
 
 
-def rhs(x, u):
-    z, y, r, rdot = x[0], x[1], x[2], x[3]
-    return [
-        -y + Z_C + 1 + 1.5 * z - 0.5 * z**3,
-        (z + 1 - r * ca.sqrt(y)) / BETA**2,
-        rdot,
-        OMEGA_N**2 * (u[0] - r) - 2 * ZETA * OMEGA_N * rdot,
-    ]
+def equations(beta: float, z_c: float, slope: float) -> Rhs:
+    """dx/dt of a compressor with these parameters."""
+
+    def rhs(x: Any, u: Any) -> list[Any]:
+        z, y, r, rdot = x[0], x[1], x[2], x[3]
+        return [
+            -y + z_c + 1 + slope * z - 0.5 * z**3,
+            (z + 1 - r * ca.sqrt(y)) / beta**2,
+            rdot,
+            OMEGA_N**2 * (u[0] - r) - 2 * ZETA * OMEGA_N * rdot,
+        ]
+
+    return rhs
 
 
 # The exact equilibrium throttle at z = 0.5, y = 1.6875; 1.1547 to the paper's four digits.
@@ -39,7 +48,9 @@ MOORE_GREITZER = Plant(
     states=("z", "y", "r", "rdot"),
     inputs=("u",),
     units={"z": "1", "y": "1", "r": "1", "rdot": "1/s", "u": "1", "t": "s"},
-    rhs=rhs,
+    rhs=equations(**PARAMETERS),
+    parameters=PARAMETERS,
+    equations=equations,
     x_e=np.array([0.5, 1.6875, R_E, 0.0]),
     u_e=np.array([R_E]),
     x_min=np.array([0.0, 1.1875, 0.1547, -20.0]),
