@@ -93,7 +93,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
     from run_log.summary import summarise
     from tandem import figures
     from tandem.checks import plant_of
-    from tandem.simulate import simulate as lock_step
+    from experiments.lockstep import simulate as lock_step
 
     plant_of(config)
     console = terminal.console(as_json)

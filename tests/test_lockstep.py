@@ -12,7 +12,7 @@ from node_runtime.config import load
 from protocol import topics
 from run_log.reader import Run
 from run_log.summary import Summary, summarise
-from tandem.simulate import simulate
+from experiments.lockstep import simulate
 
 STEPS = 200
 SEEDS = range(10)

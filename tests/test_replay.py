@@ -23,7 +23,7 @@ from run_log.reader import Entry, Run, gather, read_run
 from run_log.recover import recover
 from run_log.replay import replay
 from run_log.save import save
-from tandem.simulate import simulate
+from experiments.lockstep import simulate
 
 STEPS, EVERY = 90, 25
 RUN = "controller-simulated"
@@ -146,7 +146,7 @@ def test_bad_ticks_replay_too(config: Config) -> None:
 
 def test_several_controllers_in_one_log(run: Run, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     both = copy.copy(run)
-    monkeypatch.setattr("tandem.simulate.CONTROLLER", "controller-2")
+    monkeypatch.setattr("experiments.lockstep.CONTROLLER", "controller-2")
     later = simulate(override(config, ["seed=3"]), 30)
     both.streams = {
         name: [

@@ -1,19 +1,25 @@
 """Lock-step simulation: the real controller, trainer and plant in one process, on a virtual clock.
 
 Deterministic for a seed: a tick's state is the plant's sample at exactly that time, its command acts from that time
-on, a training takes no time at all and its weights arrive `weights_delay` ticks later.
+on, a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
 
 from controller_node.build import initial_state
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import PlantError
-from node_runtime.config import Config
+from experiments.faults import Faults
+from lbmpc.plants import Plant, PlantError
+from node_runtime.config import Config, ConfigError, override
 from node_runtime.realtime import one_blas_thread
 from plant_sim.plant import PlantSim
 from protocol import messages as m
@@ -25,46 +31,82 @@ if TYPE_CHECKING:
     from trainer_node.training import Trainer
 
 Progress = Callable[[int], None]
+NO_FAULTS = Faults()
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
 
 
-def simulate(
-    config: Config,
-    steps: int,
-    adapt_only: bool = False,
-    progress: Progress | None = None,
-    weights_delay: int = 1,
-) -> Run:
-    """Run `steps` periods from x0.
+@dataclass(frozen=True)
+class Outcome:
+    """A run, whole or until the plant was lost."""
+
+    run: Run
+    """What a recorder would have seen; times are virtual and start at 0."""
+    lost: str | None
+    """Why the true motion could not be followed to the end; None when it could."""
+
+
+def simulate(config: Config, steps: int, adapt_only: bool = False, progress: Progress | None = None) -> Run:
+    """`follow`, without faults, of a plant that is not lost.
 
     Args:
-        config: the resolved configuration.
-        steps: ticks.
         adapt_only: hidden layers are never trained.
-        progress: told the number of finished steps.
-        weights_delay: ticks between the end of the samples that a training saw and the arrival of its weights.
-
-    Returns:
-        What a recorder would have seen; times are virtual and start at 0.
 
     Raises:
         ConfigError: the configuration admits no controller.
         PlantError: the true plant left every state from which its equations can be followed.
     """
+    if adapt_only:
+        config = override(config, ["trainer.enabled=false"])
+    outcome = follow(config, steps, progress=progress)
+    if outcome.lost is not None:
+        raise PlantError(outcome.lost)
+    return outcome.run
+
+
+def follow(
+    config: Config, steps: int, faults: Faults = NO_FAULTS, progress: Progress | None = None
+) -> Outcome:
+    """Run `steps` periods from x0.
+
+    Args:
+        config: the resolved configuration.
+        steps: ticks.
+        faults: what goes wrong.
+        progress: told the number of finished steps.
+
+    Raises:
+        ConfigError: the configuration admits no controller, or the faults do not fit the plant.
+    """
     with one_blas_thread():
-        return _LockStep(config, adapt_only, weights_delay).run(steps, progress)
+        return _LockStep(config, faults).run(steps, progress)
 
 
 class _LockStep:
-    def __init__(self, config: Config, adapt_only: bool, weights_delay: int):
-        self.config = config
+    def __init__(self, config: Config, faults: Faults):
+        self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
         x0 = initial_state(config, self.core.plant)
         self.plant = PlantSim(self.core.plant, config.period, x0, config.plant.plan_patience, PLANT)
-        self.trainer = None if adapt_only or not config.trainer.enabled else self._trainer()
-        self.weights_delay = weights_delay
+        self.changes = self._changes()
+        self.noise = self._noise()
+        self.draws = np.random.default_rng([config.seed, 0x4015E])
+        self.trainer = self._trainer() if config.trainer.enabled else None
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
         self.log: list[tuple[Topic, m.Message, int]] = []
+
+    def _changes(self) -> list[tuple[float, Plant]]:
+        if self.faults.drift is None:
+            return []
+        try:
+            return self.faults.drift.plants(self.core.plant)
+        except KeyError as error:
+            raise ConfigError(f"faults.drift: {error.args[0]}") from error
+
+    def _noise(self) -> np.ndarray | None:
+        noise, states = self.faults.noise, self.core.plant.d
+        if noise is not None and len(noise) != states:
+            raise ConfigError(f"faults.noise has {len(noise)} entries, the plant has {states} states")
+        return None if noise is None else np.array(noise)
 
     def _trainer(self) -> Trainer | None:
         snapshot = self.core.hidden_snapshot(-1)
@@ -77,27 +119,30 @@ class _LockStep:
         hidden = [layer.numpy().astype(float) for layer in snapshot.layers]
         return Trainer(self.core.description, self.config.trainer, self.config.seed, TRAINER, hidden)
 
-    def run(self, steps: int, progress: Progress | None) -> Run:
+    def run(self, steps: int, progress: Progress | None) -> Outcome:
         self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
         self._note(topics.KEYFRAME, self.core.keyframe(-1), 0)
-        seq = -1
-        for seq in range(steps):
-            try:
+        lost, seq = None, -1
+        try:
+            for seq in range(steps):
                 self._step(seq)
-            except PlantError as error:
-                raise PlantError(f"at step {seq} of {steps}: {error}") from error
-            if progress is not None:
-                progress(seq + 1)
+                if progress is not None:
+                    progress(seq + 1)
+            self._note(topics.PLANT_STATE, self.plant.sample(steps * self.config.period), steps)
+        except PlantError as error:
+            lost = f"at step {seq} of {steps}: {error}"
         if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
             self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
-        self._note(topics.PLANT_STATE, self.plant.sample(steps * self.config.period), steps)
-        return gather(self.config, self.log)
+        return Outcome(gather(self.config, self.log), lost)
 
     def _step(self, seq: int) -> None:
         started = time.perf_counter()
         t = seq * self.config.period
-        state = self.plant.sample(t)
-        self._note(topics.PLANT_STATE, state, seq)
+        while self.changes and self.changes[0][0] <= t + self.config.period / 2:
+            self.plant.change(self.changes.pop(0)[1])
+        true = self.plant.sample(t)
+        self._note(topics.PLANT_STATE, true, seq)
+        state = self._measured(true)
         weights = None
         while self.on_the_way and self.on_the_way[0][0] <= seq:
             weights = self.on_the_way.pop(0)[1]
@@ -141,15 +186,28 @@ class _LockStep:
         if outputs.sample is not None:
             batch = m.Samples(run_id=CONTROLLER, seq=outputs.sample.seq, samples=[outputs.sample])
             self._note(topics.SAMPLES, batch, seq)
-        if self.trainer is None or outputs.output_weights is None:
+        if self.trainer is None or outputs.output_weights is None or self._trainer_is_dead(seq):
             return
         if outputs.sample is not None:
             self.trainer.add(CONTROLLER, [outputs.sample])
-        if self.trainer.due():
+        if self.trainer.due() and not self.on_the_way:
             weights = self.trainer.train(outputs.output_weights, CONTROLLER)
             if weights is not None:
+                takes = max(1, math.ceil(self.faults.training_seconds / self.config.period - 1e-9))
+                if self._trainer_is_dead(seq + takes):
+                    return
                 self._note(topics.HIDDEN_WEIGHTS, weights, seq)
-                self.on_the_way.append((seq + self.weights_delay, weights))
+                self.on_the_way.append((seq + takes, weights))
+
+    def _trainer_is_dead(self, seq: int) -> bool:
+        dies = self.faults.trainer_dies_at
+        return dies is not None and seq * self.config.period > dies
+
+    def _measured(self, true: m.PlantState) -> m.PlantState:
+        if self.noise is None:
+            return true
+        noisy = np.array(true.x) + self.noise * self.draws.standard_normal(len(self.noise))
+        return msgspec.structs.replace(true, x=noisy.tolist())
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
         self.log.append((topic, message, round(seq * self.config.period * 1e9)))
