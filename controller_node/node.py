@@ -31,7 +31,7 @@ OLDEST_STATE = 0.8
 STATE_PATIENCE = 0.25
 LONGEST_PHASE = 0.5
 # Seconds, and share of a period at most.
-USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.1
+USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.25
 COUNTS = (
     "ticks",
     "late ticks",
@@ -94,7 +94,7 @@ class ControllerNode:
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
         pacer = Pacer(self._grid, stop)
-        garbage = GarbageCollection()
+        garbage = GarbageCollection.at(self._period)
         garbage.begin()
         self._bus.publish(topics.KEYFRAME, self._core.keyframe(-1))
         while self._find_plant(stop):

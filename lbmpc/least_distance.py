@@ -52,7 +52,7 @@ class Shown:
     def __init__(
         self, M: np.ndarray, lower: np.ndarray, upper: np.ndarray, penalty: Penalty | None, seen: np.ndarray
     ):
-        self.seen = seen
+        self.seen, self._free = seen, M.shape[1]
         rows = M[seen]
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         self._usable = bool((norms > 1e-12).all())
@@ -74,6 +74,9 @@ class Shown:
         """w (n,) for the row values y (rows,) at w = 0; None when the shown rows contradict each other."""
         if not self._usable:
             return None
+        if not len(self.seen):
+            # Rows may be outside by less than the tolerance: nothing holds w away from 0.
+            return np.zeros(self._free)
         offset = y[self.seen] * self._inverse
         if self._model is None:
             flag = self._set_up(offset)

@@ -143,7 +143,7 @@ class Solver:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
         self._rows.bound_first(None)
-        tangent, rows, v = self._tangent, self._rows, self._rows.clip(np.nan_to_num(warm_start))
+        tangent, rows, v = self._tangent, self._rows, self._rows.clip(_numbers(warm_start))
         with np.errstate(all="ignore"):
             status = Status.NUMERICAL
             for sweep, theta, trusted in (
@@ -222,7 +222,7 @@ class Solver:
         ur: np.ndarray | None,
     ) -> Solution:
         self._load(sweep, x, theta, xr, ur)
-        v, merit = self._rows.clip(np.nan_to_num(warm_start)), np.inf
+        v, merit = self._rows.clip(_numbers(warm_start)), np.inf
         self._linearise(sweep, v)
         status, values, seen = Status.ITERATION_LIMIT, self._values(x, v), NO_ROWS
         iterations, size = 0, 0.0
@@ -354,3 +354,8 @@ def _prediction(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
         response[:, m * i : m * (i + 1)] += model.B
         free[i], forced[i] = power, response
     return free.reshape(n * d, d), forced.reshape(n * d, m * n)
+
+
+def _numbers(v: np.ndarray) -> np.ndarray:
+    """`v` with a number in the place of what is none; to look first takes a tenth of the time."""
+    return v if np.isfinite(v).all() else np.nan_to_num(v)

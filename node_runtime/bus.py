@@ -21,6 +21,7 @@ import zenoh
 from node_runtime import clock
 from node_runtime.bad_messages import BadMessages
 from node_runtime.config import Config, ConfigError
+from node_runtime.gathering import Gathered, Gathering, Separating, size_of
 from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
 from node_runtime.session import OpenInterrupted, connect, session_config
 from protocol import codec, topics
@@ -35,6 +36,7 @@ PENDING_QUERIES = 32
 LARGEST = max(topic.max_bytes for topic in topics.ALL)
 
 Handler = Callable[[dict[str, str]], list[bytes]]
+Payload = bytes | list[Gathered]
 
 __all__ = ["Bus", "Delivery", "Handler", "Latest", "Mailbox", "OpenInterrupted", "session_config"]
 
@@ -57,7 +59,8 @@ class Bus:
         self._bulk: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
-        self._outgoing: queue.SimpleQueue[tuple[Topic, bytes] | None] = queue.SimpleQueue()
+        self._outgoing: queue.SimpleQueue[tuple[Topic, Payload] | None] = queue.SimpleQueue()
+        self._gathering = Gathering(run_id)
         self._outgoing_count = 0
         self._outgoing_bytes = 0
         self._idle = threading.Condition(self._lock)
@@ -136,10 +139,13 @@ class Bus:
         if len(payload) > topic.max_bytes:
             self._count(f"not sent, oversized {topic.name}")
             return
+        gathered = topics.gathers(topic, self.config.rate)
         if topic.lane == "control":
             self._put(topic, payload)
-        else:
+        elif not gathered:
             self._enqueue(topic, payload)
+        if gathered:
+            self._gather(topic, payload)
 
     def matched(self, topic: Topic) -> bool:
         """Whether somebody is subscribed to this topic; a message sent before that reaches nobody."""
@@ -148,6 +154,8 @@ class Bus:
 
     def flush(self, timeout_s: float) -> bool:
         """Wait until the bulk lane is empty; False when it is not after `timeout_s`."""
+        with self._lock:
+            self._enqueue_gathered()
         with self._idle:
             return self._idle.wait_for(lambda: self._outgoing_count == 0, timeout_s)
 
@@ -162,22 +170,41 @@ class Bus:
 
     def _enqueue(self, topic: Topic, payload: bytes) -> None:
         with self._lock:
-            if self._closed:
-                return
-            if self._outgoing_count >= BULK_MESSAGES or self._outgoing_bytes + len(payload) > BULK_BYTES:
-                self._counts["bulk overflow"] = self._counts.get("bulk overflow", 0) + 1
-                return
-            self._outgoing_count += 1
-            self._outgoing_bytes += len(payload)
+            # What was published before goes out before.
+            self._enqueue_gathered()
+            self._enqueue_one(topic, payload, len(payload))
+
+    def _gather(self, topic: Topic, payload: bytes) -> None:
+        with self._lock:
+            if self._gathering.add(topic, payload, clock.now_ns()):
+                self._enqueue_gathered()
+
+    def _enqueue_gathered(self) -> None:
+        """With the lock held: what has gathered is one message more to send. Its parts count one by one if lost."""
+        gathered, size = self._gathering.take()
+        if gathered:
+            self._enqueue_one(topics.BATCH[self.process], gathered, size, len(gathered))
+
+    def _enqueue_one(self, topic: Topic, payload: Payload, size: int, messages: int = 1) -> None:
+        """With the lock held."""
+        if self._closed:
+            return
+        if self._outgoing_count >= BULK_MESSAGES or self._outgoing_bytes + size > BULK_BYTES:
+            self._counts["bulk overflow"] = self._counts.get("bulk overflow", 0) + messages
+            return
+        self._outgoing_count += 1
+        self._outgoing_bytes += size
         self._outgoing.put((topic, payload))
 
     def _send_bulk(self) -> None:
         while (item := self._outgoing.get()) is not None:
             topic, payload = item
-            self._put(topic, payload)
+            size = len(payload) if isinstance(payload, bytes) else size_of(payload)
+            # Put together here, where nobody waits for it.
+            self._put(topic, payload if isinstance(payload, bytes) else self._gathering.encode(payload))
             with self._idle:
                 self._outgoing_count -= 1
-                self._outgoing_bytes -= len(payload)
+                self._outgoing_bytes -= size
                 self._idle.notify_all()
 
     def _publisher(self, topic: Topic) -> zenoh.Publisher:
@@ -188,8 +215,10 @@ class Bus:
         session = self._session(topic)
         with self._lock:
             if topic.name not in self._publishers:
+                direct = control and topics.gathers(topic, self.config.rate)
+                name = self.config.name
                 self._publishers[topic.name] = session.declare_publisher(
-                    topic.key(self.config.name),
+                    topic.direct_key(name) if direct else topic.key(name),
                     congestion_control=zenoh.CongestionControl.DROP
                     if control
                     else zenoh.CongestionControl.BLOCK,
@@ -209,20 +238,31 @@ class Bus:
     def latest(self, topic: Topic) -> Latest:
         """Follow a topic's newest message only."""
         latest = Latest(topic.name)
-        self._subscribe(self._session(topic), topic.key(self.config.name), latest.put)
+        self._follow(topic, latest.put)
         return latest
 
     def queue(self, topic: Topic, capacity: int = 1000) -> Mailbox:
         """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
         mailbox = self._mailbox(topic.name, capacity)
-        self._subscribe(self._session(topic), topic.key(self.config.name), mailbox.put)
+        self._follow(topic, mailbox.put)
         return mailbox
 
     def everything(self, capacity: int = 100_000) -> Mailbox:
-        """Follow all that is published below `tandem/<plant>/`, this process's own messages included."""
-        mailbox = self._mailbox("everything", capacity)
+        """Follow all that is published below `tandem/<plant>/`, this process's own messages included.
+
+        What travelled gathered in a `Batch` is here one by one, as if it had travelled alone.
+        """
+        mailbox = Separating("everything", capacity, self.bad)
+        with self._lock:
+            self._boxes.append(mailbox)
         self._subscribe(self._session(), topics.everything(self.config.name), mailbox.put)
         return mailbox
+
+    def _follow(self, topic: Topic, sink: Sink) -> None:
+        session, name = self._session(topic), self.config.name
+        self._subscribe(session, topic.key(name), sink, topic)
+        if topic.lane == "control" and topics.gathers(topic, self.config.rate):
+            self._subscribe(session, topic.direct_key(name), sink, topic)
 
     def _mailbox(self, name: str, capacity: int) -> Mailbox:
         mailbox = Mailbox(name, capacity)
@@ -230,14 +270,16 @@ class Bus:
             self._boxes.append(mailbox)
         return mailbox
 
-    def _subscribe(self, session: zenoh.Session, key: str, sink: Sink) -> None:
+    def _subscribe(self, session: zenoh.Session, key: str, sink: Sink, only: Topic | None = None) -> None:
+        """`only`: what `key` is the key of, None where it covers many."""
         bad = self.bad
+        plain = None if only is None else only.key(self.config.name)
 
         # Runs on the link's receiving thread, so it must be short: a stamp, a copy, an append.
         def arrived(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
-            key = str(sample.key_expr)
-            topic = topics.topic_of(key)
+            key = plain or str(sample.key_expr)
+            topic = only or topics.topic_of(key)
             limit = LARGEST if topic is None else topic.max_bytes
             payload = sample.payload
             size = len(payload)

@@ -11,9 +11,10 @@ import difflib
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import msgspec
+import msgspec.inspect
 import tomli_w
 
 from node_runtime import config_words
@@ -38,6 +39,7 @@ Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 
 
 Fail = Callable[[str, str], NoReturn]
+T = TypeVar("T", bound=msgspec.Struct)
 
 AWAKE_BELOW = 0.01
 """Seconds. Waking a sleeping core takes up to a few tenths of a millisecond: little of a longer period, but power all
@@ -87,7 +89,7 @@ class ControllerConfig(Section, frozen=True):
     late_fraction: Unit = 0.2
     """A tick is late when it starts later than this share of a period after its slot."""
     phase_ms: NonNegative | None = None
-    """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a tenth of a period."""
+    """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
     solver: SolverConfig = SolverConfig()
 
 
@@ -238,17 +240,8 @@ def from_tree(
     where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
     """
 
-    def fail(key: str, text: str) -> NoReturn:
-        place = key.split("[")[0]
-        given = [origin for name, origin in (origins or {}).items() if f"{name}.".startswith(f"{place}.")]
-        raise ConfigError(f"{given[-1] if given else where}: {text}")
-
-    _reject_unknown(tree, Config, fail, "")
-    try:
-        config = msgspec.convert(tree, Config)
-    except msgspec.ValidationError as error:
-        key, text = config_words.explain(str(error), tree, Config)
-        fail(key, text)
+    fail = _failing(where, origins)
+    config = _strict(tree, Config, fail)
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
@@ -347,21 +340,51 @@ def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _reject_unknown(
-    tree: dict[str, Any], kind: type, fail: Callable[[str, str], NoReturn], path: str
-) -> None:
+def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
+    """A plain tree as the Struct `kind`. Raises `ConfigError`, as helpful as for a configuration.
+
+    where: the file, for messages.
+    """
+    return _strict(tree, kind, _failing(where, None))
+
+
+def _failing(where: str, origins: Mapping[str, str] | None) -> Fail:
+    def fail(key: str, text: str) -> NoReturn:
+        place = key.split("[")[0]
+        given = [origin for name, origin in (origins or {}).items() if f"{name}.".startswith(f"{place}.")]
+        raise ConfigError(f"{given[-1] if given else where}: {text}")
+
+    return fail
+
+
+def _strict(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
+    _reject_unknown(tree, msgspec.inspect.type_info(kind), fail, "")
+    try:
+        return msgspec.convert(tree, kind)
+    except msgspec.ValidationError as error:
+        key, text = config_words.explain(str(error), tree, kind)
+        fail(key, text)
+
+
+def _reject_unknown(value: Any, kind: msgspec.inspect.Type, fail: Fail, path: str) -> None:
     """msgspec would reject unknown keys too, but cannot say which key was meant."""
-    fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
-    for key, value in tree.items():
-        full = f"{path}.{key}" if path else key
-        if key not in fields:
-            near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
-            hint = (
-                f"did you mean {(path + '.' if path else '') + near[0]!r}?"
-                if near
-                else f"known: {', '.join(fields)}"
-            )
-            fail(full, f"unknown key {full!r}; {hint}")
-        section = fields[key]
-        if isinstance(value, dict) and isinstance(section, type) and issubclass(section, msgspec.Struct):
-            _reject_unknown(value, section, fail, full)
+    match config_words.without_none(kind), value:
+        case msgspec.inspect.StructType(fields=known), dict():
+            fields = {field.name: field.type for field in known}
+            for key, below in value.items():
+                full = f"{path}.{key}" if path else key
+                if key not in fields:
+                    near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
+                    hint = (
+                        f"did you mean {(path + '.' if path else '') + near[0]!r}?"
+                        if near
+                        else f"known: {', '.join(fields)}"
+                    )
+                    fail(full, f"unknown key {full!r}; {hint}")
+                _reject_unknown(below, fields[key], fail, full)
+        case msgspec.inspect.ListType(item_type=item), list():
+            for i, below in enumerate(value):
+                _reject_unknown(below, item, fail, f"{path}[{i}]")
+        case msgspec.inspect.DictType(value_type=item), dict():
+            for key, below in value.items():
+                _reject_unknown(below, item, fail, f"{path}.{key}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import os
 import struct
 import sys
@@ -126,6 +127,11 @@ class GarbageCollection:
         """`every`: calls of `idle` between two collections."""
         self._every = every
         self._calls = 0
+
+    @classmethod
+    def at(cls, period: float) -> GarbageCollection:
+        """For a loop with this period, in seconds: every 20 steps, and at most five times a second."""
+        return cls(max(20, math.ceil(0.2 / period)))
 
     def begin(self) -> None:
         """All that exists now stays: take it out of what is searched, and stop automatic collection."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import cache
 from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import inspect
 
 from protocol import messages as m
 from protocol.topics import Topic
@@ -61,23 +63,57 @@ def decode(topic: Topic, payload: bytes) -> m.Message:
     return message
 
 
+@cache
+def _fields_with_floats(kind: type[msgspec.Struct]) -> tuple[str, ...]:
+    """The fields of a Struct in which there can be a float: most of a message's fields are texts and counts."""
+    fields = msgspec.structs.fields(kind)
+    return tuple(field.name for field in fields if _may_hold_float(inspect.type_info(field.type)))
+
+
+def _may_hold_float(kind: inspect.Type) -> bool:
+    match kind:
+        case inspect.Metadata(type=inner):
+            return _may_hold_float(inner)
+        case inspect.UnionType(types=types):
+            return any(map(_may_hold_float, types))
+        case inspect.ListType(item_type=inner):
+            return _may_hold_float(inner)
+        case inspect.DictType(value_type=inner):
+            return _may_hold_float(inner)
+        case inspect.StructType(cls=struct):
+            return struct is m.Array or bool(_fields_with_floats(struct))
+        case (
+            inspect.StrType()
+            | inspect.IntType()
+            | inspect.BoolType()
+            | inspect.NoneType()
+            | inspect.BytesType()
+            | inspect.LiteralType()
+        ):
+            return False
+        case _:
+            return True
+
+
 def first_non_finite(value: object, path: str = "") -> str | None:
     """Name of the first field that holds a NaN or an infinity, or None. msgspec lets both pass."""
     if isinstance(value, float):
         return None if math.isfinite(value) else path or "value"
+    if value is None:
+        return None
     if isinstance(value, m.Array):
         if value.dtype in ("<f4", "<f8") and not np.isfinite(np.frombuffer(value.data, value.dtype)).all():
             return path or "array"
         return None
     children: Iterable[tuple[object, object]]
     if isinstance(value, msgspec.Struct):
-        children = ((name, getattr(value, name)) for name in value.__struct_fields__)
+        children = [(name, getattr(value, name)) for name in _fields_with_floats(type(value))]
     elif isinstance(value, dict):
         children = value.items()
     elif isinstance(value, list):
         # Nearly all are vectors of finite numbers, and those have a finite sum.
         first = value[0] if value else None
-        if type(first) is float and math.isfinite(sum(value)):
+        if first is None or (type(first) is float and math.isfinite(sum(value))):
             return None
         if type(first) is list and first and type(first[0]) is float and math.isfinite(sum(map(sum, value))):
             return None

@@ -231,6 +231,21 @@ class RunInfo(Message, frozen=True):
     unix_time: float
 
 
+class Gathered(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One message as it would have travelled alone."""
+
+    topic: str
+    ago_ns: Count
+    """How long before the `Batch` was sent it was published."""
+    payload: bytes
+
+
+class Batch(Message, frozen=True):
+    """Messages of a fast loop that nobody waits for, in the order in which they were published."""
+
+    messages: list[Gathered]
+
+
 class Health(Message, frozen=True):
     """How one process is, about twice a second and at every change."""
 

@@ -15,6 +15,7 @@ from protocol import messages as m
 
 Lane = Literal["control", "bulk"]
 PREFIX = "tandem"
+DIRECT = "@direct"
 PROCESSES = ("router", "plant", "controller", "trainer", "recorder")
 
 
@@ -31,6 +32,8 @@ class Topic:
     """A loop that ticks faster publishes it at every n-th tick only, and where what it says has changed."""
     view_hz: float = math.inf
     """Messages a second that get a view in the log; their bytes are all in it, whatever the rate."""
+    gathered: bool = False
+    """In a fast loop those who log and show it get many of its messages in one `Batch`; see `gathers`."""
 
     def every(self, period: float) -> int:
         """Ticks from one message to the next in a loop of this period, in seconds."""
@@ -39,23 +42,38 @@ class Topic:
     def key(self, plant: str) -> str:
         return f"{PREFIX}/{plant}/{self.name}"
 
+    def direct_key(self, plant: str) -> str:
+        """Where a fast loop's control messages travel: no wildcard covers it, so only who needs them is woken."""
+        return f"{PREFIX}/{plant}/{DIRECT}/{self.name}"
+
 
 WEIGHTS_LIMIT = 16 * 1024 * 1024
+
+# Above this rate, in Hz, what is logged and shown travels together; up to it every message travels alone.
+GATHER_ABOVE = 100.0
+# Seconds for which messages wait for each other, and bytes beyond which they do not.
+GATHER_S = 0.02
+BATCH_BYTES = 1024 * 1024
 
 # More points than that in a second no plot shows, and each costs as much as the logging itself.
 VIEW_HZ = 100.0
 
-PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ)
-COMMAND = Topic("controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ)
-TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ)
-RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ)
-TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ)
+PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ, gathered=True)
+COMMAND = Topic(
+    "controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ, gathered=True
+)
+TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ, gathered=True)
+RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
+TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
 SAMPLES = Topic("controller/samples", m.Samples, "bulk", "controller", 1024 * 1024)
 OUTPUT_WEIGHTS = Topic(
     "controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0
 )
 KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
 HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
+BATCH = {
+    name: Topic(f"{name}/batch", m.Batch, "bulk", name, 4 * WEIGHTS_LIMIT) for name in ("plant", "controller")
+}
 RUN_INFO = {name: Topic(f"{name}/run_info", m.RunInfo, "bulk", name) for name in PROCESSES}
 HEALTH = {name: Topic(f"{name}/health", m.Health, "bulk", name) for name in PROCESSES}
 
@@ -69,10 +87,17 @@ ALL: tuple[Topic, ...] = (
     OUTPUT_WEIGHTS,
     KEYFRAME,
     HIDDEN_WEIGHTS,
+    *BATCH.values(),
     *RUN_INFO.values(),
     *HEALTH.values(),
 )
 BY_NAME = {topic.name: topic for topic in ALL}
+
+
+def gathers(topic: Topic, rate: float) -> bool:
+    """Whether messages of `topic` are logged from a `Batch` at this sampling rate, in Hz."""
+    return topic.gathered and topic.writer in BATCH and rate > GATHER_ABOVE
+
 
 OUTBOX_QUERY = "controller/outbox"
 """Queryable: `?run=RUN;since=SEQ;last=K` answers with `Samples` batches."""
