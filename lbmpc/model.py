@@ -75,9 +75,9 @@ class Model:
     def answer(self, pieces: Pieces) -> np.ndarray:
         """The linear model's state, (d,), after the inputs of `pieces` in turn, from the equilibrium."""
         x = np.zeros(self.d)
-        for seconds, u in pieces:
+        for k, (seconds, u) in enumerate(pieces):
             phi, gamma = self.hold(seconds)
-            x = phi @ x + gamma @ u
+            x = phi @ x + gamma @ u if k else gamma @ u
         return x
 
     def hold(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:

@@ -63,4 +63,4 @@ class Numbers:
         return ACTIVATIONS[name].numpy(a)
 
     def join(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate(parts, axis=-1)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
