@@ -7,6 +7,7 @@ import numpy as np
 from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle
 from lbmpc.plants import get_plant
+from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription
 
 
@@ -15,9 +16,14 @@ def compressor(period: float = 0.05) -> Model:
 
 
 def describe(
-    model: Model, hidden: list[int], activation: str = "tanh", scale: float = 0.01
+    model: Model,
+    hidden: list[int],
+    activation: str = "tanh",
+    scale: float = 0.01,
+    architecture: str = "mlp",
+    window: int | None = None,
 ) -> NetworkDescription:
-    plant = model.plant
+    plant, kind = model.plant, get_architecture(architecture)
     half = np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
     return NetworkDescription(
         states=model.d,
@@ -26,6 +32,9 @@ def describe(
         activations=[activation] * len(hidden),
         input_scale=half.tolist(),
         output_scale=[scale] * model.d,
+        architecture=architecture,
+        window=window or kind.window,
+        options=kind.options,
     )
 
 

@@ -26,7 +26,9 @@ def descriptions(draw: st.DrawFn) -> NetworkDescription:
     scale = st.floats(1e-3, 1e3)
     architecture = draw(st.sampled_from(architecture_names()))
     window = draw(st.integers(1 if architecture == "mlp" else 2, 5))
-    options = {"kernel": draw(st.integers(1, window))} if architecture == "cnn" else {}
+    options = dict(get_architecture(architecture).options)
+    if architecture == "cnn":
+        options["kernel"] = draw(st.integers(1, window))
     return NetworkDescription(
         states=states,
         inputs=inputs,
@@ -53,7 +55,11 @@ def test_all_three_of_the_paper_are_there() -> None:
 def test_torch_casadi_and_numpy_agree_to_1e_12_in_float64(
     description: NetworkDescription, seed: int, size: float
 ) -> None:
-    """The value; and its slope along every entry of the window, by CasADi and by torch."""
+    check_parity(description, seed, size)
+
+
+def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) -> None:
+    """The value, its slope along every entry of the window by CasADi and by torch, and the bound of phi."""
     rng = np.random.default_rng(seed)
     d, points = description.states, 5
     hidden = [size * rng.standard_normal(shape) / np.sqrt(shape[0]) for shape in description.layer_shapes]

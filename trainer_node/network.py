@@ -37,10 +37,10 @@ _BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 class _Tensors:
-    """The operations of `protocol.architecture`: a value is (M, n), a layer (1 + n_a, n), its bias first."""
+    """The operations of `protocol.architecture`: a value is (M, n), a layer its bias (n,) and weights (n_a, n)."""
 
-    def affine(self, layer: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
-        return torch.addmm(layer[0], a, layer[1:])
+    def affine(self, layer: tuple[torch.Tensor, torch.Tensor], a: torch.Tensor) -> torch.Tensor:
+        return torch.addmm(layer[0], a, layer[1])
 
     def activate(self, name: Activation, a: torch.Tensor) -> torch.Tensor:
         return _ACTIVATIONS[name](a)
@@ -106,14 +106,16 @@ class Network(torch.nn.Module):
         """Windows in units of `input_scale`."""
         return window / self._input_scale
 
-    def activations(self, scaled: torch.Tensor, layers: Sequence[torch.Tensor]) -> torch.Tensor:
-        """phi without its leading 1, (M, n_L), of scaled windows under these layers."""
+    def activations(
+        self, scaled: torch.Tensor, layers: Sequence[tuple[torch.Tensor, torch.Tensor]]
+    ) -> torch.Tensor:
+        """phi without its leading 1, (M, n_L), of scaled windows under these biases and weights."""
         pairs = scaled.split(self.description.pair, dim=1)
         return self._architecture.forward(_Tensors(), self._sizes, layers, pairs)
 
     def features(self, window: torch.Tensor) -> torch.Tensor:
         """phi, (M, 1 + n_L), of windows in deviation coordinates and plant units."""
-        psi = self.activations(self.scaled(window), self.layers())
+        psi = self.activations(self.scaled(window), [(layer[0], layer[1:]) for layer in self.layers()])
         return torch.cat([torch.ones_like(psi[:, :1]), psi], dim=1)
 
     def forward(self, window: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
@@ -158,12 +160,16 @@ class AutogradLoss:
         self._offset = output[0] - network.scaled_targets(network.tensor(h))
         self._weights = output[1:]
         # Leaves of their own on the same memory: views of one parameter would each give a gradient of its full length.
-        self._leaves = [layer.detach().requires_grad_() for layer in network.layers()]
+        self._layers = [
+            (layer[0].detach().requires_grad_(), layer[1:].detach().requires_grad_())
+            for layer in network.layers()
+        ]
+        self._leaves = [leaf for layer in self._layers for leaf in layer]
         self._gradient = torch.zeros_like(network.flat, requires_grad=False)
-        self._parts = network.layers(self._gradient)
+        self._parts = [part for layer in network.layers(self._gradient) for part in (layer[0], layer[1:])]
 
     def _loss(self) -> torch.Tensor:
-        psi = self._network.activations(self._inputs, self._leaves)
+        psi = self._network.activations(self._inputs, self._layers)
         residual = torch.addmm(self._offset, psi, self._weights)
         return residual.square().sum() / len(self._inputs)
 

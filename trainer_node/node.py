@@ -37,6 +37,8 @@ REFILL_EVERY = 1.0
 TRAIN_EVERY = 0.4
 """Seconds between the beginnings of two trainings, at least: a fast loop's samples would keep a core busy for good,
 and it is the loop that needs it."""
+SHARE = 0.5
+"""Of the time, at most, is spent training: a network that takes long to train is trained less often."""
 ADOPTION_PATIENCE = 2.0
 """Seconds that a controller may go on with other hidden layers than those it was sent."""
 OUTBOX = 20_000
@@ -82,6 +84,7 @@ class TrainerNode:
         self._refill_at = 0.0
         self._unadopted_since: float | None = None
         self._train_at = 0.0
+        self._trained_for = 0.0
 
     @property
     def trainer(self) -> Trainer | None:
@@ -108,8 +111,8 @@ class TrainerNode:
             self._refill_at = now + REFILL_EVERY
             self._refill(self._gap)
         if now >= self._train_at and self._may_train():
-            self._train_at = now + TRAIN_EVERY
             self._train()
+            self._train_at = now + max(TRAIN_EVERY, self._trained_for / SHARE)
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))
 
@@ -243,7 +246,8 @@ class TrainerNode:
         assert self._output is not None
         began = clock.now()
         weights = self._trainer.train(self._output, self._run)
-        self._counts["last training, ms"] = round((clock.now() - began) * 1e3)
+        self._trained_for = clock.now() - began
+        self._counts["last training, ms"] = round(self._trained_for * 1e3)
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)

@@ -1,0 +1,418 @@
+"""Recurrent and convolutional hidden layers: a window of past pairs, in the solver, in the log, in the trainer."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from science import compressor, describe
+from test_network_parity import check_parity
+
+from controller_node.outbox import BATCH, Outbox
+from experiments.lockstep import simulate
+from lbmpc.controller import Controller, ControllerState, HiddenSet, Observation, StepResult
+from lbmpc.oracles import DnnOracle
+from lbmpc.oracles.base import follow
+from lbmpc.plants import Truth
+from lbmpc.problem import build_problem
+from lbmpc.reference import ReferenceSolver
+from lbmpc.solution import Status
+from lbmpc.solver import Solver
+from node_runtime.config import Config, ConfigError, TrainerConfig, load, override
+from protocol import architecture, architectures, codec, topics
+from protocol import messages as m
+from protocol.architecture import get_architecture
+from protocol.network import NetworkDescription, hash_layers
+from run_log.replay import replay
+from run_log.summary import summarise
+from trainer_node.network import AutogradLoss, DenseLoss, Network, build_loss
+from trainer_node.training import Trainer
+
+MODEL = compressor()
+D, M = MODEL.d, MODEL.m
+X0 = MODEL.plant.x0 - MODEL.plant.x_e
+LOOKING_BACK = [("rnn", 5), ("rnn", 2), ("cnn", 5), ("mlp", 3)]
+QUICK = [
+    "controller.horizon=15",
+    "network.hidden=[8, 8]",
+    "trainer.steps=20",
+    "controller.solver.compile=never",
+]
+PAGE = Path(__file__).parents[1] / "docs" / "architectures.md"
+
+
+def oracle_of(name: str, window: int | None = None, hidden: list[int] | None = None) -> DnnOracle:
+    return DnnOracle(describe(MODEL, hidden or [8, 8], architecture=name, window=window))
+
+
+def somewhere(oracle: DnnOracle, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A state with a past, s (D,), and the parameters after some labels on the way there."""
+    state = oracle.begin(oracle.initial_state(rng), np.zeros(D), np.zeros(M))
+    for _ in range(20):
+        x = rng.uniform(-1, 1, D) * [0.4, 0.4, 0.5, 5.0]
+        state = oracle.learn(state, x, rng.uniform(-0.5, 0.5, M), rng.normal(size=D) * 0.006)
+    x = rng.choice([-1, 1], D) * rng.uniform([0.05, 0.05, 0.1, 1.0], [0.45, 0.45, 0.6, 8.0])
+    return np.concatenate([x, oracle.past(state).ravel()]), oracle.theta(state)
+
+
+# -- the solver ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "window"), LOOKING_BACK)
+def test_the_optimum_is_that_of_ipopt(name: str, window: int) -> None:
+    rng = np.random.default_rng(7)
+    oracle = oracle_of(name, window)
+    problem = build_problem(MODEL, oracle, 12, "first_step")
+    solver, reference = Solver(problem, max_iterations=60, tolerance=1e-9), ReferenceSolver(problem)
+    active = 0
+    for _ in range(4):
+        s, theta = somewhere(oracle, rng)
+        ours = solver.solve(s, theta, rng.uniform(-1, 1, (12, M)))
+        theirs = reference.solve(s, theta, ours.v)
+        assert ours.status is Status.CONVERGED
+        assert theirs.status is Status.CONVERGED
+        np.testing.assert_allclose(ours.v[0], theirs.v[0], atol=1e-6)
+        active += bool(ours.slack) or bool(np.isin(ours.v, [MODEL.plant.u_min, MODEL.plant.u_max]).any())
+    # The model of the cost is exact: from nearby, steps shrink at Gauss-Newton's rate and not slower.
+    again = solver.solve(s, theta, ours.v)
+    assert again.iterations <= 3
+
+
+@pytest.mark.parametrize("name", ["rnn", "cnn"])
+def test_the_past_matters_to_the_plan_as_the_prepared_step_says(name: str) -> None:
+    """A prepared step corrects for another past too, to first order."""
+    rng = np.random.default_rng(3)
+    oracle = oracle_of(name)
+    solver = Solver(build_problem(MODEL, oracle, 12), tolerance=1e-10, max_iterations=60)
+    s, theta = somewhere(oracle, rng)
+    s[:D] *= 0.3
+    plan = solver.solve(s, theta, np.zeros((12, M))).v
+    errors = []
+    for size in (1e-2, 1e-3):
+        moved = s.copy()
+        moved[D:] += size * rng.normal(size=len(s) - D) * np.tile([0.4, 0.4, 0.5, 5.0, 0.5], 4)
+        optimum = solver.solve(moved, theta, plan).v
+        solver.prepare(s, theta, plan)
+        assert np.abs(optimum - plan).max() > 1e-7
+        errors.append(float(np.abs(solver.feedback(moved).v - optimum).max() / np.abs(optimum - plan).max()))
+    assert errors[1] < 0.05
+    assert errors[1] < errors[0] or errors[0] < 1e-3
+
+
+@pytest.mark.parametrize("name", ["rnn", "cnn"])
+def test_one_real_time_iteration_is_close_to_the_optimum_along_a_closed_loop(name: str) -> None:
+    plant, truth, oracle = MODEL.plant, Truth(MODEL.plant), oracle_of(name)
+    solver = Solver(build_problem(MODEL, oracle, 20))
+    state = oracle.begin(oracle.initial_state(np.random.default_rng(0)), X0, np.zeros(M))
+    x, differences = X0, []
+    s = np.concatenate([x, oracle.past(state).ravel()])
+    solution = solver.solve(s, oracle.theta(state), np.zeros((20, M)))
+    for _ in range(30):
+        u = solution.v[0]
+        predicted = follow(s, u, MODEL.A @ x + MODEL.B @ u + oracle.estimate(state, x, u))
+        after = truth.step(x + plant.x_e, u + plant.u_e, 0.05) - plant.x_e
+        state = oracle.learn(state, x, u, MODEL.label(x, u, after))
+        s, x = np.concatenate([after, oracle.past(state).ravel()]), after
+        np.testing.assert_allclose(predicted[D:], s[D:], atol=1e-15)
+        v = np.vstack([solution.v[1:], np.zeros((1, M))])
+        solver.prepare(predicted, oracle.theta(state), v)
+        real_time = solver.feedback(s)
+        solution = solver.solve(s, oracle.theta(state), v)
+        differences.append(float(np.abs(solution.v[0] - real_time.v[0]).max()))
+    assert max(differences) < 2e-3
+    assert np.median(differences) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["rnn", "cnn"])
+def test_a_network_of_nonsense_is_set_aside(name: str) -> None:
+    solver = Solver(build_problem(MODEL, oracle_of(name), 10))
+    s = np.concatenate([0.3 * X0, np.zeros(4 * (D + M))])
+    refused = solver.solve(s, np.full(solver.problem.oracle.parameters, np.nan), np.zeros((10, M)))
+    assert refused.status is Status.ORACLE_REFUSED
+    assert refused.usable
+
+
+# -- the window: its beginning, its gaps, its way to the trainer -------------------------------------------
+
+ORACLE = oracle_of("rnn", 4)
+CONTROLLER = Controller(build_problem(MODEL, ORACLE, 8), Solver(build_problem(MODEL, ORACLE, 8)))
+
+
+def run_controller(
+    missing: tuple[int, ...] = (), ticks: int = 12
+) -> list[tuple[ControllerState, StepResult]]:
+    """The states after each tick and its result; x of tick t is t / 100, u applied before it t / 10."""
+    state, found = CONTROLLER.initial_state(0), []
+    for t in range(ticks):
+        x = None if t in missing else np.full(D, t / 100)
+        applied = None if t == 0 else np.full(M, t / 10)
+        state, result = CONTROLLER.step(state, Observation(x, applied, 1, t, None))
+        found.append((state, result))
+    return found
+
+
+def pair(t: int, u: float) -> np.ndarray:
+    return np.append(np.full(D, t / 100), u)
+
+
+def test_a_window_begins_as_if_the_plant_had_stood_at_its_first_state() -> None:
+    found = run_controller()
+    labels = [result.label for _state, result in found]
+    assert labels[0] is None
+    stood = pair(0, 0.0)  # the input at the first sample is not known: the equilibrium's
+    for t, expected in [
+        (1, [stood, stood, stood]),
+        (2, [stood, stood, pair(0, 0.1)]),
+        (4, [pair(0, 0.1), pair(1, 0.2), pair(2, 0.3)]),
+        (9, [pair(5, 0.6), pair(6, 0.7), pair(7, 0.8)]),
+    ]:
+        label = labels[t]
+        assert label is not None
+        np.testing.assert_array_equal(label.past, expected)
+
+
+def test_after_a_gap_the_window_begins_anew_and_holds_nothing_from_before_it() -> None:
+    found = run_controller(missing=(5,))
+    assert [t for t, (_s, result) in enumerate(found) if result.label is None] == [0, 5, 6]
+    label = found[7][1].label
+    assert label is not None
+    np.testing.assert_array_equal(label.past, [pair(6, 0.6)] * 3)
+    label = found[8][1].label
+    assert label is not None
+    np.testing.assert_array_equal(label.past, [pair(6, 0.6), pair(6, 0.6), pair(6, 0.7)])
+
+
+def test_the_predicted_state_of_the_next_tick_carries_the_window_as_it_will_be() -> None:
+    found = run_controller()
+    state, result = found[6]
+    np.testing.assert_array_equal(state.predicted[D:-M], found[7][0].oracle["past"].ravel()[:-M])
+    assert state.predicted[-M] == result.plan[0, 0]
+
+
+def test_the_window_is_part_of_the_memory_and_thaws() -> None:
+    state = run_controller()[-1][0]
+    arrays = state.to_arrays()
+    assert arrays["oracle.past"].shape == (3, D + M)
+    again = ControllerState.from_arrays(arrays)
+    seen = Observation(np.zeros(D), np.zeros(M), 1, 12, None)
+    ours, theirs = CONTROLLER.step(state, seen)[1], CONTROLLER.step(again, seen)[1]
+    np.testing.assert_array_equal(ours.plan, theirs.plan)
+    assert not np.array_equal(
+        CONTROLLER.step(ControllerState.from_arrays({**arrays, "oracle.past": np.ones((3, D + M))}), seen)[
+            1
+        ].plan,
+        ours.plan,
+    )
+
+
+def test_the_trainer_sees_the_window_that_the_controller_saw() -> None:
+    """Also at the beginning and behind a gap: phi there and here are the same."""
+    trainer = Trainer(
+        ORACLE.description,
+        TrainerConfig(device="cpu"),
+        0,
+        "trainer",
+        ORACLE.hidden(CONTROLLER.initial_state(0).oracle),
+    )
+    phis = []
+    found = run_controller(missing=(5,))
+    for (before, _), (_, result) in itertools.pairwise(found):
+        label = result.label
+        if label is not None:
+            sample = m.Sample(
+                len(phis), label.x.tolist(), label.u.tolist(), label.h.tolist(), label.past.tolist()
+            )
+            sample = msgspec.msgpack.decode(msgspec.msgpack.encode(sample), type=m.Sample)
+            assert trainer.add("run", [sample]) == 1
+            phis.append(ORACLE.features(before.oracle, label.x, label.u))
+    network = Network(ORACLE.description, torch.float64)
+    network.load(trainer.hidden)
+    with torch.no_grad():
+        theirs = network.features(network.tensor(trainer.buffer.contents()[0])).numpy()
+    np.testing.assert_allclose(theirs, phis, atol=1e-12)
+    assert trainer.counters["bad samples"] == 0
+    short = m.Sample(99, [0.0] * D, [0.0] * M, [0.0] * D, [[0.0] * (D + M)] * 2)
+    assert trainer.add("run", [short]) == 0
+    assert trainer.counters["bad samples"] == 1
+
+
+def test_a_sample_without_a_past_is_written_as_it_always_was() -> None:
+    sample = m.Sample(1, [0.5], [0.25], [0.125])
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(sample)) == {
+        "seq": 1,
+        "x": [0.5],
+        "u": [0.25],
+        "h": [0.125],
+    }
+
+
+def test_a_past_of_the_wrong_length_is_named() -> None:
+    batch = m.Samples(run_id="r", seq=0, samples=[m.Sample(0, [0.0] * 4, [0.0], [0.0] * 4, [[0.0] * 4])])
+    with pytest.raises(codec.BadMessage, match=r"past\[0\] has 4 entries, the plant has 5"):
+        codec.check_dimensions(topics.SAMPLES, batch, 4, 1)
+
+
+def test_samples_with_a_long_past_still_fit_into_their_messages() -> None:
+    sample = m.Sample(0, [0.1] * D, [0.1] * M, [0.1] * D, [[0.1] * (D + M)] * 63)
+    samples = [msgspec.structs.replace(sample, seq=i) for i in range(BATCH)]
+    batches = Outbox("run").batches(samples)
+    assert sum(len(batch.samples) for batch in batches) == BATCH
+    assert max(len(codec.encode(batch)) for batch in batches) <= topics.SAMPLES.max_bytes
+
+
+# -- weights, descriptions and configuration ---------------------------------------------------------------
+
+
+def test_weights_of_another_architecture_are_refused() -> None:
+    rnn, cnn = oracle_of("rnn"), oracle_of("cnn")
+    state = rnn.initial_state(np.random.default_rng(0))
+    foreign = [
+        layer.astype(np.float32).astype(float)
+        for layer in cnn.hidden(cnn.initial_state(np.random.default_rng(0)))
+    ]
+    after, verdict = rnn.adopt(state, 1, foreign, hash_layers(foreign), cnn.description.sha256())
+    assert verdict == "refused: trained for another network description"
+    assert after is state
+    # And one that lies about what it was trained for.
+    after, verdict = rnn.adopt(state, 1, foreign, hash_layers(foreign), rnn.description.sha256())
+    assert verdict.startswith("refused: shapes")
+    assert after is state
+    huge = [layer * 1e3 for layer in rnn.hidden(state)]
+    _, verdict = rnn.adopt(state, 1, huge, hash_layers(huge), rnn.description.sha256())
+    assert verdict.startswith("refused: layer 1 has norm")
+    hidden = HiddenSet(1, foreign, hash_layers(foreign), cnn.description.sha256())
+    controller = Controller(build_problem(MODEL, rnn, 5), Solver(build_problem(MODEL, rnn, 5)))
+    _, result = controller.step(controller.initial_state(0), Observation(X0, None, 1, 0, hidden))
+    assert result.verdict == "refused: trained for another network description"
+
+
+def test_every_field_is_in_the_hash_and_that_of_an_mlp_is_what_it_always_was() -> None:
+    base = NetworkDescription(
+        states=1, inputs=1, hidden=[4, 4], activations=["tanh"] * 2, input_scale=[1.0] * 2, output_scale=[1.0]
+    )
+    # Of the same network before there were architectures: weights in older logs carry it.
+    assert base.sha256() == "8fd5ad81c26bc9b1bedce1e9c82c407553450c46471d51f31437eaa4f00f9acd"
+    changed = [
+        msgspec.structs.replace(base, window=2),
+        msgspec.structs.replace(base, window=2, architecture="rnn"),
+        msgspec.structs.replace(base, window=3, architecture="rnn"),
+        msgspec.structs.replace(base, window=3, architecture="cnn", options={"kernel": 2}),
+        msgspec.structs.replace(base, window=3, architecture="cnn", options={"kernel": 3}),
+    ]
+    assert len({description.sha256() for description in (base, *changed)}) == 6
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["network.architecture=rn"], "did you mean 'rnn'"),
+        (["network.architecture=cnn", "network.options.kernal=2"], "did you mean 'kernel'"),
+        (["network.options.kernel=2"], "mlp has no such option"),
+        (["network.window=0"], "network.window = 0"),
+        (["network.architecture=rnn", "network.window=1"], "at least 2 pairs"),
+        (["network.architecture=cnn", "network.options.kernel=9"], "covers 1 to 5 pairs"),
+    ],
+)
+def test_a_wrong_setting_is_named(settings: list[str], said: str) -> None:
+    from controller_node.build import build_controller
+
+    with pytest.raises(ConfigError, match=said):
+        build_controller(load(None, settings))
+
+
+@pytest.mark.parametrize(("name", "window"), [("rnn", 5), ("cnn", 5)])
+def test_the_gradient_for_training_is_that_of_a_difference(name: str, window: int) -> None:
+    rng = np.random.default_rng(2)
+    description = describe(MODEL, [6, 5], architecture=name, window=window)
+    network = Network(description, torch.float64)
+    network.load([rng.normal(size=shape) for shape in description.layer_shapes])
+    windows, h, K = rng.normal(size=(9, window * 5)), 0.01 * rng.normal(size=(9, D)), rng.normal(size=(6, D))
+    loss = build_loss(network, windows, h, K)
+    assert isinstance(loss, AutogradLoss)
+    assert isinstance(
+        build_loss(Network(describe(MODEL, [4]), torch.float64), rng.normal(size=(2, 5)), h[:2], K[:5]),
+        DenseLoss,
+    )
+    gradient = loss.gradient().numpy().copy()
+    flat = network.flat.detach()
+    for i in rng.choice(len(flat), 20, replace=False):
+        values = []
+        for step in (1e-6, -1e-6):
+            flat[i] += step
+            values.append(loss.value())
+            flat[i] -= step
+        assert abs(gradient[i] - (values[0] - values[1]) / 2e-6) < 1e-6 * (1 + abs(gradient[i]))
+
+
+# -- the whole loop ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["rnn", "cnn"])
+@pytest.mark.parametrize("mode", ["converged", "real_time"])
+def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) -> None:
+    settings = [
+        f"network.architecture={name}",
+        f"controller.solver.mode={mode}",
+        "controller.keyframe_every=20",
+    ]
+    run = simulate(override(Config(), [*QUICK, *settings]), 50)
+    assert any(result.weights_verdict == "adopted" for result in run.results)
+    assert replay(run).equal
+    middle = replay(run, 45)
+    assert middle.equal
+    assert middle.first_tick == 40
+    # The window is what a keyframe would miss.
+    thawed = run.entries(topics.KEYFRAME)[2].message
+    assert "oracle.past" in thawed.arrays
+
+
+@pytest.mark.parametrize("name", ["rnn", "cnn"])
+def test_the_loop_learns(name: str) -> None:
+    settings = [f"network.architecture={name}", "network.hidden=[32, 32]", "controller.solver.compile=never"]
+    summary = summarise(simulate(load(None, settings), 160))
+    error = summary.prediction_error
+    assert error.first_second is not None
+    assert error.last_second is not None
+    assert error.last_second < 0.05 * error.first_second
+    # Linear MPC overshoots by 0.0085.
+    assert summary.overshoot < 0.0085
+    assert summary.constraint_violations == 0
+    assert summary.fallback_ticks == 0
+    assert summary.weights_adopted >= 5
+    assert summary.weights_refused == 0
+
+
+# -- the page in docs ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def gru(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The worked example of docs/architectures.md in a file of its own, as the page says."""
+    (block,) = re.findall(
+        r"```python\n(# protocol/architectures/gru\.py\n.*?)```", PAGE.read_text(), re.DOTALL
+    )
+    (tmp_path / "gru.py").write_text(block)
+    monkeypatch.setattr(architectures, "__path__", [*architectures.__path__, str(tmp_path)])
+    get_architecture.cache_clear()
+    yield "gru"
+    sys.modules.pop("protocol.architectures.gru", None)
+    get_architecture.cache_clear()
+    shutil.rmtree(tmp_path)
+
+
+def test_the_example_of_the_docs_is_the_same_network_on_both_sides_and_runs(gru: str) -> None:
+    assert gru in architecture.architecture_names()
+    for window in (1, 4):
+        for seed in range(3):
+            check_parity(describe(MODEL, [7, 6], architecture=gru, window=window), seed)
+    run = simulate(override(Config(), [*QUICK, f"network.architecture={gru}"]), 40)
+    assert any(result.weights_verdict == "adopted" for result in run.results)
+    assert replay(run).equal
