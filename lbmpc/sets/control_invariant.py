@@ -91,6 +91,7 @@ def iterate(
                 np.concatenate([current.g, g]),
                 f"the set of states that can be kept in X for {step} steps",
                 X.scale,
+                current,
             )
         except EmptySetError as error:
             raise EmptySetError(
@@ -108,7 +109,7 @@ def _excess(before: Body, after: Body, eps: float, scale: np.ndarray) -> float:
     """How far `before` drawn in by eps sticks out of `after`, in scaled lengths; at most 0 when it does not."""
     lengths = np.linalg.norm(before.G * scale, axis=1)
     try:
-        shrunk = body(before.G, before.g - eps * lengths, "the set drawn in", scale)
+        shrunk = body(before.G, before.g - eps * lengths, "the set drawn in", scale, before)
     except EmptySetError:
         return -np.inf
     reach = after.G @ shrunk.vertices.T

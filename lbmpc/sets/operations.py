@@ -162,7 +162,13 @@ def halfspaces(G: np.ndarray, g: np.ndarray) -> Polytope:
     )
 
 
-def body(G: np.ndarray, g: np.ndarray, what: str = "the set", scale: np.ndarray | None = None) -> Body:
+def body(
+    G: np.ndarray,
+    g: np.ndarray,
+    what: str = "the set",
+    scale: np.ndarray | None = None,
+    inside: Body | None = None,
+) -> Body:
     """Check {x : G x <= g} and find its scale and a point well inside.
 
     Args:
@@ -170,6 +176,7 @@ def body(G: np.ndarray, g: np.ndarray, what: str = "the set", scale: np.ndarray 
         g: (r,).
         what: its name, for messages.
         scale: half-widths to measure by, (d,); the bounding box's own by default, which takes 2 d linear programs.
+        inside: another set whose centre may serve, which saves a linear program.
 
     Raises:
         EmptySetError: holds nothing.
@@ -186,7 +193,12 @@ def body(G: np.ndarray, g: np.ndarray, what: str = "the set", scale: np.ndarray 
     G, g = G[keep], g[keep]
     if scale is None:
         scale = _bounding_scale(G, g, what)
-    centre, radius = _chebyshev(G * scale, g, what)
+    G_scaled = G * scale
+    if inside is not None:
+        room = float(((g - G @ inside.centre) / np.linalg.norm(G_scaled, axis=1)).min())
+        if room > 0.2 * inside.radius:
+            return Body(G, g, scale, inside.centre, room)
+    centre, radius = _chebyshev(G_scaled, g, what)
     if radius <= FLAT:
         raise FlatSetError(
             f"{what} is flat: the largest ball inside has {max(radius, 0.0):.2g} of its width. "
@@ -266,6 +278,13 @@ def support_of(G: np.ndarray, g: np.ndarray, direction: np.ndarray) -> float:
     return float(-found.fun)
 
 
+def _smallest(values: np.ndarray) -> np.ndarray:
+    """Indices of the `ROWS_AT_ONCE` smallest."""
+    if len(values) <= ROWS_AT_ONCE:
+        return np.arange(len(values))
+    return np.argpartition(values, ROWS_AT_ONCE)[:ROWS_AT_ONCE]
+
+
 def _bounding_scale(G: np.ndarray, g: np.ndarray, what: str) -> np.ndarray:
     d = G.shape[1]
     high, low = np.zeros(d), np.zeros(d)
@@ -295,7 +314,7 @@ def _chebyshev(G: np.ndarray, g: np.ndarray, what: str) -> tuple[np.ndarray, flo
     """
     d = G.shape[1]
     rows = np.column_stack([G, np.linalg.norm(G, axis=1)])
-    seen = np.argsort(g / rows[:, d])[:ROWS_AT_ONCE]
+    seen = _smallest(g / rows[:, d])
     # A box around everything, so that the first answers are bounded; the set itself is inside it or unbounded.
     wide = [(-FAR, FAR)] * d + [(None, FAR)]
     while True:
@@ -303,7 +322,7 @@ def _chebyshev(G: np.ndarray, g: np.ndarray, what: str) -> tuple[np.ndarray, flo
         if found.status != 0:
             raise EmptySetError(f"{what} is empty")
         broken = rows @ found.x - g
-        worst = np.argsort(broken)[-ROWS_AT_ONCE:]
+        worst = _smallest(-broken)
         worst = np.setdiff1d(worst[broken[worst] > 1e-12 * (1 + np.abs(g[worst]))], seen)
         if worst.size == 0:
             break

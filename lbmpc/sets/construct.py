@@ -1,0 +1,175 @@
+"""From a model to a certificate: W, then the invariant set, then what lies around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.sets.bounds import input_set, state_set
+from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
+from lbmpc.sets.control_invariant import Stage, Uncertain, iterate
+from lbmpc.sets.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
+from lbmpc.sets.operations import Body, body, body_of
+from lbmpc.sets.regions import Link, chain
+
+Wanted = Literal["given", "box", "hull", "regions"]
+Saved = MutableMapping[str, dict[str, np.ndarray]]
+"""Where work is kept, so that an interrupted construction goes on: arrays by name."""
+Report = Callable[[str, float], None]
+"""What is being done, and the share of it that is done."""
+SAVE_EVERY = 5
+
+
+def silent(_what: str, _done: float) -> None:
+    """A `Report` to nobody."""
+
+
+def construct(
+    model: Model,
+    kind: Wanted,
+    start: np.ndarray,
+    W: np.ndarray | None = None,
+    slack: float = 3e-4,
+    patience: int = 150,
+    saved: Saved | None = None,
+    report: Report = silent,
+) -> Certificate:
+    """The sets of one kind for the whole of X and U.
+
+    Args:
+        model: what they are for.
+        kind: `given` takes W as it is; `box` and `hull` bound h over X x U rigorously; `regions` adds to the set of `hull`
+            sets around a way from `start` into it, with h bounded locally.
+        start: a state that should be in the sets, (d,), deviation.
+        W: half-widths (d,) for `given`; the plant's own by default.
+        slack, patience: as for `control_invariant.iterate`.
+        saved: of an earlier call with the same arguments; filled as the work goes on.
+
+    Raises:
+        EmptySetError: there are none; the text says what is empty at which step, and what would help.
+        SetError, DisturbanceError: the model or its bounds admit no such construction.
+    """
+    saved = {} if saved is None else saved
+    bound = _bound(model, kind, W, saved, report)
+    stage = _invariant(model, bound, slack, patience, saved, report)
+    base = stage.set
+    links: list[Link] = []
+    if kind == "regions" and not base.contains(start).all():
+        links = chain(model, start, base, lambda done: report("sets around the way from x0", done))
+    return _certificate(model, kind, bound, stage, links, slack)
+
+
+def whole(model: Model) -> Region:
+    """All of X and U."""
+    X, U = state_set(model), input_set(model)
+    return Region(X.lower, X.upper, U.lower, U.upper)
+
+
+def _bound(
+    model: Model, kind: Wanted, W: np.ndarray | None, saved: Saved, report: Report
+) -> DisturbanceBound:
+    region = whole(model)
+    if kind == "given":
+        return given_box(model, model.plant.W * model.period if W is None else W, region)
+    name = "W as a box" if kind == "box" else "W as a hull"
+    if "W" not in saved:
+        find = bound_box if kind == "box" else bound_hull
+        saved["W"] = {"vertices": find(model, region, progress=lambda done: report(name, done)).vertices}
+    d, m = model.d, model.m
+    return DisturbanceBound(
+        region, np.zeros((d, d)), np.zeros((d, m)), saved["W"]["vertices"], "box" if kind == "box" else "hull"
+    )
+
+
+def _invariant(
+    model: Model, bound: DisturbanceBound, slack: float, patience: int, saved: Saved, report: Report
+) -> Stage:
+    X = body_of(state_set(model), "X")
+    plant = Uncertain(model.A, model.B, bound, input_set(model))
+    stage = _thaw(saved["stage"], X) if "stage" in saved else None
+    first = None
+    if stage is None or not stage.invariant:
+        for stage in iterate(X, plant, slack, patience, stage):
+            if stage.invariant or stage.step % SAVE_EVERY == 0:
+                saved["stage"] = _freeze(stage)
+            # The excess falls roughly by the same factor at each step, down to the slack.
+            first = max(stage.excess, 2 * slack) if first is None else first
+            left = np.log(max(stage.excess, slack / 10) / (slack / 10)) / np.log(first / (slack / 10))
+            report(
+                f"the invariant set: step {stage.step}, {len(stage.set.g)} facets",
+                1.0 - min(max(left, 0.0), 1.0),
+            )
+    assert stage is not None
+    return stage
+
+
+def _freeze(stage: Stage) -> dict[str, np.ndarray]:
+    return {
+        "G": stage.set.G,
+        "g": stage.set.g,
+        "at": np.array([stage.step, stage.excess, stage.slack]),
+    }
+
+
+def _thaw(arrays: dict[str, np.ndarray], X: Body) -> Stage:
+    step, excess, slack = arrays["at"]
+    return Stage(
+        int(step), body(arrays["G"], arrays["g"], "the saved set", X.scale), float(excess), float(slack)
+    )
+
+
+def _certificate(
+    model: Model, kind: Kind, bound: DisturbanceBound, stage: Stage, links: Sequence[Link], slack: float
+) -> Certificate:
+    pieces = [_piece("C", stage.set, bound, 0)]
+    pieces += [_piece(f"S{i + 1}", link.set, link.bound, i) for i, link in enumerate(links)]
+    source = "given" if kind == "given" else "interval arithmetic"
+    return Certificate(FORMAT, kind, True, model_of(model), pieces, source, slack, stage.step)
+
+
+def _piece(name: str, set_: Body, bound: DisturbanceBound, target: int) -> Piece:
+    region = bound.region
+    return Piece(
+        name,
+        set_.G.tolist(),
+        set_.g.tolist(),
+        target,
+        bound.slope_x.tolist(),
+        bound.slope_u.tolist(),
+        bound.vertices.tolist(),
+        region.x_lower.tolist(),
+        region.x_upper.tolist(),
+        region.u_lower.tolist(),
+        region.u_upper.tolist(),
+    )
+
+
+def volume_fraction(certificate: Certificate, samples: int = 20_000, seed: int = 0) -> float:
+    """Volume of the union of all pieces, as a share of X's.
+
+    The first piece exactly; of the others what none before them holds, by sampling (Karp and Luby 1983).
+    """
+    low, high = (np.array(bound) for bound in certificate.model.X)
+    half = (high - low) / 2
+    bodies = [body(np.array(p.G), np.array(p.g), p.name, half) for p in certificate.pieces]
+    total, rng = bodies[0].volume, np.random.default_rng(seed)
+    for i, piece in enumerate(bodies[1:], start=1):
+        inside = _points_in(piece, max(100, samples // len(bodies)), rng)
+        known = np.zeros(len(inside), dtype=bool)
+        for earlier in bodies[:i]:
+            known |= earlier.contains(inside)
+        total += piece.volume * float((~known).mean())
+    return float(total / np.prod(high - low))
+
+
+def _points_in(piece: Body, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Uniform points inside, (count, d), out of a box around."""
+    low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
+    found = np.zeros((0, piece.dimension))
+    while len(found) < count:
+        points = rng.uniform(low, high, (4 * count, piece.dimension))
+        found = np.vstack([found, points[piece.contains(points)]])
+    return found[:count]
