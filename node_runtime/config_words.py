@@ -29,7 +29,7 @@ def explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
     value: Any = tree
     wanted: inspect.Type = inspect.type_info(kind)
     for index, name in _STEP.findall(key):
-        wanted = _without_none(wanted)
+        wanted = without_none(wanted)
         if name and isinstance(wanted, inspect.StructType) and isinstance(value, dict):
             wanted = next(field.type for field in wanted.fields if field.name == name)
             value = value[name]
@@ -37,7 +37,7 @@ def explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
             wanted, value = wanted.item_type, value[int(index)]
         else:  # a place that these types do not have: msgspec's own words are all there is
             return key, f"{key}: {found['text']}"
-    wanted = _without_none(wanted)
+    wanted = without_none(wanted)
     if isinstance(wanted, inspect.LiteralType):
         choices = [str(choice) for choice in wanted.values]
         near = difflib.get_close_matches(str(value), choices, n=1, cutoff=0.5)
@@ -60,7 +60,7 @@ def allowed(kind: inspect.Type) -> str:
         case inspect.StrType():
             return "a string" + (f" matching {kind.pattern}" if kind.pattern else "")
         case inspect.ListType():
-            return f"a list, each entry {allowed(_without_none(kind.item_type))}"
+            return f"a list, each entry {allowed(without_none(kind.item_type))}"
     return f"a {type(kind).__name__.removesuffix('Type').lower()}"
 
 
@@ -78,7 +78,7 @@ def _range(kind: inspect.IntType | inspect.FloatType) -> str:
     return " " + " and ".join(bounds) if bounds else ""
 
 
-def _without_none(kind: inspect.Type) -> inspect.Type:
+def without_none(kind: inspect.Type) -> inspect.Type:
     """The type proper of `T | None`."""
     if isinstance(kind, inspect.UnionType):
         rest = [option for option in kind.types if not isinstance(option, inspect.NoneType)]

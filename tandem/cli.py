@@ -307,6 +307,31 @@ class BenchSolver(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Experiment(Command):
+    """Run an experiment, `paper` or a file of your own, and report it on one page; `list` says which there are."""
+
+    what: Annotated[Positional[str], arg(metavar="NAME|FILE.toml|list")]
+    """A shipped experiment, your own file (docs/experiments.md), or `list`."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(needed, except for list)")] = None
+    """Where the report goes. An experiment that was interrupted goes on from what lies there."""
+    quick: bool = False
+    """Few seeds, states and values: whether everything works, in minutes."""
+    jobs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
+    """Runs at the same time; the figures do not depend on it."""
+    only: Annotated[str | None, arg(metavar="GROUP", help_behavior_hint="(default: all)")] = None
+    """One group of the experiment."""
+
+    def run(self) -> int:
+        from tandem import experiment_command, terminal
+
+        if self.what == "list":
+            return experiment_command.show_list(self.json)
+        if self.out is None:
+            raise terminal.Refused("--out DIR is missing: where should the report go?")
+        return experiment_command.run(self.what, self.out, self.quick, self.jobs, self.only, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
 class BenchCommand:
     """Measure how fast it is."""
 
@@ -325,6 +350,7 @@ AnyCommand = (
     | Annotated[Plant, subcommand("plant")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Health, subcommand("health")]
+    | Annotated[Experiment, subcommand("experiment")]
     | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[ConfigCommand, subcommand("config")]
 )

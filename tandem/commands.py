@@ -57,7 +57,7 @@ def plant(config: Config, as_json: bool) -> int:
 
 
 def record(config: Config, as_json: bool) -> int:
-    with _log_packages():
+    with log_packages():
         from run_log.record import main
     from tandem.checks import plant_of
 
@@ -88,12 +88,12 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
         raise Refused(f"--steps {steps}: at least 1")
     if log is not None and log.exists():
         raise Refused(f"{log}: exists already, and a log never overwrites anything; choose another name")
+    from experiments.lockstep import simulate as lock_step
     from lbmpc.plants import PlantError
     from run_log.errors import LogError
     from run_log.summary import summarise
     from tandem import figures
     from tandem.checks import plant_of
-    from experiments.lockstep import simulate as lock_step
 
     plant_of(config)
     console = terminal.console(as_json)
@@ -123,7 +123,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
 def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: bool) -> int:
     """0 when every command and keyframe is equal, 1 when one differs."""
-    with _log_packages():
+    with log_packages():
         from run_log.errors import LogError
         from run_log.reader import read_run
         from run_log.replay import replay as replay_run
@@ -160,7 +160,7 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
 
 def report(file: Path, folder: Path | None, as_json: bool) -> int:
     """Pictures beside the log or in `folder`, and a table."""
-    with _log_packages():
+    with log_packages():
         from run_log import report as pictures
         from run_log.errors import LogError
         from run_log.reader import read_run
@@ -187,7 +187,7 @@ def report(file: Path, folder: Path | None, as_json: bool) -> int:
 
 def recover(file: Path, output: Path | None, as_json: bool) -> int:
     """A whole log beside the one that was cut short."""
-    with _log_packages():
+    with log_packages():
         from run_log.errors import LogError
         from run_log.recover import recover as make_whole
 
@@ -239,12 +239,17 @@ def progress_bar(console: Console) -> Progress:
     )
 
 
-class _log_packages:
+class log_packages:
     """Says how to install what reading and writing logs needs, where it is missing."""
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: Any, error: BaseException | None, at: Any) -> None:
-        if isinstance(error, ModuleNotFoundError) and error.name in ("mcap", "zstandard", "matplotlib"):
+        if isinstance(error, ModuleNotFoundError) and error.name in (
+            "mcap",
+            "zstandard",
+            "matplotlib",
+            "jinja2",
+        ):
             raise Refused(f"logs need {error.name}: pip install 'tandem-control[log]'") from error

@@ -65,6 +65,8 @@ class Plant:
     poles: tuple[complex, ...] | None = None
     """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
     positive: tuple[Domain, ...] = ()
+    names: Mapping[str, str] = field(default_factory=dict)
+    """What states and inputs are called in a person's words, by name."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """What the equations are built with, by name; empty where they cannot be varied."""
     equations: Callable[..., Rhs] | None = None

@@ -49,6 +49,7 @@ MOORE_GREITZER = Plant(
     inputs=("u",),
     units={"z": "1", "y": "1", "r": "1", "rdot": "1/s", "u": "1", "t": "s"},
     rhs=equations(**PARAMETERS),
+    names={"z": "mass flow z", "y": "pressure rise y", "r": "throttle opening r", "u": "throttle command u"},
     parameters=PARAMETERS,
     equations=equations,
     x_e=np.array([0.5, 1.6875, R_E, 0.0]),
