@@ -372,6 +372,9 @@ def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) 
     # The window is what a keyframe would miss.
     thawed = run.entries(topics.KEYFRAME)[2].message
     assert "oracle.past" in thawed.arrays
+    # In a run without a gap the windows of the samples slide over the samples.
+    for before, after in itertools.pairwise(run.samples):
+        assert after.past == [*before.past[1:], before.x + before.u]
 
 
 @pytest.mark.parametrize("name", ["rnn", "cnn"])
