@@ -34,7 +34,7 @@ class Way:
 
 
 def find_way(model: Model, start: np.ndarray, goal: Body) -> Way | None:
-    """From `start`, (d,), into `goal`: the shortest of `LENGTHS` with enough room, else the roomiest; None: none found."""
+    """From `start`, (d,), into `goal`: the shortest of `LENGTHS` with enough room, else the roomiest, or None."""
     best = None
     for steps in LENGTHS:
         way = _of_length(model, start, goal, steps)
@@ -51,7 +51,7 @@ def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Way |
     low, high = plant.x_min - plant.x_e, plant.x_max - plant.x_e
     u_low, u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
     spare = 0.02 * (u_high - u_low)
-    move = _one_period(model)
+    move = one_period(model)
     opti = ca.Opti()
     x, u, room = opti.variable(model.d, steps + 1), opti.variable(model.m, steps), opti.variable()
     opti.subject_to(x[:, 0] == start)
@@ -77,7 +77,7 @@ def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Way |
     return Way(xs, np.asarray(found.value(u)).reshape(model.m, -1).T, float(found.value(room)))
 
 
-def _one_period(model: Model) -> ca.Function:
+def one_period(model: Model) -> ca.Function:
     """(x, u), deviations -> x after one period, (d,)."""
     plant = model.plant
     f = plant.function()

@@ -178,7 +178,7 @@ def _best_single(base: np.ndarray, slope: np.ndarray, low: float, high: float) -
 
 
 def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Balls in the maximum norm, points (k, d) and radii (k,), around all vertices of a set a little wider than G x <= g.
+    """Balls in the maximum norm, points (k, d) and radii (k,), around all vertices of a slightly wider set.
 
     Raises:
         Refuted: the vertices cannot be confirmed to be all.

@@ -41,8 +41,8 @@ def construct(
 
     Args:
         model: what they are for.
-        kind: `given` takes W as it is; `box` and `hull` bound h over X x U rigorously; `regions` adds to the set of `hull`
-            sets around a way from `start` into it, with h bounded locally.
+        kind: `given` takes W as it is; `box` and `hull` bound h over X x U rigorously; `regions` adds to the set of
+            `hull` sets around a way from `start` into it, with h bounded locally.
         start: a state that should be in the sets, (d,), deviation.
         W: half-widths (d,) for `given`; the plant's own by default.
         slack, patience: as for `control_invariant.iterate`.
@@ -92,7 +92,8 @@ def _invariant(
     stage = _thaw(saved["stage"], X) if "stage" in saved else None
     first = None
     if stage is None or not stage.invariant:
-        for stage in iterate(X, plant, slack, patience, stage):
+        for found in iterate(X, plant, slack, patience, stage):
+            stage = found
             if stage.invariant or stage.step % SAVE_EVERY == 0:
                 saved["stage"] = _freeze(stage)
             # The excess falls roughly by the same factor at each step, down to the slack.
@@ -157,7 +158,7 @@ def volume_fraction(certificate: Certificate, samples: int = 20_000, seed: int =
     bodies = [body(np.array(p.G), np.array(p.g), p.name, half) for p in certificate.pieces]
     total, rng = bodies[0].volume, np.random.default_rng(seed)
     for i, piece in enumerate(bodies[1:], start=1):
-        inside = _points_in(piece, max(100, samples // len(bodies)), rng)
+        inside = points_in(piece, max(100, samples // len(bodies)), rng)
         known = np.zeros(len(inside), dtype=bool)
         for earlier in bodies[:i]:
             known |= earlier.contains(inside)
@@ -165,7 +166,7 @@ def volume_fraction(certificate: Certificate, samples: int = 20_000, seed: int =
     return float(total / np.prod(high - low))
 
 
-def _points_in(piece: Body, count: int, rng: np.random.Generator) -> np.ndarray:
+def points_in(piece: Body, count: int, rng: np.random.Generator) -> np.ndarray:
     """Uniform points inside, (count, d), out of a box around."""
     low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
     found = np.zeros((0, piece.dimension))

@@ -49,6 +49,17 @@ class Supported(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Hull:
+    """The convex hull of points (k, d)."""
+
+    points: np.ndarray
+
+    def support(self, directions: np.ndarray) -> np.ndarray:
+        """max f' x over the points for each row f of directions (r, d); (r,)."""
+        return np.asarray((directions @ self.points.T).max(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """A bounded set {x : G x <= g} with an inside: G is (r, d), g (r,). Its rows may be redundant.
 
