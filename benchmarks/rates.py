@@ -1,0 +1,173 @@
+"""How punctual the live loop is at one rate after the other, and the machine beside it at the same time.
+
+    python -m benchmarks.rates --document docs/rates.md
+
+For each rate and solver mode `tandem run` goes on for a while, with its trainer, recorder and live view. Beside it runs
+the empty loop of `benchmarks.wakeups`, one priority above: nothing of Tandem delays it, so what is late there is late
+because of the machine. Late is what the configuration calls late: begun later than a fifth of a period after its slot,
+or ended after its period; a slot that was skipped counts too.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from benchmarks import machine
+from node_runtime.choices import SolverMode
+from node_runtime.config import Config
+from run_log.errors import LogError
+from run_log.reader import read_run
+from run_log.summary import Spread, summarise
+
+BEGIN, END = "<!-- rates: begin, written by `python -m benchmarks.rates` -->", "<!-- rates: end -->"
+COLUMNS = (
+    "rate, Hz",
+    "solver",
+    "ticks",
+    "on time, %",
+    "late",
+    "skipped",
+    "empty loop on time, %",
+    "tick p50 / p99, ms",
+    "solve p50 / p99, ms",
+    "constraint violations",
+    "replay",
+)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Rates and modes, and how long each of them runs."""
+
+    rates: tuple[int, ...] = (20, 100, 200, 500, 1000)
+    """Samples a second."""
+    modes: tuple[SolverMode, ...] = ("converged", "real_time")
+    seconds: float = 20.0
+    horizon: int = 20
+    set: list[str] = field(default_factory=list)
+    """More section.key=value for `tandem run`."""
+    document: Path | None = None
+    """Where the table goes between its two marks."""
+
+
+def main(settings: Rates) -> int:
+    """Measure, print a Markdown table, and put it into the document where one is given."""
+    text = "" if settings.document is None else settings.document.read_text(encoding="utf-8")
+    if settings.document is not None and not (BEGIN in text and END in text):
+        sys.stderr.write(
+            f"{settings.document}: the table goes between two lines that it lacks: {BEGIN} and {END}\n"
+        )
+        return 2
+    table = "\n".join(_table(settings))
+    if settings.document is not None:
+        before, rest = text.split(BEGIN, 1)
+        after = rest.split(END, 1)[1]
+        settings.document.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{after}", encoding="utf-8")
+    return 0
+
+
+def _table(settings: Rates) -> Iterator[str]:
+    facts = machine.describe()
+    command = shlex.join(["python", "-m", "benchmarks.rates", *sys.argv[1:]])
+    overrides = " ".join(f"--set {override}" for override in _overrides(settings, "SOLVER"))
+    run = f"tandem run --rate RATE --seconds {settings.seconds:g} {overrides}"
+    head = [
+        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}. Each row is `{run}`.",
+        "",
+        f"| {' | '.join(COLUMNS)} |",
+        f"| {' | '.join(['---:'] * len(COLUMNS))} |",
+    ]
+    for line in head:
+        yield _said(line)
+    for rate in settings.rates:
+        for mode in settings.modes:
+            with tempfile.TemporaryDirectory() as folder:
+                yield _said(f"| {' | '.join(_row(settings, rate, mode, Path(folder) / 'run.mcap'))} |")
+    for line in ("", f"Load of the machine at the end: {machine.load():.1f}."):
+        yield _said(line)
+
+
+def _said(line: str) -> str:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+    return line
+
+
+def _overrides(settings: Rates, mode: str) -> list[str]:
+    return [f"controller.horizon={settings.horizon}", f"controller.solver.mode={mode}", *settings.set]
+
+
+def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
+    arguments = ["run", "--json", "--rate", str(rate), "--seconds", str(settings.seconds), "--log", str(log)]
+    for override in _overrides(settings, mode):
+        arguments += ["--set", override]
+    running = _tandem(*arguments)
+    empty = _beside(rate, settings.seconds, running)
+    running.communicate()
+    try:
+        ran = read_run(log)
+        found = summarise(ran)
+    except LogError as error:
+        return [str(rate), mode, f"no figures: {error}", *[""] * (len(COLUMNS) - 3)]
+    slots = found.ticks + found.skipped_slots
+    on_time = 100.0 * (1.0 - (found.late_ticks + found.skipped_slots) / slots)
+    return [
+        str(rate),
+        mode,
+        str(found.ticks),
+        f"{on_time:.2f}",
+        str(found.late_ticks),
+        str(found.skipped_slots),
+        "" if empty is None else f"{100.0 - empty['off_percent']:.2f}",
+        _spread(found.tick_ms),
+        _spread(found.solve_ms),
+        str(found.constraint_violations),
+        _replayed(log),
+    ]
+
+
+def _beside(rate: int, seconds: float, running: subprocess.Popen[str]) -> dict[str, Any] | None:
+    """The empty loop's figures from the middle of the run; None when it did not run."""
+    # Processes need some seconds to start; the loop waits here for the controller's first tick, not for the clock.
+    assert running.stderr is not None
+    for line in running.stderr:
+        if "the run begins" in line:
+            break
+    module = ["-m", "benchmarks.wakeups", "--rate", str(rate), "--seconds", str(0.8 * seconds)]
+    priority = ["--priority", str(Config().realtime.priority + 1)]
+    done = subprocess.run([sys.executable, *module, *priority], capture_output=True, text=True, check=False)
+    found: dict[str, Any] | None = json.loads(done.stdout) if done.returncode == 0 else None
+    return found
+
+
+def _replayed(log: Path) -> str:
+    replay = _tandem("replay", str(log))
+    replay.communicate()
+    return "exact" if replay.returncode == 0 else "DIFFERS"
+
+
+def _tandem(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tandem", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _spread(spread: Spread | None) -> str:
+    return "" if spread is None else f"{spread.p50:.2f} / {spread.p99:.2f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Rates)))
