@@ -54,7 +54,9 @@ def test_volume_and_vertices_of_a_simplex_and_a_cross_polytope() -> None:
 
 
 def test_the_chebyshev_centre_of_a_triangle_is_its_incentre() -> None:
-    triangle = body(np.array([[-1.0, 0], [0, -1.0], [3.0, 4.0]]), np.array([0.0, 0.0, 12.0]), scale=np.ones(2))
+    triangle = body(
+        np.array([[-1.0, 0], [0, -1.0], [3.0, 4.0]]), np.array([0.0, 0.0, 12.0]), scale=np.ones(2)
+    )
     assert triangle.centre == pytest.approx([1.0, 1.0])
     assert triangle.radius == pytest.approx(1.0)
 
@@ -71,12 +73,14 @@ def test_units_far_apart_do_no_harm() -> None:
 def test_redundant_rows_go_and_the_set_stays() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
-    many = body(np.vstack([directions, np.eye(3), -np.eye(3)]), np.append(rng.uniform(0.5, 9, 200), np.ones(6)))
+    many = body(
+        np.vstack([directions, np.eye(3), -np.eye(3)]), np.append(rng.uniform(0.5, 9, 200), np.ones(6))
+    )
     few = many.reduced()
     assert len(few.g) < 60
     for row, bound in zip(few.G, few.g, strict=True):
         # Each row that is left cuts something off.
-        others = ~(few.G == row).all(axis=1)
+        others = ~(row == few.G).all(axis=1)
         reach = linprog(-row, few.G[others], few.g[others], bounds=(None, None), method="highs")
         assert reach.status == 3 or -reach.fun > bound
     points = rng.uniform(-1, 1, (3000, 3))
@@ -85,7 +89,10 @@ def test_redundant_rows_go_and_the_set_stays() -> None:
 
 def test_eliminating_variables_is_projecting() -> None:
     rng = np.random.default_rng(1)
-    G, g = np.vstack([rng.normal(size=(30, 4)), np.eye(4), -np.eye(4)]), np.append(rng.uniform(0.2, 1, 30), np.ones(8))
+    G, g = (
+        np.vstack([rng.normal(size=(30, 4)), np.eye(4), -np.eye(4)]),
+        np.append(rng.uniform(0.2, 1, 30), np.ones(8)),
+    )
     projected = body(*eliminate(G, g, 2))
     for x in rng.uniform(-1, 1, (200, 2)):
         found = linprog(np.zeros(2), G[:, 2:], g - G[:, :2] @ x, bounds=(None, None), method="highs")
@@ -111,8 +118,18 @@ def test_image_and_preimage_undo_each_other_and_the_difference_is_exact() -> Non
     [
         ([[1.0], [-1.0]], [1.0, -2.0], EmptySetError, "empty"),
         ([[1.0, 0], [-1.0, 0], [0, 1.0]], [1.0, 1.0, 1.0], UnboundedSetError, "unbounded in variable 1"),
-        ([[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]], [1.0, 1.0, 3.0, -3.0], FlatSetError, "variable 1 only ever is 3"),
-        ([[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]], [1.0, 1.0, 1e14, 1e14], BadlyScaledError, "use other units"),
+        (
+            [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],
+            [1.0, 1.0, 3.0, -3.0],
+            FlatSetError,
+            "variable 1 only ever is 3",
+        ),
+        (
+            [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],
+            [1.0, 1.0, 1e14, 1e14],
+            BadlyScaledError,
+            "use other units",
+        ),
         ([[0.0], [1.0], [-1.0]], [-1.0, 1.0, 1.0], EmptySetError, "asks for 0 <= -1"),
     ],
 )
@@ -139,7 +156,9 @@ def test_one_unstable_state_in_closed_form() -> None:
 def test_the_textbook_example_of_two_states() -> None:
     # Borrelli, Bemporad and Morari (2017), Example 10.6: the maximal control invariant set of this system is
     # {|x_2| <= 4, |0.55 x_1 - 0.83 x_2| <= 2.22}.
-    plant = Uncertain(np.array([[1.5, 0.0], [1.0, -1.5]]), np.array([[1.0], [0.0]]), corners([0, 0]), cube([5.0]))
+    plant = Uncertain(
+        np.array([[1.5, 0.0], [1.0, -1.5]]), np.array([[1.0], [0.0]]), corners([0, 0]), cube([5.0])
+    )
     found = maximal(cube([10.0, 10.0]), plant, 1e-6)
     published = body(np.array([[0, 1.0], [0, -1.0], [1, -1.5], [-1, 1.5]]), np.full(4, 4.0))
     assert found.volume == pytest.approx(published.volume, rel=1e-3)
@@ -158,14 +177,16 @@ def test_three_decoupled_states_and_inputs_are_a_product_of_intervals() -> None:
 
 def test_a_slow_iteration_ends_all_the_same_with_a_smaller_certified_set() -> None:
     plant = Uncertain(np.array([[1.01]]), np.array([[1.0]]), corners([0.001]), cube([0.005]))
-    *_, last = iterate(body_of(cube([1.0])), plant, 1e-9, patience=5)
+    *_, last = iterate(body_of(cube([1.0])), plant, 1e-6, patience=5)
     assert last.invariant
-    assert last.step < 40
-    assert 0.05 < last.set.vertices.max() <= 0.4 + 1e-9
+    assert last.step == 6
+    assert 0.3 < last.set.vertices.max() <= 0.4
 
 
 def test_an_interrupted_iteration_goes_on_to_the_same_set() -> None:
-    plant = Uncertain(np.array([[1.0, 0.1], [0.0, 1.2]]), np.array([[0.0], [1.0]]), corners([0.01, 0.01]), cube([0.2]))
+    plant = Uncertain(
+        np.array([[1.0, 0.1], [0.0, 1.2]]), np.array([[0.0], [1.0]]), corners([0.01, 0.01]), cube([0.2])
+    )
     X = body_of(cube([1.0, 1.0]))
     stages = list(iterate(X, plant, 1e-4))
     assert len(stages) > 4

@@ -111,15 +111,16 @@ def _freeze(stage: Stage) -> dict[str, np.ndarray]:
     return {
         "G": stage.set.G,
         "g": stage.set.g,
-        "at": np.array([stage.step, stage.excess, stage.slack]),
+        "centre": stage.set.centre,
+        "at": np.array([stage.step, stage.excess, stage.slack, stage.set.radius]),
     }
 
 
 def _thaw(arrays: dict[str, np.ndarray], X: Body) -> Stage:
-    step, excess, slack = arrays["at"]
-    return Stage(
-        int(step), body(arrays["G"], arrays["g"], "the saved set", X.scale), float(excess), float(slack)
-    )
+    step, excess, slack, radius = arrays["at"]
+    # The very same numbers: an interrupted construction ends with the same set as one that was not.
+    again = Body(arrays["G"], arrays["g"], X.scale, arrays["centre"], float(radius))
+    return Stage(int(step), again, float(excess), float(slack))
 
 
 def _certificate(

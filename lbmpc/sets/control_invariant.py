@@ -18,7 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbmpc.sets.operations import Body, Supported, body, eliminate
-from lbmpc.sets.polytope import EmptySetError, Polytope
+from lbmpc.sets.polytope import EmptySetError, Polytope, SetError
+
+LEFT = 0.05
+SHARES = tuple(np.arange(0.95, 0.0, -0.05).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,8 @@ class Stage:
 
     @property
     def invariant(self) -> bool:
-        return self.excess <= 0.0
+        """With something left for the rounding of whoever checks it."""
+        return self.excess <= -LEFT * self.slack
 
 
 def predecessor(
@@ -70,12 +74,13 @@ def iterate(
     Args:
         X: the states allowed.
         slack: eps, as a share of X's half-widths. A larger one ends sooner, with a smaller set.
-        patience: steps after which eps doubles at each step, so that an iteration that converges too slowly still ends
-            with a certified set, if a smaller one.
+        patience: steps after which a smaller copy of the set reached is looked for that is invariant, so that an
+            iteration that converges too slowly still ends with a certified set.
         start: a stage to go on from, after an interruption.
 
     Raises:
         EmptySetError: nothing is left; names the step.
+        SetError: out of patience, and no smaller copy is invariant.
     """
     current, first = (X.reduced(), 0) if start is None else (start.set, start.step)
     eps = slack if start is None else start.slack
@@ -83,7 +88,8 @@ def iterate(
     while True:
         step += 1
         if step > patience:
-            eps *= 2.0
+            yield Stage(step, _smaller_copy(current, plant, eps, X.scale, patience), -eps, eps)
+            return
         G, g = predecessor(current, plant, eps, X.scale)
         try:
             new = body(
@@ -103,6 +109,22 @@ def iterate(
         if stage.invariant:
             return
         current = new
+
+
+def _smaller_copy(current: Body, plant: Uncertain, eps: float, scale: np.ndarray, patience: int) -> Body:
+    """The largest of some copies of a set, shrunk about the equilibrium, that is invariant for W + eps S."""
+    for share in SHARES:
+        try:
+            copy = body(current.G, share * current.g, "a smaller copy", scale)
+            before = body(*predecessor(copy, plant, eps, scale), "its predecessor", scale)
+        except EmptySetError:
+            continue
+        if before.includes(copy, 0.0):
+            return copy
+    raise SetError(
+        f"the iteration has not converged after {patience} steps, and no smaller copy of the set it reached is "
+        "invariant; allow more steps, or more slack"
+    )
 
 
 def _excess(before: Body, after: Body, eps: float, scale: np.ndarray) -> float:
