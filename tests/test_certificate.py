@@ -17,6 +17,7 @@ from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.problem import build_problem
+from lbmpc.rows import Box
 from lbmpc.sets import check as checker
 from lbmpc.sets.approach import one_period
 from lbmpc.sets.bounds import state_set
@@ -26,6 +27,7 @@ from lbmpc.sets.construct import construct, points_in, volume_fraction
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.operations import body
 from lbmpc.sets.polytope import EmptySetError, SetError
+from lbmpc.solution import Solution, Status
 from lbmpc.solver import Solver
 
 MODEL = pendulum()
@@ -262,3 +264,92 @@ def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
         assert first.upper is not None
         for u in (first.lower, first.upper, np.array([first.lower[0], first.upper[1]])):
             assert base.contains(np.array(move(x, u)).ravel())
+
+
+def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
+    guard, rng = Guard(family), np.random.default_rng(6)
+    bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
+    tight = 0
+    for index, piece in enumerate(family.pieces):
+        A, B = MODEL.A + np.array(piece.slope_x), MODEL.B + np.array(piece.slope_u)
+        target = bodies[piece.target]
+        for x in points_in(bodies[index], 20, rng):
+            first = guard.first_inputs(x)
+            if first.piece != index:
+                # The first piece that holds x decides.
+                assert first.piece < index
+                assert bodies[first.piece].contains(x)
+                continue
+            for u, step in ((first.lower, -1e-6), (first.upper, 1e-6)):
+                assert u is not None
+                after = A @ x + B @ u + np.array(piece.W)
+                assert target.contains(after).all()
+                if piece.u_lower[0] <= u[0] + step <= piece.u_upper[0]:
+                    assert not target.contains(after + B @ np.array([step])).all()
+                    tight += 1
+    assert tight > 10
+
+
+def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(family: Certificate) -> None:
+    problem = build_problem(MODEL, oracle_named("linear", MODEL), 6, "invariant", certificate=family)
+    solver, guard, rng = Solver(problem), problem.guard, np.random.default_rng(7)
+    assert guard is not None
+    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g))
+    reached = set()
+    for x in points_in(base, 20, rng):
+        first = guard.first_inputs(x)
+        assert first.lower is not None
+        assert first.upper is not None
+        for wish in (-50.0, 50.0):
+            found = solver.solve(
+                x, np.zeros(0), np.zeros((6, 1)), ur=np.full((6, 1), wish), first=(first.lower, first.upper)
+            )
+            v = found.v[0, 0]
+            assert first.lower[0] <= v <= first.upper[0]
+            reached |= {"lower"} if v == first.lower[0] else {"upper"} if v == first.upper[0] else set()
+    assert reached == {"lower", "upper"}
+
+
+class Failing:
+    """A solver that finds its first solution and nothing after it."""
+
+    def __init__(self, real: Solver, good: int):
+        self.real, self.good = real, good
+
+    def solve(
+        self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray, *, first: Box | None = None
+    ) -> Solution:
+        self.good -= 1
+        found = self.real.solve(x, theta, warm, first=first)
+        return found if self.good >= 0 else replace(found, status=Status.NUMERICAL)
+
+    def prepare(self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray) -> None: ...
+
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+        raise AssertionError("not in this mode")
+
+
+@pytest.mark.parametrize("good", [0, 1])
+def test_what_is_certified_holds_without_a_solution_too(family: Certificate, good: int) -> None:
+    # A feedback that drives the plant away.
+    model = replace(MODEL, K=-3.0 * MODEL.K)
+    problem = build_problem(model, oracle_named("linear", model), 6, "invariant", certificate=family)
+    rng, clipped = np.random.default_rng(8), 0
+    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g))
+    states = points_in(base, 40, rng)
+    for start, x in zip(states[::2], states[1::2], strict=True):
+        controller = Controller(problem, Failing(Solver(problem), good))
+        state = controller.initial_state(0)
+        if good:
+            state, _ = controller.step(state, observation(start, 0))
+        wanted = state.plan.v[0] if good else np.clip(model.K @ x, -3.0, 3.0)
+        # Far from where the plan was made for: it would lead anywhere.
+        _, result = controller.step(state, observation(x, 1))
+        assert result.mode == ("shifted_plan" if good else "feedback")
+        first = result.first
+        assert first is not None
+        assert first.lower is not None
+        assert first.upper is not None
+        assert first.lower[0] <= result.plan[0, 0] <= first.upper[0]
+        clipped += bool(result.plan[0, 0] != wanted[0])
+    assert clipped
