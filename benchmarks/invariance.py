@@ -109,7 +109,8 @@ def measure(
         "steps": steps,
         "seed": seed,
     }
-    began, kinds = time.perf_counter(), ("worst", "random", "true")
+    began = time.perf_counter()
+    kinds: tuple[Disturbance, ...] = ("worst", "random", "true")
     for kind in kinds:
         x, pieces = crowd.start(states // len(kinds))
         infeasible = left = outside = 0

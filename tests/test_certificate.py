@@ -296,7 +296,7 @@ def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(family:
     assert guard is not None
     base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g))
     reached = set()
-    for x in points_in(base, 20, rng):
+    for x in points_in(base, 60, rng):
         first = guard.first_inputs(x)
         assert first.lower is not None
         assert first.upper is not None
@@ -306,7 +306,8 @@ def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(family:
             )
             v = found.v[0, 0]
             assert first.lower[0] <= v <= first.upper[0]
-            reached |= {"lower"} if v == first.lower[0] else {"upper"} if v == first.upper[0] else set()
+            reached |= {"lower"} if -3.0 < first.lower[0] == v else set()
+            reached |= {"upper"} if v == first.upper[0] < 3.0 else set()
     assert reached == {"lower", "upper"}
 
 
