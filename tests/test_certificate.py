@@ -290,25 +290,19 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
     assert tight > 10
 
 
-def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(family: Certificate) -> None:
-    problem = build_problem(MODEL, oracle_named("linear", MODEL), 6, "invariant", certificate=family)
-    solver, guard, rng = Solver(problem), problem.guard, np.random.default_rng(7)
-    assert guard is not None
-    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g))
-    reached = set()
-    for x in points_in(base, 60, rng):
-        first = guard.first_inputs(x)
-        assert first.lower is not None
-        assert first.upper is not None
-        for wish in (-50.0, 50.0):
-            found = solver.solve(
-                x, np.zeros(0), np.zeros((6, 1)), ur=np.full((6, 1), wish), first=(first.lower, first.upper)
-            )
-            v = found.v[0, 0]
-            assert first.lower[0] <= v <= first.upper[0]
-            reached |= {"lower"} if -3.0 < first.lower[0] == v else set()
-            reached |= {"upper"} if v == first.upper[0] < 3.0 else set()
-    assert reached == {"lower", "upper"}
+@pytest.mark.parametrize("wish", [-50.0, 50.0])
+def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(wish: float) -> None:
+    problem = build_problem(MODEL, oracle_named("linear", MODEL), 6)
+    solver, first = Solver(problem), (np.array([-0.5]), np.array([0.2]))
+    x, warm, nothing = np.array([0.01, 0.0]), np.zeros((6, 1)), np.zeros(0)
+    bound = first[0][0] if wish < 0 else first[1][0]
+    references = {"ur": np.full((6, 1), wish)}
+    assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
+    assert solver.solve(x, nothing, warm, **references, first=first).v[0, 0] == bound
+    # The bounds are for one solve only.
+    assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
+    solver.prepare(x, nothing, np.full((6, 1), 0.1))
+    assert first[0][0] <= solver.feedback(np.array([-0.3 * np.sign(wish), 0.0]), first).v[0, 0] <= first[1][0]
 
 
 class Failing:
