@@ -13,6 +13,7 @@ from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOr
 from lbmpc.oracles.dnn import Refit
 from lbmpc.plants import Plant, get_plant
 from lbmpc.problem import build_problem
+from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.polytope import EmptySetError
 from lbmpc.solver import Solver
 from node_runtime.config import Config, ConfigError
@@ -96,12 +97,30 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     )
 
 
-def build_controller(config: Config, realise: Realise | None = None) -> Controller:
-    """Everything a controller is, built once; `realise` may compile its functions. Raises `ConfigError`."""
-    plant = build_plant(config)
+def model_for(config: Config) -> Model:
+    """The nominal model of the configuration's plant at its rate. Raises `ConfigError`."""
+    try:
+        return _model(config, build_plant(config))
+    except ModelError as error:
+        raise ConfigError(f"controller: {error}") from error
+
+
+def build_controller(
+    config: Config, realise: Realise | None = None, certificate: Certificate | None = None
+) -> Controller:
+    """Everything a controller is, built once.
+
+    Args:
+        config: the resolved configuration.
+        realise: may compile the solver's functions.
+        certificate: the sets of the tightening `invariant`.
+
+    Raises:
+        ConfigError: the configuration admits no controller, or the sets are of another model.
+    """
+    model = model_for(config)
     settings = config.controller
     try:
-        model = _model(config, plant)
         problem = build_problem(
             model,
             build_oracle(config, model),
@@ -109,8 +128,9 @@ def build_controller(config: Config, realise: Realise | None = None) -> Controll
             settings.tightening,
             None if settings.W is None else np.array(settings.W, dtype=float),
             settings.solver.penalty,
+            certificate,
         )
-    except (ModelError, EmptySetError) as error:
+    except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
     solver = Solver(problem, chosen.max_iterations, chosen.tolerance, realise or _as_it_is)

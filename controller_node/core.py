@@ -18,8 +18,9 @@ from importlib import metadata
 import msgspec
 import numpy as np
 
-from controller_node.build import build_controller
+from controller_node.build import build_controller, model_for
 from controller_node.compile import Compiler
+from controller_node.sets import CertifiedSets, find_sets
 from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
 from lbmpc.rows import Box
@@ -78,15 +79,19 @@ class ControllerCore:
     Args:
         config: the resolved configuration.
         run_id: stamped on every message; a replay gives the recorded one.
+        sets: the certified sets of the tightening `invariant`; None: found by the configuration.
 
     Raises:
         ConfigError: the configuration admits no controller, and why.
     """
 
-    def __init__(self, config: Config, run_id: str):
+    def __init__(self, config: Config, run_id: str, sets: CertifiedSets | None = None):
         self.config, self.run_id = config, run_id
+        self.sets = None
+        if config.controller.tightening == "invariant":
+            self.sets = find_sets(config, model_for(config)) if sets is None else sets
         compiler = Compiler() if config.controller.solver.compile == "auto" else None
-        self.controller = build_controller(config, compiler)
+        self.controller = build_controller(config, compiler, self.sets.certificate if self.sets else None)
         self.kernels = compiler.note if compiler else "virtual machine, as configured"
         self._timed = self.controller.solver = _Timed(self.controller.solver)
         self.plant = self.controller.model.plant
@@ -155,10 +160,24 @@ class ControllerCore:
             layers=layers,
         )
 
+    def certified_sets(self) -> m.CertifiedSets | None:
+        """The sets in force, for the log; None without any."""
+        if self.sets is None:
+            return None
+        return m.CertifiedSets(
+            run_id=self.run_id,
+            seq=0,
+            kind=self.sets.certificate.kind,
+            sha256=self.sets.sha256,
+            content=self.sets.to_bytes(),
+        )
+
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
         versions = {"python": platform.python_version(), "machine": platform.machine()}
         versions |= {"kernels": self.kernels}
+        if self.sets is not None:
+            versions |= {"certified sets": self.sets.sha256}
         versions |= {name: metadata.version(name) for name in PACKAGES}
         return m.RunInfo(
             run_id=self.run_id,

@@ -96,6 +96,8 @@ class ControllerNode:
         pacer = Pacer(self._grid, stop)
         garbage = GarbageCollection.at(self._period)
         garbage.begin()
+        if (sets := self._core.certified_sets()) is not None:
+            self._bus.publish(topics.SETS, sets)
         self._bus.publish(topics.KEYFRAME, self._core.keyframe(-1))
         while self._find_plant(stop):
             while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:

@@ -121,6 +121,8 @@ class _LockStep:
 
     def run(self, steps: int, progress: Progress | None) -> Outcome:
         self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
+        if (sets := self.core.certified_sets()) is not None:
+            self._note(topics.SETS, sets, 0)
         self._note(topics.KEYFRAME, self.core.keyframe(-1), 0)
         lost, seq = None, -1
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 OracleName = Literal["linear", "l2nw", "dnn", "perfect"]
-TighteningName = Literal["none", "first_step", "tube"]
+TighteningName = Literal["none", "first_step", "tube", "invariant"]
 Strategy = Literal["fifo", "reservoir", "novelty"]
 StartName = Literal["random", "zero", "pretrained"]
 AdoptionName = Literal["keep", "refit"]

@@ -78,6 +78,8 @@ class ControllerConfig(Section, frozen=True):
     horizon: PositiveInt = 60
     oracle: OracleName = "dnn"
     tightening: TighteningName = "first_step"
+    sets: str | None = None
+    """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
     W: list[NonNegative] | None = None
     """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
     Q: list[NonNegative] | None = None

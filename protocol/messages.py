@@ -219,6 +219,15 @@ class Keyframe(Message, frozen=True):
     arrays: dict[str, Array]
 
 
+class CertifiedSets(Message, frozen=True):
+    """The certified sets that a controller keeps its plant in, whole: a replay needs no other file."""
+
+    kind: str
+    sha256: Digest
+    content: bytes
+    """The file of `tandem sets compute`."""
+
+
 class RunInfo(Message, frozen=True):
     """What a log needs to be understood and replayed on its own."""
 

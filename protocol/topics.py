@@ -70,6 +70,7 @@ OUTPUT_WEIGHTS = Topic(
     "controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0
 )
 KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
+SETS = Topic("controller/sets", m.CertifiedSets, "bulk", "controller", WEIGHTS_LIMIT)
 HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
 BATCH = {
     name: Topic(f"{name}/batch", m.Batch, "bulk", name, 4 * WEIGHTS_LIMIT) for name in ("plant", "controller")
@@ -86,6 +87,7 @@ ALL: tuple[Topic, ...] = (
     SAMPLES,
     OUTPUT_WEIGHTS,
     KEYFRAME,
+    SETS,
     HIDDEN_WEIGHTS,
     *BATCH.values(),
     *RUN_INFO.values(),

@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore
+from controller_node.sets import CertifiedSets
+from lbmpc.sets.certificate import CertificateError
 from node_runtime.config import Config, ConfigError, from_json, override
 from node_runtime.health import versions
 from node_runtime.realtime import one_blas_thread
@@ -55,6 +57,7 @@ class _Recorded:
     results: dict[int, Entry[m.TickResult]]
     weights: dict[int, Entry[m.OutputWeights]]
     keyframes: dict[int, Entry[m.Keyframe]]
+    sets: CertifiedSets | None
     complete: bool
     """The log holds the run to its end; if not, its last tick may lack some of its messages."""
 
@@ -156,8 +159,9 @@ def _replay_one(
     progress: Progress | None,
     total: int,
 ) -> None:
+    sets = _sets_for(run, recorded, config)
     try:
-        core = ControllerCore(config, recorded.run_id)
+        core = ControllerCore(config, recorded.run_id, sets)
     except ConfigError as error:
         raise (
             error if changed else LogError(f"{run.path}: its configuration admits no controller: {error}")
@@ -206,6 +210,29 @@ def _begin(
         raise LogError(f"{run.path}: {error}{hint}") from error
 
 
+def _sets_for(run: Run, recorded: _Recorded, config: Config) -> CertifiedSets | None:
+    """The certified sets that were in force; None: there were none, or others are asked for now."""
+    then = recorded.config.controller
+    if config.controller.tightening != "invariant" or config.controller.sets != then.sets:
+        return None
+    if then.tightening == "invariant" and recorded.sets is None:
+        raise LogError(
+            f"{run.path}: the certified sets of {recorded.run_id} are not in the log: its recorder began after the "
+            f"controller{_unreadable(run)}"
+        )
+    return recorded.sets
+
+
+def _recorded_sets(run: Run, run_id: str) -> CertifiedSets | None:
+    for entry in run.entries(topics.SETS):
+        if entry.message.run_id == run_id:
+            try:
+                return CertifiedSets.from_bytes(entry.message.content)
+            except CertificateError as error:
+                raise LogError(f"{run.path}: the certified sets of {run_id}: {error}") from error
+    return None
+
+
 def _collect(run: Run, run_id: str) -> _Recorded:
     def by_tick(topic: Topic) -> dict[int, Entry[Any]]:
         found: dict[int, Entry[Any]] = {}
@@ -234,6 +261,7 @@ def _collect(run: Run, run_id: str) -> _Recorded:
         results=by_tick(topics.RESULT),
         weights=by_tick(topics.OUTPUT_WEIGHTS),
         keyframes=by_tick(topics.KEYFRAME),
+        sets=_recorded_sets(run, run_id),
         # A simulation has no health; a live run that ended says so.
         complete=not (run.truncated or run.recovered) and (not said or "stopping" in said),
     )

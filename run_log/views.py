@@ -115,7 +115,12 @@ def views(plant: Plant) -> dict[str, View]:
             hidden_version=r.hidden_version,
             hidden_sha256=r.hidden_sha256,
             weights_verdict=r.weights_verdict,
+            set_margin=r.set_margin,
+            set_piece=None if r.set_margin is None else r.set_piece,
         )
+
+    def sets(s: m.CertifiedSets) -> Json:
+        return {"kind": s.kind, "sha256": s.sha256}
 
     def samples(s: m.Samples) -> Json:
         if not s.samples:
@@ -196,8 +201,12 @@ def views(plant: Plant) -> dict[str, View]:
                 **weights,
                 "weights_verdict": TEXT,
             },
-            {"x": x, "h": x, "h_hat": x, "prediction_error": NUMBER, "oracle_norms": x},
+            {
+                **{"x": x, "h": x, "h_hat": x, "prediction_error": NUMBER, "oracle_norms": x},
+                **{"set_margin": NUMBER, "set_piece": INTEGER},
+            },
         ),
+        (topics.SETS, sets, {"kind": TEXT, "sha256": TEXT}, {}),
         (
             topics.TIMING,
             timing,

@@ -25,7 +25,7 @@ SILENT_S = 2.0
 TREND_SECONDS = 40
 
 # Of no use here, and large: not even decoded.
-UNSEEN = (topics.KEYFRAME, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
+UNSEEN = (topics.KEYFRAME, topics.SETS, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
 # Nothing is counted over all of these: a fast loop's are looked at now and then.
 ONLY_SHOWN = (topics.PLANT_STATE, topics.COMMAND, topics.TIMING)
 

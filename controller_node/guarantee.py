@@ -1,0 +1,49 @@
+"""What a controller guarantees, and from which states, in words for its start."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller_node.build import model_for
+from controller_node.sets import CertifiedSets, find_sets, start_of
+from lbmpc.sets.guard import Guard
+from node_runtime.config import Config
+
+
+def guarantee(config: Config, sets: CertifiedSets | None = None) -> str:
+    """One sentence or two for the tightening of the configuration.
+
+    Args:
+        config: the resolved configuration.
+        sets: those in force; None: found by the configuration, for `invariant`.
+
+    Raises:
+        ConfigError: `invariant`, and there are no sets for it.
+    """
+    match config.controller.tightening:
+        case "none":
+            return "guaranteed: nothing; the constraints of the nominal prediction are not tightened"
+        case "first_step":
+            return (
+                "guaranteed: the next state is in X for every disturbance in W, from states where the plan keeps its "
+                "first constraint; nothing for the steps after it"
+            )
+        case "tube":
+            return (
+                "guaranteed: X and U for ever, for every disturbance in W, from every state where the problem has a "
+                "solution once; W is taken as given"
+            )
+    model = model_for(config)
+    return _of_sets(find_sets(config, model) if sets is None else sets, start_of(config, model))
+
+
+def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
+    certificate, found = sets.certificate, sets.found
+    count, margin = len(certificate.pieces), Guard(certificate).first_inputs(start).margin
+    inside = f"x0 is inside, {margin:.2g} from the boundary" if margin >= 0 else "x0 is OUTSIDE of them"
+    trust = "W is given, not proved" if certificate.source_of_W == "given" else "W is proved"
+    return (
+        f"guaranteed: X and U for ever, whatever the network says, from every state of {count} certified "
+        f"{'set' if count == 1 else 'sets'} ({certificate.kind}, {100 * found.volume_fraction:.1f} % of X, margin "
+        f"{found.invariance_margin:.2g}, sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
+    )
