@@ -24,11 +24,11 @@ from lbmpc.sets.disturbance import DisturbanceBound, Region, bound_affine
 from lbmpc.sets.operations import Body, body, body_of
 from lbmpc.sets.polytope import EmptySetError, Polytope, SetError
 
-REMAINDERS = (4e-3, 2e-3, 1e-3, 5e-4)
+REMAINDERS = (1e-3, 5e-4)
 """What a cell's W may be, as a share of X's half-widths, tried in turn."""
 SPARE = 2e-5
 """How much each step promises beyond W, as a share of X's half-widths: room for the checker's rounding."""
-LARGEST = 0.8
+LARGEST = 0.4
 """A cell's half-width at most, as a share of that of X and U."""
 
 
