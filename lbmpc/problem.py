@@ -81,6 +81,10 @@ def build_problem(
                 "the tightening `invariant` needs certified sets: tandem sets compute makes them"
             )
         require_match(certificate, model)
+        if not certificate.certified:
+            raise CertificateError(
+                f"these sets are an approximation ({certificate.kind}) that claims nothing"
+            )
         guard = Guard(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
     n = horizon

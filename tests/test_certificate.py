@@ -233,6 +233,17 @@ def test_outside_it_says_so_and_finds_back(family: Certificate) -> None:
     assert abs(x[0]) < 0.2
 
 
+def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family: Certificate) -> None:
+    approximation = construct(MODEL, "extension", START)
+    assert volume_fraction(approximation) > volume_fraction(family)
+    verdict = check(approximation)
+    assert not verdict.ok
+    assert "claims nothing" in verdict.reason
+    assert "no input found" in check(msgspec.structs.replace(approximation, certified=True)).reason
+    with pytest.raises(CertificateError, match="claims nothing"):
+        build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant", certificate=approximation)
+
+
 def test_without_sets_there_is_no_invariant_tightening() -> None:
     with pytest.raises(CertificateError, match="tandem sets compute"):
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant")

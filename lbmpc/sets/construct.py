@@ -10,12 +10,12 @@ import numpy as np
 from lbmpc.model import Model
 from lbmpc.sets.bounds import input_set, state_set
 from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
-from lbmpc.sets.control_invariant import Stage, Uncertain, iterate
+from lbmpc.sets.control_invariant import Stage, Uncertain, iterate, predecessor
 from lbmpc.sets.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
 from lbmpc.sets.operations import Body, body, body_of
 from lbmpc.sets.regions import Link, chain
 
-Wanted = Literal["given", "box", "hull", "regions"]
+Wanted = Literal["given", "box", "hull", "regions", "extension"]
 Saved = MutableMapping[str, dict[str, np.ndarray]]
 """Where work is kept, so that an interrupted construction goes on: arrays by name."""
 Report = Callable[[str, float], None]
@@ -42,7 +42,8 @@ def construct(
     Args:
         model: what they are for.
         kind: `given` takes W as it is; `box` and `hull` bound h over X x U rigorously; `regions` adds to the set of
-            `hull` sets around a way from `start` into it, with h bounded locally.
+            `hull` sets around a way from `start` into it, with h bounded locally; `extension` is the approximation that
+            the paper follows (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X: it claims nothing.
         start: a state that should be in the sets, (d,), deviation.
         W: half-widths (d,) for `given`; the plant's own by default.
         slack, patience: as for `control_invariant.iterate`.
@@ -54,12 +55,22 @@ def construct(
     """
     saved = {} if saved is None else saved
     bound = _bound(model, kind, W, saved, report)
+    if kind == "extension":
+        return _extension(model, bound)
     stage = _invariant(model, bound, slack, patience, saved, report)
     base = stage.set
     links: list[Link] = []
     if kind == "regions" and not base.contains(start).all():
         links = chain(model, start, base, lambda done: report("sets around the way from x0", done))
     return _certificate(model, kind, bound, stage, links, slack)
+
+
+def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
+    X = body_of(state_set(model), "X")
+    G, g = predecessor(X, Uncertain(model.A, model.B, bound, input_set(model)))
+    once = body(np.vstack([X.G, G]), np.concatenate([X.g, g]), "X with its predecessor", X.scale).reduced()
+    pieces = [_piece("X with Pre(X)", once, bound, 0)]
+    return Certificate(FORMAT, "extension", False, model_of(model), pieces, "interval arithmetic", 0.0, 1)
 
 
 def whole(model: Model) -> Region:
