@@ -20,7 +20,6 @@ from node_runtime.config import Config, ConfigError, from_tree
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
 REPEATS = 5
-"""Timed runs of what the picture of the solver's time shows; one of everything else."""
 
 Progress = Callable[[str, int, int], None]
 """Told the stage, what is done and of how many."""
@@ -42,6 +41,7 @@ def run(
     command: str,
     quick: bool = False,
     only: str | None = None,
+    repeats: int = REPEATS,
     progress: Progress = lambda stage, done, total: None,
 ) -> Finished:
     """Run what is missing under `out`, time the solver, write the report and the summary.
@@ -55,6 +55,7 @@ def run(
         command: what the report says it was made with.
         quick: fewer seeds, states and values.
         only: one group instead of all.
+        repeats: timed runs of what the picture of the solver's time shows; one of everything else.
         progress: told how far it is.
 
     Raises:
@@ -64,6 +65,7 @@ def run(
         KeyboardInterrupt: what was finished is kept.
     """
     cases = _chosen(declared, resolve(declared, plant, where, quick), only, where)
+    base = settings(declared, where)
     detailed = {group.name for group in declared.group if group.picture in DETAILED}
     logs = out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
@@ -73,13 +75,14 @@ def run(
     shown = {group.name for group in declared.group if group.picture == "trajectories"}
     timings = time_all(
         cases,
-        lambda case: REPEATS if case.group in shown and not quick else 1,
+        lambda case: repeats if case.group in shown and not quick else 1,
+        declared.steps * base.period,
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )
     found = results.collect(plans, records, timings, plant)
     code = code_version()
-    html = page(declared, found, plant, settings(declared, where), command, code, quick)
+    html = page(declared, found, plant, base, command, code, quick)
     made = Finished(
         out / "report.html",
         out / "summary.json",

@@ -42,17 +42,18 @@ def claims(results: list[CaseResult]) -> list[Claim]:
             ),
             Claim("and below L2NW's", own < others[1], f"{own:.3g} against {others[1]:.3g}"),
         ]
-    higher = int((dnn.values("overshoot") >= l2nw.values("overshoot")).sum())
+    kernel, network = paired(l2nw, dnn, "overshoot")
+    slow, fast = paired(linear, dnn, "settling_step")
     found += [
         Claim(
             "Less overshoot than L2NW, for every seed",
-            higher == 0,
+            bool((network < kernel).all()),
             f"{dnn.median('overshoot'):.2g} in the median, {dnn.values('overshoot').max():.2g} at worst, against "
             f"{l2nw.values('overshoot').min():.2g}",
         ),
         Claim(
             "Faster than linear MPC, for every seed",
-            bool((dnn.values("settling_step") < linear.values("settling_step")).all()),
+            bool((fast < slow).all()),
             f"settles at step {dnn.median('settling_step'):.0f} in the median, {dnn.values('settling_step').max():.0f} "
             f"at worst, against {linear.median('settling_step'):.0f}",
         ),
@@ -63,14 +64,14 @@ def claims(results: list[CaseResult]) -> list[Claim]:
         ),
     ]
     if linear.timing and l2nw.timing and dnn.timing:
-        times = {result.oracle: spread(result.timing) for result in (linear, l2nw, dnn) if result.timing}
+        times = {result.label: spread(result.timing) for result in (linear, l2nw, dnn) if result.timing}
         period = dnn.case.config.period * 1e3
         said = "; ".join(f"{name} {t.p50:.2g} / {t.p99:.2g} ms" for name, t in times.items())
         found.append(
             Claim(
                 "A solve of the network takes less time than one of L2NW and fits in the period",
-                times["dnn"].p50 < times["l2nw"].p50 and times["dnn"].max < period,
-                f"p50 / p99: {said}; period {period:g} ms",
+                times[dnn.label].p50 < times[l2nw.label].p50 and times[dnn.label].p99 < period,
+                f"p50 / p99 of {said}; the period is {period:g} ms",
             )
         )
     return found
@@ -108,9 +109,12 @@ def _differences(result: CaseResult, base: CaseResult) -> list[str]:
         (regret, regret, REGRET * abs(base.median(regret))),
         ("overshoot", "overshoot", OVERSHOOT),
     ):
-        own, other = _paired(result, base, name)
+        own, other = paired(result, base, name)
         if not len(own):
             continue
+        if name == "overshoot":
+            # Below zero there is none, however far below.
+            own, other = np.maximum(own, 0.0), np.maximum(other, 0.0)
         change = float(np.median(own)) - float(np.median(other))
         if not abs(change) > enough:
             continue
@@ -118,8 +122,12 @@ def _differences(result: CaseResult, base: CaseResult) -> list[str]:
         if agree >= CLEAR * len(own):
             more = "more" if change > 0 else "less"
             said.append(
-                f"{more} {word}, {_figure(np.median(own))} against {_figure(np.median(other))} in the median, "
-                f"on {agree} of {len(own)} pairs of runs"
+                f"{more} {word}, {_figure(np.median(own))} against {_figure(np.median(other))} in the median "
+                + (
+                    f"in all {agree} pairs of runs"
+                    if agree == len(own)
+                    else f"in {agree} of {len(own)} pairs of runs"
+                )
             )
     return said
 
@@ -132,7 +140,7 @@ def _kept(result: CaseResult) -> str:
     return f"{sum(record.kept for record in result.records)} of {len(result.records)} runs"
 
 
-def _paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray, np.ndarray]:
+def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The figure of both for every seed and x0 that both have; rows that draw nothing stand for all seeds."""
     keys = [(row.seed, tuple(row.x0)) for row in base.rows]
     own = [(row.seed, tuple(row.x0)) for row in result.rows]

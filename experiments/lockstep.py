@@ -140,9 +140,9 @@ class _LockStep:
     def _step(self, seq: int) -> None:
         started = time.perf_counter()
         t = seq * self.config.period
+        true = self.plant.sample(t)
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.plant.change(self.changes.pop(0)[1])
-        true = self.plant.sample(t)
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = None

@@ -147,7 +147,7 @@ def survival(results: list[CaseResult]) -> list[Picture]:
             marker=look.marker,
             markersize=5,
             linewidth=1.4,
-            label=f"{family_label(members[0])} ({len(members[0].rows)} runs)",
+            label=f"{family_label(members[0])} ({_runs(len(members[0].rows))})",
         )
     # Even steps: the margins crowd at the small end.
     ax.set_xticks(range(len(places)), [f"{place:g}" for place in places])
@@ -160,6 +160,10 @@ def survival(results: list[CaseResult]) -> list[Picture]:
             made, "Share of runs that keep all true constraints, by margin.", "survival by margin and oracle"
         )
     ]
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
 
 
 def by_family(results: list[CaseResult]) -> dict[str, list[CaseResult]]:

@@ -146,13 +146,14 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
                 _number(float(result.values(worst).max())),
                 _number(result.median("overshoot"), 2),
                 _number(float(result.values("overshoot").max()), 2),
-                _number(result.median("settling_step")),
+                _settled(result),
                 _number(result.median("infeasible_ticks")),
                 times,
             ]
         )
     note = (
-        "Cost, regret, overshoot, settling and infeasible ticks are medians over the runs; worst is the worst run. An "
+        "Cost, regret, overshoot, settling and infeasible ticks are medians over the runs; worst is the worst run. A "
+        "negative overshoot is the distance that was never closed. A run settles when z and y stay within 0.02. An "
         "infeasible tick is one whose problem has no solution that keeps all tightened constraints, so that a soft one "
         "gave way. Solve times were measured alone, from the plant's own x0, once for every oracle, horizon, network "
         "and rate."
@@ -174,6 +175,12 @@ def _survival_table(results: list[CaseResult]) -> Table:
     return Table(
         ["oracle", "runs", *(f"{place:g}" for place in places)], body, "Share of the runs kept, by margin."
     )
+
+
+def _settled(result: CaseResult) -> str:
+    """The last sample of a run that is still off is none at which it has settled."""
+    step = result.median("settling_step")
+    return "not in time" if step >= result.case.steps else _number(step)
 
 
 def _number(value: float, digits: int = 3) -> str:

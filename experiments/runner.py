@@ -5,7 +5,6 @@ A run is the same in any process, so neither the number of processes nor an inte
 
 from __future__ import annotations
 
-import hashlib
 import signal
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -19,13 +18,12 @@ import msgspec
 from experiments.declaration import Resolved
 from experiments.faults import Faults
 from experiments.lockstep import follow
-from experiments.plan import Job, RowPlan, code_version
+from experiments.plan import Job, RowPlan
 from experiments.work import Record, read, work, write_whole
 from node_runtime.config import AdaptationConfig, Config, PlantConfig
 
 Progress = Callable[[int, int], None]
 """Told what is done and of how many."""
-TIMED_SECONDS = 10.0
 
 
 class RunnerError(RuntimeError):
@@ -136,7 +134,7 @@ class Timing(msgspec.Struct, frozen=True):
     runs: list[list[float]]
 
 
-def timing_job(case: Resolved, seed: int) -> Job:
+def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
@@ -146,16 +144,23 @@ def timing_job(case: Resolved, seed: int) -> Job:
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
-    steps = round(TIMED_SECONDS * config.rate)
+    steps = round(seconds * config.rate)
     return Job(config=config, steps=steps, faults=Faults())
 
 
 def time_all(
-    cases: list[Resolved], repeats: Callable[[Resolved], int], folder: Path, progress: Progress | None = None
+    cases: list[Resolved],
+    repeats: Callable[[Resolved], int],
+    seconds: float,
+    folder: Path,
+    progress: Progress | None = None,
 ) -> dict[str, Timing]:
-    """Solve times by case name; one process, nothing beside it. Those in `folder` are taken as they are."""
+    """Solve times by case name; one process, nothing beside it. Those in `folder` are taken as they are.
+
+    repeats: runs of a case, at least; seconds: of control in each.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    keys = {case.name: _timing_key(case) for case in cases}
+    keys = {case.name: timing_job(case, 0, seconds).key for case in cases}
     most = {keys[case.name]: 0 for case in cases}
     for case in cases:
         most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
@@ -169,18 +174,13 @@ def time_all(
             except (OSError, msgspec.DecodeError):
                 timing = Timing([])
             while len(timing.runs) < most[key]:
-                times = pool.submit(_time, timing_job(case, len(timing.runs))).result()
+                times = pool.submit(_time, timing_job(case, len(timing.runs), seconds)).result()
                 timing = Timing([*timing.runs, times])
                 write_whole(path, msgspec.json.encode(timing))
             timings[key] = timing
             if progress is not None:
                 progress(done + 1, len(by_key))
     return {case.name: timings[keys[case.name]] for case in cases}
-
-
-def _timing_key(case: Resolved) -> str:
-    job = timing_job(case, 0)
-    return hashlib.sha256(msgspec.json.encode(job) + code_version().encode()).hexdigest()[:24]
 
 
 def _time(job: Job) -> list[float]:

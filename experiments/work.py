@@ -29,12 +29,10 @@ class Traces(msgspec.Struct, frozen=True, kw_only=True):
     """(n - 1, m) commanded."""
     error: list[float | None]
     """(n - 1,) |h_hat - h| of the step that ended at each tick."""
-    solve_ms: list[float]
-    """(n - 1,); depends on the machine and is no result."""
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What one run came to. All but `traces.solve_ms` depends on the job and the code alone."""
+    """What one run came to; it depends on the job and the code alone."""
 
     job: Job
     lost: str | None
@@ -104,7 +102,6 @@ def _traces(run: Run) -> Traces:
         x=x.tolist(),
         u=[result.u for result in run.results],
         error=[result.prediction_error for result in run.results],
-        solve_ms=[timing.solve_ms for timing in run.timings],
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
@@ -360,12 +361,17 @@ def _failing(where: str, origins: Mapping[str, str] | None) -> Fail:
 
 
 def _strict(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
-    _reject_unknown(tree, msgspec.inspect.type_info(kind), fail, "")
+    _reject_unknown(tree, _type_info(kind), fail, "")
     try:
         return msgspec.convert(tree, kind)
     except msgspec.ValidationError as error:
         key, text = config_words.explain(str(error), tree, kind)
         fail(key, text)
+
+
+@cache
+def _type_info(kind: type) -> msgspec.inspect.Type:
+    return msgspec.inspect.type_info(kind)
 
 
 def _reject_unknown(value: Any, kind: msgspec.inspect.Type, fail: Fail, path: str) -> None:

@@ -81,7 +81,9 @@ def run(what: str, out: Path, quick: bool, jobs: int | None, only: str | None, a
             bar.update(tasks[stage], completed=done, total=total)
 
         try:
-            made = experiment.run(declared, str(path), plant, out, processes, command, quick, only, progress)
+            made = experiment.run(
+                declared, str(path), plant, out, processes, command, quick, only, progress=progress
+            )
         except (RunnerError, LogError) as error:
             raise Refused(str(error)) from error
         except OSError as error:
