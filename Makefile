@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate bench test compose-test lint format clean
+.PHONY: help setup run simulate paper bench test compose-test lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -24,6 +24,9 @@ run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
 
 simulate: $(READY)  ## the same in lock-step, faster than real time
 	$(BIN)/tandem simulate $(ARGS)
+
+paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html: about 20 minutes on two cores
+	$(BIN)/tandem experiment paper --out paper $(ARGS)
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/tandem bench solver --document docs/performance.md $(ARGS)
