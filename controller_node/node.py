@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 
 from controller_node.core import ControllerCore, Outputs
+from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
 from node_runtime import clock
 from node_runtime.bus import Bus, OpenInterrupted
@@ -257,6 +258,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         try:
             _check_phase(config)
             core = ControllerCore(config, run_id)
+            log.info("%s", guarantee(config, core.sets))
             with (
                 punctual(config.realtime.priority, keep_awake=config.awake) as note,
                 Bus(config, "controller", run_id, stopping) as bus,

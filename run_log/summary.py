@@ -56,6 +56,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     solve_ms: Spread | None
     tick_ms: Spread | None
     prediction_error: PredictionError
+    outside_ticks: int | None
+    """Ticks in a state outside the certified sets, where nothing is guaranteed; null where none are in force."""
+    smallest_set_margin: float | None
+    """Smallest distance of a tick's state to their boundary, as a share of X's half-widths, negative outside."""
     log: str | None
 
 
@@ -121,6 +125,7 @@ def summarise(run: Run) -> Summary:
     controllers = set(run.controllers)
     ticks = [tick for tick in run.ticks if tick.run_id in controllers]
     results = [r for r in run.results if r.run_id in controllers]
+    margins = [r.set_margin for r in results if r.set_margin is not None]
     timings = [timing for timing in run.timings if timing.run_id in controllers]
     performance = list(plant.performance)
     deviation = motion.x[:, performance] - plant.x_e[performance]
@@ -141,6 +146,8 @@ def summarise(run: Run) -> Summary:
         solve_ms=_spread([timing.solve_ms for timing in timings]),
         tick_ms=_spread([timing.tick_ms for timing in timings]),
         prediction_error=_prediction_error(run.config.period, ticks, results),
+        outside_ticks=sum(margin < 0.0 for margin in margins) if margins else None,
+        smallest_set_margin=min(margins, default=None),
         log=str(run.path) if run.path.name else None,
     )
 

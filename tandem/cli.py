@@ -1,7 +1,8 @@
 """`tandem`: the command line. Every command has `--help`, and `--json` for one JSON object on stdout.
 
 Exit codes: 0 it went well; 1 it did not (a replay differs, a process died); 2 what was asked cannot be done
-(a mistake in the arguments, the configuration or the file); 130 interrupted.
+(a mistake in the arguments, the configuration or the file); 3 there are no such sets, or their certificate does not
+hold; 130 interrupted.
 
 What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and
 the controller no torch.
@@ -12,65 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import Annotated, Any, get_args
 
 import tyro
 from tyro.conf import Positional, Suppress, UseAppendAction, arg, subcommand
 
 from node_runtime.choices import OracleName, ProcessName, TighteningName
-
-if TYPE_CHECKING:
-    from node_runtime.config import Config
-
-FROM_CONFIG = "(default: the configuration's)"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Command:
-    """What every command has."""
-
-    json: bool = False
-    """Print the result as one JSON object on standard output, and nothing else there."""
-
-    def run(self) -> int:
-        """Do it; returns the exit code. Raises `ConfigError` or `Refused` for what cannot be done."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class Configured(Command):
-    """A command that reads a configuration."""
-
-    config: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped values)")
-    ] = None
-    """Configuration in TOML; see configs/compressor.toml."""
-    set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
-    """Change one value of the configuration."""
-
-    def flags(self) -> dict[str, tuple[str, Any]]:
-        """Options that stand for a configuration key: option -> (key, value or None)."""
-        return {}
-
-    def resolve(self) -> tuple[Config, dict[str, Any]]:
-        """The configuration: file, then --set, then the command's options. And the tree as it was given."""
-        from node_runtime.config import ConfigError, apply_override, from_tree, load_tree
-
-        tree = load_tree(self.config)
-        origins = {apply_override(tree, text): f"--set {text}" for text in self.set}
-        for option, (key, value) in self.flags().items():
-            if value is not None:
-                *tables, last = key.split(".")
-                table = tree
-                for name in tables:
-                    table = table.setdefault(name, {})
-                    if not isinstance(table, dict):
-                        raise ConfigError(
-                            f"{self.config}: {name} is a table: write [{name}] and its keys below"
-                        )
-                table[last] = value
-                origins[key] = option
-        return from_tree(tree, str(self.config or "configuration"), origins), tree
+from tandem.cli_base import FROM_CONFIG, Command, Configured
+from tandem.cli_sets import SetsCommand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +68,8 @@ class Simulate(Configured):
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
     """Of everything random; the same seed gives the same run, bit for bit."""
     tightening: Annotated[
-        TighteningName | None, arg(metavar="none|first_step|tube", help_behavior_hint=FROM_CONFIG)
+        TighteningName | None,
+        arg(metavar="none|first_step|tube|invariant", help_behavior_hint=FROM_CONFIG),
     ] = None
     """How the nominal constraints are tightened."""
     adapt_only: bool = False
@@ -351,6 +302,7 @@ AnyCommand = (
     | Annotated[Record, subcommand("record")]
     | Annotated[Health, subcommand("health")]
     | Annotated[Experiment, subcommand("experiment")]
+    | Annotated[SetsCommand, subcommand("sets")]
     | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[ConfigCommand, subcommand("config")]
 )

@@ -23,6 +23,8 @@ KEYS = (
     "solve_ms",
     "tick_ms",
     "prediction_error",
+    "outside_ticks",
+    "smallest_set_margin",
     "log",
 )
 """What programs may count on, in `run` and `simulate` alike."""
@@ -43,10 +45,19 @@ MEANING = {
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
     "prediction_error": "first / last second",
+    "outside_ticks": "outside of the certified sets",
+    "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",
 }
 # Anything but zero is worth a look.
-SHOULD_BE_ZERO = ("late_ticks", "skipped_slots", "weights_refused", "fallback_ticks", "constraint_violations")
+SHOULD_BE_ZERO = (
+    "late_ticks",
+    "skipped_slots",
+    "weights_refused",
+    "fallback_ticks",
+    "constraint_violations",
+    "outside_ticks",
+)
 
 
 def of(summary: Summary) -> dict[str, Any]:

@@ -92,6 +92,11 @@ class Snapshot:
     slack_row: str
     """Which state constraint gives way, as "y at step 3"."""
     soft: int
+    set_margin: float | None
+    """To the boundary of the certified sets, negative outside; None where none are in force, or no state."""
+    set_piece: int
+    outside: int
+    """Ticks outside of them."""
     solve_ms: tuple[float, float] | None
     """p50 and p99 of the recent ticks."""
     tick_ms: tuple[float, float] | None
@@ -147,6 +152,7 @@ class Monitor:
         self._trend_second = 0
         self._first_slot = self._ticks = self._late = self._skipped = self._fallback = self._soft = 0
         self._adopted = self._refused = 0
+        self._outside = self._outside_now = 0
         self._events: deque[Event] = deque(maxlen=200)
         self._new_events: deque[Event] = deque(maxlen=200)
         self._bad_elsewhere: dict[str, int] = {}
@@ -224,6 +230,7 @@ class Monitor:
             self.say(
                 f"tick {result.seq}: the command comes from {result.mode} ({result.status})", now, weight
             )
+        self._take_margin(result, now)
         if result.weights_verdict == "adopted":
             self._adopted += 1
             self.say(f"tick {result.seq}: hidden weights {result.hidden_version} adopted", now, "good")
@@ -233,6 +240,22 @@ class Monitor:
         if result.prediction_error is not None:
             self._errors.append((now, result.prediction_error))
             self._follow_trend(now)
+
+    def _take_margin(self, result: m.TickResult, now: float) -> None:
+        if result.set_margin is None:
+            return
+        if result.set_margin < 0.0:
+            self._outside += 1
+            self._outside_now += 1
+            if self._outside_now == 1:
+                by = f"{-result.set_margin:.2g}"
+                text = f"tick {result.seq}: OUTSIDE the certified sets by {by}: nothing is guaranteed"
+                self.say(text, now, "bad")
+        elif self._outside_now:
+            ticks = "tick" if self._outside_now == 1 else "ticks"
+            text = f"tick {result.seq}: back in the certified sets after {self._outside_now} {ticks}"
+            self._outside_now = 0
+            self.say(text, now, "good")
 
     def _follow_trend(self, now: float) -> None:
         if self.first_command is None:
@@ -311,6 +334,9 @@ class Monitor:
             slack=result.slack if result and result.slack > SOFT else 0.0,
             slack_row=result.slack_row if result else "",
             soft=self._soft,
+            set_margin=result.set_margin if result else None,
+            set_piece=result.set_piece if result else -1,
+            outside=self._outside,
             solve_ms=_percentiles(self._solve_ms),
             tick_ms=_percentiles(self._tick_ms),
             prediction_error=float(np.mean(recent)) if recent else None,

@@ -11,6 +11,7 @@ import msgspec
 from rich.console import Console
 from rich.status import Status
 
+from controller_node.guarantee import guarantee
 from node_runtime.config import Config, to_toml
 from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from run_log import report
@@ -38,9 +39,11 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> 
         raise terminal.Refused(f"--seconds {seconds:g}: less than one period of {config.period:g} s")
     plant = plant_of(config)
     console = terminal.console(as_json)
+    said = guarantee(config)
     with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
         for text in moved:
             console.print(text, style="dim", markup=False, soft_wrap=True)
+        console.print(said, markup=False, soft_wrap=True)
         bus = config.bus if endpoint_given else msgspec.structs.replace(config.bus, endpoint=_free_endpoint())
         log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
         resolved = msgspec.structs.replace(config, bus=bus, log=log)

@@ -13,7 +13,7 @@ from rich.text import Text
 from tandem.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
-FIGURES = 7
+FIGURES = 8
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
@@ -76,9 +76,20 @@ def line(now: Snapshot) -> str:
     if now.prediction_error is not None:
         parts.append(f"error {now.prediction_error:.1e}")
     parts.append(f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused)")
+    if now.set_margin is not None:
+        parts.append(_sets(now)[0])
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
     troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
     return " | ".join(parts + troubled)
+
+
+def _sets(now: Snapshot) -> tuple[str, str]:
+    """Where the state is to the certified sets, in words, and their style."""
+    if now.set_margin is None:
+        return "none in force", "dim"
+    if now.set_margin < 0.0:
+        return f"OUTSIDE the sets by {-now.set_margin:.2g}", "bold red"
+    return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
 
 
 def _panel(title: str, body: RenderableType) -> Panel:
@@ -199,6 +210,7 @@ def _loop(now: Snapshot) -> Table:
                 ),
             ),
             ("slack", slack),
+            ("sets", Text.assemble(_sets(now), "   ", _counted(now.outside, "ticks outside", "bold red"))),
             ("plant", source.get(now.source, now.source or "-")),
         ]
     )

@@ -18,6 +18,7 @@ COMMANDS = (
     "health",
     "config show",
     "bench solver",
+    *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {
     *("ticks", "late_ticks", "weights_adopted", "weights_refused", "fallback_ticks", "soft_ticks"),
@@ -29,6 +30,8 @@ KEYS = {
         "solve_ms",
         "tick_ms",
         "prediction_error",
+        "outside_ticks",
+        "smallest_set_margin",
     ),
     "log",
 }
