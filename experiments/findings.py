@@ -155,20 +155,16 @@ def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray,
 
 
 def survival(results: list[CaseResult]) -> list[str]:
-    """The largest margin up to which every run is saved, for each family."""
+    """How many runs each family keeps at best, up to which margin, and what is left at the largest."""
     said = []
     for members in by_family(results).values():
-        places, whole = margins(members), None
-        for place, member in zip(places, members, strict=True):
-            if member.kept < 1.0:
-                break
-            whole = place
-        none = [place for place, member in zip(places, members, strict=True) if member.kept == 0.0]
-        kept = (
-            "not even the smallest margin is borne by all runs"
-            if whole is None
-            else f"all runs kept up to {whole:g}"
-        )
-        lost = f", none from {none[0]:g} on" if none else ""
-        said.append(f"{family_label(members[0])}: {kept}{lost}.")
+        places, kept = margins(members), [member.kept for member in members]
+        best = max(kept)
+        held = max(place for place, share in zip(places, kept, strict=True) if share == best)
+        text = f"{family_label(members[0])}: at best {best:.0%} of its runs"
+        if best > 0.0:
+            text += f", up to a margin of {held:g}"
+        if held != places[-1]:
+            text += f"; {kept[-1]:.0%} at {places[-1]:g}"
+        said.append(f"{text}.")
     return said

@@ -136,9 +136,10 @@ def survival(results: list[CaseResult]) -> list[Picture]:
     families = by_family(results)
     heads = [members[0] for members in families.values()]
     places: list[float] = []
-    for members, look in zip(families.values(), looks(heads), strict=True):
+    for i, (members, look) in enumerate(zip(families.values(), looks(heads), strict=True)):
         places = margins(members)
-        at = range(len(places))
+        # Side by side, since many lie on each other.
+        at = np.arange(len(places)) + 0.07 * (i - (len(heads) - 1) / 2)
         ax.plot(
             at,
             [100 * member.kept for member in members],
