@@ -43,7 +43,7 @@ def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     inside = f"x0 is inside, {margin:.2g} from the boundary" if margin >= 0 else "x0 is OUTSIDE of them"
     trust = "W is given, not proved" if certificate.source_of_W == "given" else "W is proved"
     return (
-        f"guaranteed: X and U for ever, whatever the network says, from every state of {count} certified "
+        f"guaranteed: X and U at every sample, whatever the network says, if inputs act for whole periods, from every state of {count} certified "
         f"{'set' if count == 1 else 'sets'} ({certificate.kind}, {100 * found.volume_fraction:.1f} % of X, margin "
         f"{found.invariance_margin:.2g}, sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
     )
