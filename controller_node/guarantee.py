@@ -42,8 +42,9 @@ def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     count, margin = len(certificate.pieces), Guard(certificate).first_inputs(start).margin
     inside = f"x0 is inside, {margin:.2g} from the boundary" if margin >= 0 else "x0 is OUTSIDE of them"
     trust = "W is given, not proved" if certificate.source_of_W == "given" else "W is proved"
+    sets_are = f"{count} certified {'set' if count == 1 else 'sets'} ({certificate.kind}, "
+    sets_are += f"{100 * found.volume_fraction:.1f} % of X, margin {found.invariance_margin:.2g}, "
     return (
-        f"guaranteed: X and U at every sample, whatever the network says, if inputs act for whole periods, from every state of {count} certified "
-        f"{'set' if count == 1 else 'sets'} ({certificate.kind}, {100 * found.volume_fraction:.1f} % of X, margin "
-        f"{found.invariance_margin:.2g}, sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
+        "guaranteed: X and U at every sample, whatever the network says, if inputs act for whole periods, from every "
+        f"state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
     )
