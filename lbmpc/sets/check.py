@@ -216,7 +216,9 @@ def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tupl
 def _bases(G: np.ndarray, g: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Which d rows meet in each vertex, (k, d), as Qhull sees it."""
     try:
-        found = HalfspaceIntersection(np.column_stack([G, -g]), inside)
+        # An unbounded set has a vertex at infinity; it is found out below.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = HalfspaceIntersection(np.column_stack([G, -g]), inside)
     except QhullError as error:
         raise Refuted(f"Qhull cannot list its vertices: {str(error).splitlines()[0]}") from error
     if any(len(facet) != G.shape[1] for facet in found.dual_facets):
