@@ -230,7 +230,7 @@ def test_outside_is_said_once_and_so_is_the_way_back(cached: Path):
     assert summarise(ran).outside_ticks == 3
     seen = Monitor(invariant(), PENDULUM, 1.0)
     result = ran.results[0]
-    for seq, margin in enumerate([0.1, -0.2, -0.1, 0.1]):
+    for seq, margin in enumerate([0.1, -0.2, -0.1, 0.1, 0.2]):
         seen._take(msgspec.structs.replace(result, seq=seq, set_margin=margin), float(seq))
     said = [event.text for event in seen.new_events()]
     assert said == [
