@@ -17,6 +17,10 @@ OVERSHOOT = 0.005
 """or those of the overshoot by this much."""
 
 
+ENOUGH = 3
+"""Fewer pairs say nothing."""
+
+
 class Claim(NamedTuple):
     """Something the paper says, and whether the figures agree."""
 
@@ -83,6 +87,8 @@ def compare(results: list[CaseResult], reference: str | None) -> list[str]:
     if not known:
         return []
     base, matter, same, said = known[0], [], [], []
+    if min(len(result.rows) for result in results) < ENOUGH and len(base.rows) < ENOUGH:
+        return [f"Fewer than {ENOUGH} runs of a case do not show what matters."]
     for result in results:
         if result is base:
             continue
