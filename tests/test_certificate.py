@@ -278,7 +278,7 @@ def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
 
 
 def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
-    guard, rng = Guard(family), np.random.default_rng(6)
+    guard, rng = Guard(family, ()), np.random.default_rng(6)
     bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
     tight = 0
     for index, piece in enumerate(family.pieces):
@@ -299,6 +299,29 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
                     assert not target.contains(after + B @ np.array([step])).all()
                     tight += 1
     assert tight > 10
+
+
+def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
+    plain, wary, rng = Guard(family, ()), Guard(family, (0.05,)), np.random.default_rng(9)
+    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
+    tighter = 0
+    for x in np.vstack([points_in(base, 60, rng), 0.97 * base.vertices]):
+        all_, some = plain.first_inputs(x), wary.first_inputs(x)
+        assert all_.lower is not None
+        assert all_.upper is not None
+        assert some.lower is not None
+        assert some.upper is not None
+        assert all_.lower <= some.lower <= some.upper <= all_.upper
+        tighter += bool(some.upper - some.lower < all_.upper - all_.lower)
+    assert tighter
+
+
+def test_a_last_digit_is_no_other_model(family: Certificate) -> None:
+    again = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 3e-16)).tolist())
+    require_match(msgspec.structs.replace(family, model=again), MODEL)
+    other = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 1e-9)).tolist())
+    with pytest.raises(CertificateError, match="A: sha256"):
+        require_match(msgspec.structs.replace(family, model=other), MODEL)
 
 
 @pytest.mark.parametrize("wish", [-50.0, 50.0])

@@ -19,14 +19,18 @@ from lbmpc.sets.certificate import Certificate
 
 # Rounding of a row's value must not put a state outside that was steered onto its facet. Scaled lengths.
 HAIR = 1e-10
+RESERVES = (0.02, 0.005, 0.001)
+"""Distances from the target's boundary, as shares of X's half-widths, that are kept where some input keeps them: the
+claim does not need them, but a command that acts late, or a measurement that is off, is not part of W."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstInputs:
     """What is certified of v_0 in a state.
 
-    `lower` and `upper` (m,) keep the family; None outside of it, where nothing is certified. `margin` is the distance
-    to the nearest facet, as a share of X's half-widths, negative outside. `piece` is the set that x is in, -1 outside.
+    `lower` and `upper` (m,) keep the family, at some distance from its boundary where that can be had; None outside of
+    it, where nothing is certified. `margin` is the distance to the nearest facet, as a share of X's half-widths, negative
+    outside. `piece` is the set that x is in, -1 outside.
     """
 
     lower: np.ndarray | None
@@ -55,11 +59,17 @@ class _Step:
             self._per_up, self._per_down = 1 / slope[self._up], 1 / slope[self._down]
             self._none = slope == 0
 
-    def bounds(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Of v_0, (m,) each; None when there is none."""
+    def bounds(self, x: np.ndarray, reserves: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Of v_0, (m,) each, with the first of the reserves that can be had, or none; None when there are no bounds."""
         room = self.r - self.P @ x
-        if self.Q.shape[1] > 1:
-            return self._box(room)
+        find = self._interval if self.Q.shape[1] == 1 else self._box
+        for reserve in (*reserves, 0.0):
+            found = find(room - reserve)
+            if found is not None:
+                return found
+        return None
+
+    def _interval(self, room: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         high = min(self.high[0], (room[self._up] * self._per_up).min(initial=np.inf))
         low = max(self.low[0], (room[self._down] * self._per_down).max(initial=-np.inf))
         if low > high or (room[self._none] < 0).any():
@@ -87,7 +97,8 @@ class _Step:
 class Guard:
     """A certified family of sets, ready to be asked at every tick."""
 
-    def __init__(self, certificate: Certificate):
+    def __init__(self, certificate: Certificate, reserves: tuple[float, ...] = RESERVES):
+        self._reserves = reserves
         x_lower, x_upper = (np.array(bound) for bound in certificate.model.X)
         self.scale = (x_upper - x_lower) / 2
         self.certificate = certificate
@@ -110,7 +121,7 @@ class Guard:
         margins = self.margins(x)
         best = float(margins.max())
         for index in np.flatnonzero(margins >= 0.0):
-            found = self._steps[index].bounds(x)
+            found = self._steps[index].bounds(x, self._reserves)
             if found is not None:
                 return FirstInputs(*found, best, int(index))
         return FirstInputs(None, None, min(best, -HAIR), -1)
