@@ -17,7 +17,7 @@ import pytest
 from experiments import experiment, findings, results
 from experiments.declaration import Resolved, load, resolve
 from experiments.experiment import Finished
-from experiments.plan import Job, rows
+from experiments.plan import Job, code_version, rows
 from experiments.runner import run_all, wanted
 from experiments.work import Record, read
 from lbmpc.plants import get_plant
@@ -219,6 +219,8 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
 
 
 def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
+    # The other process reads the code anew; so must this one, where somebody edits while tests run.
+    code_version.cache_clear()
     small.write_text(SMALL.replace("steps = 30", "steps = 150"))
     out = tmp_path / "out"
     command = [sys.executable, "-m", "tandem", "experiment", str(small), "--out", str(out), "--jobs", "1"]
