@@ -109,7 +109,7 @@ def hashes(model: ModelOf) -> dict[str, str]:
 
 
 def require_match(certificate: Certificate, model: Model) -> None:
-    """Raise `CertificateError`, naming the parts that differ, unless the certificate is about this model, to rounding."""
+    """Raise `CertificateError`, naming what differs, unless the certificate is about this model, to rounding."""
     mine, its = hashes(model_of(model)), hashes(certificate.model)
     different = [
         name

@@ -28,8 +28,8 @@ claim does not need them, but a command that acts late, or a measurement that is
 class FirstInputs:
     """What is certified of v_0 in a state.
 
-    `lower` and `upper` (m,) keep the family, at some distance from its boundary where that can be had; None outside of
-    it, where nothing is certified. `margin` is the distance to the nearest facet, as a share of X's half-widths, negative
+    `lower` and `upper` (m,) keep the family, at some distance from its boundary where that can be had; None outside,
+    where nothing is certified. `margin` is the distance to the nearest facet, as a share of X's half-widths, negative
     outside. `piece` is the set that x is in, -1 outside.
     """
 
