@@ -8,11 +8,11 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
+from experiments.lockstep import simulate
 from node_runtime.config import load
 from protocol import topics
 from run_log.reader import Run
 from run_log.summary import Summary, summarise
-from experiments.lockstep import simulate
 
 STEPS = 200
 SEEDS = range(10)
