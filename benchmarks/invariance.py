@@ -15,20 +15,21 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 import tyro
 
+from controller_node.sets import read_sets
 from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
 from lbmpc.sets.approach import one_period
-from lbmpc.sets.certificate import Certificate, decode
+from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.construct import points_in
 from lbmpc.sets.guard import HAIR
 from lbmpc.sets.operations import body
+from node_runtime.realtime import one_blas_thread
 
 Disturbance = Literal["worst", "random", "true"]
-CHUNK = 2000
+CHUNK = 500
 
 
 class Crowd:
@@ -40,6 +41,7 @@ class Crowd:
         low, high = (np.array(bound) for bound in certificate.model.X)
         self.half = (high - low) / 2
         self.bodies = [body(np.array(p.G), np.array(p.g), p.name, self.half) for p in certificate.pieces]
+        self.rows = [Rows(certificate, i, model, self.half) for i in range(len(certificate.pieces))]
         self.move = one_period(model)
 
     def start(self, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,29 +68,42 @@ class Crowd:
         return after, reached, infeasible, left
 
     def _step_piece(self, x: np.ndarray, i: int, disturbance: Disturbance) -> tuple[np.ndarray, int, int]:
-        piece = self.certificate.pieces[i]
-        target = self.bodies[piece.target]
-        A, B = self.model.A + np.array(piece.slope_x), self.model.B + np.array(piece.slope_u)
-        W = np.array(piece.W)
-        lengths = np.linalg.norm(target.G * self.half, axis=1)
-        T, t = target.G / lengths[:, None], target.g / lengths
-        room = t - (T @ W.T).max(axis=1) - HAIR - x @ (T @ A).T
-        slope = (T @ B)[:, 0]
-        high = (room[:, slope > 0] / slope[slope > 0]).min(axis=1, initial=piece.u_upper[0])
-        low = (room[:, slope < 0] / slope[slope < 0]).max(axis=1, initial=piece.u_lower[0])
+        piece, rows = self.certificate.pieces[i], self.rows[i]
+        high = np.minimum((rows.high - x @ rows.per_high.T).min(axis=1), piece.u_upper[0])
+        low = np.maximum((rows.low - x @ rows.per_low.T).max(axis=1), piece.u_lower[0])
         infeasible = int((low > high).sum())
         share = self.rng.choice([0.0, 1.0, np.nan], len(x))
         share = np.where(np.isnan(share), self.rng.random(len(x)), share)
         u = (low + share * (high - low))[:, None]
-        after = x @ A.T + u @ B.T
+        after = x @ rows.A.T + u @ rows.B.T
         if disturbance == "true":
             after = np.array(self.move.map(len(x))(x.T, u.T)).T
         elif disturbance == "random":
-            after = after + self.rng.dirichlet(np.full(len(W), 0.2), len(x)) @ W
+            after = after + self.rng.dirichlet(np.full(len(rows.W), 0.2), len(x)) @ rows.W
         else:
-            nearest = np.argmin(t - after @ T.T, axis=1)
-            after = after + W[np.argmax(T[nearest] @ W.T, axis=1)]
-        return after, infeasible, int((~target.contains(after, 0.0)).sum())
+            nearest = np.argmin(rows.t - after @ rows.T.T, axis=1)
+            after = after + rows.W[rows.pushing[nearest]]
+        left = int(((rows.t - after @ rows.T.T).min(axis=1) < 0.0).sum())
+        return after, infeasible, left
+
+
+class Rows:
+    """A piece's target in unit rows T x <= t, and what it asks of u: low - per_low x <= u <= high - per_high x."""
+
+    def __init__(self, certificate: Certificate, index: int, model: Model, half: np.ndarray):
+        piece = certificate.pieces[index]
+        target = certificate.pieces[piece.target]
+        self.A, self.B = model.A + np.array(piece.slope_x), model.B + np.array(piece.slope_u)
+        self.W, T = np.array(piece.W), np.array(target.G)
+        lengths = np.linalg.norm(T * half, axis=1)
+        self.T, self.t = T / lengths[:, None], np.array(target.g) / lengths
+        reach = self.T @ self.W.T
+        self.pushing = np.argmax(reach, axis=1)
+        slope, P = (self.T @ self.B)[:, 0], self.T @ self.A
+        room = self.t - reach.max(axis=1) - HAIR
+        up, down = slope > 0, slope < 0
+        self.high, self.per_high = room[up] / slope[up], P[up] / slope[up, None]
+        self.low, self.per_low = room[down] / slope[down], P[down] / slope[down, None]
 
 
 def measure(
@@ -98,8 +113,7 @@ def measure(
     seed: int = 0,
 ) -> dict[str, float | int | str]:
     """All three disturbances; each on its share of the states."""
-    raw = msgspec.json.decode(file.read_bytes(), type=dict[str, msgspec.Raw])
-    certificate = decode(bytes(raw["certificate"]) if "certificate" in raw else file.read_bytes())
+    certificate = read_sets(file).certificate
     model = build_model(get_plant(certificate.model.plant), certificate.model.period)
     low, high = (np.array(bound) for bound in certificate.model.X)
     crowd = Crowd(certificate, model, seed)
@@ -123,4 +137,6 @@ def measure(
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(tyro.cli(measure, config=(tyro.conf.PositionalRequiredArgs,))) + "\n")
+    # Many small products: threads would only wait for each other.
+    with one_blas_thread():
+        sys.stdout.write(json.dumps(tyro.cli(measure, config=(tyro.conf.PositionalRequiredArgs,))) + "\n")

@@ -26,7 +26,7 @@ from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode
 from lbmpc.sets.certificate import require_match as require_model
 from node_runtime.config import Config, ConfigError
 
-CONSTRUCTION = 1
+CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
 SLACK = 3e-4
 SHIPPED = Path(__file__).resolve().parent.parent / "configs" / "sets"
