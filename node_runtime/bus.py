@@ -82,9 +82,9 @@ class Bus:
         """
         if self._control is not None:
             raise RuntimeError("this bus is open already")
-        control = connect(self.config, self._stop)
+        control = connect(self.config, self._stop, self.process)
         try:
-            self._bulk = connect(self.config, self._stop)
+            self._bulk = connect(self.config, self._stop, self.process)
         except (OpenInterrupted, ConfigError):
             control.close()
             raise

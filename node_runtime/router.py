@@ -7,11 +7,12 @@ import threading
 
 import zenoh
 
-from node_runtime.bus import Bus, OpenInterrupted, session_config
+from node_runtime.bus import Bus, OpenInterrupted
 from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import punctual
+from node_runtime.session import lease_ms, session_config
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +33,7 @@ class Router:
         """Listen. Raises `RouterError` when that is not possible, `ConfigError` when the endpoint is none."""
         bus = self.config.bus
         try:
-            self._session = zenoh.open(session_config("router", bus.endpoint, bus.lease_ms))
+            self._session = zenoh.open(session_config("router", bus.endpoint, lease_ms(self.config, "router")))
         except zenoh.ZError as error:
             if "in use" in str(error):
                 raise RouterError(

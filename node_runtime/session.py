@@ -17,6 +17,11 @@ from node_runtime.config import Config, ConfigError
 
 log = logging.getLogger(__name__)
 
+OBEYING = ("controller", "plant")
+PATIENT_LEASE_MS = 10_000
+"""A reader that is silent for less than this has only been without a core; the messages wait for it meanwhile."""
+GIVE_UP_US = 1_000_000
+"""For as long the router holds everybody's bulk messages back where a reader's link is full; then it cuts that link."""
 ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
 
 
@@ -40,12 +45,14 @@ def session_config(mode: Literal["client", "router"], endpoint: str, lease_ms: i
         "scouting/gossip/enabled": False,
         # Messages above 3 kB vanish without an error where the receiver's memlock limit is small.
         "transport/shared_memory/enabled": False,
-        # A frozen process or a cut link is noticed after the lease; the default is 10 s.
+        # The other end takes the link for cut after this much silence, and all that is on its way here is lost then.
         "transport/link/tx/lease": lease_ms,
         "transport/link/tx/keep_alive": 4,
         # With Zenoh's two places a busy machine loses up to 3 % of the control messages: whatever is put while
         # the sending thread waits for a core. Sixteen small ones are still younger than a period.
         "transport/link/tx/queue/size/real_time": 16,
+        # And with two for the rest, 100 kB, the router waits for a reader that is without a core for a moment.
+        "transport/link/tx/queue/size/data": 16,
     }
     if mode == "client":
         settings |= {
@@ -55,7 +62,12 @@ def session_config(mode: Literal["client", "router"], endpoint: str, lease_ms: i
             "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2.0},
         }
     else:
-        settings |= {"listen/endpoints": [endpoint], "connect/endpoints": [], "listen/exit_on_failure": True}
+        settings |= {
+            "listen/endpoints": [endpoint],
+            "connect/endpoints": [],
+            "listen/exit_on_failure": True,
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": GIVE_UP_US,
+        }
     config = zenoh.Config()
     for key, value in settings.items():
         try:
@@ -65,8 +77,19 @@ def session_config(mode: Literal["client", "router"], endpoint: str, lease_ms: i
     return config
 
 
-def connect(config: Config, stop: threading.Event) -> zenoh.Session:
-    """A client session to the router at `config.bus.endpoint`; waits for the router for ever.
+def lease_ms(config: Config, process: str) -> int:
+    """After how much silence of `process` its link counts as cut.
+
+    Controller and plant obey each other, so a link that they are behind no more is cut soon. A reader gets no core
+    while they need all of them, and to cut its link for that would lose what it should read. Both ends cut: a reader
+    that runs again finds its own clock past the router's lease, so the router's is long too.
+    """
+    short = config.bus.lease_ms
+    return short if process in OBEYING else max(short, PATIENT_LEASE_MS)
+
+
+def connect(config: Config, stop: threading.Event, process: str) -> zenoh.Session:
+    """A client session of `process` to the router at `config.bus.endpoint`; waits for the router for ever.
 
     `zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind.
 
@@ -75,7 +98,7 @@ def connect(config: Config, stop: threading.Event) -> zenoh.Session:
         ConfigError: the endpoint is none.
     """
     endpoint = config.bus.endpoint
-    client = session_config("client", endpoint, config.bus.lease_ms)
+    client = session_config("client", endpoint, lease_ms(config, process))
     result: Future[zenoh.Session] = Future()
 
     def open_session() -> None:

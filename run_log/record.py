@@ -73,7 +73,7 @@ def _record(
     to_unix = time.time_ns() - clock.now_ns()
     flush_s = config.log.flush_ms * 1e-3
     next_flush = clock.now()
-    said: str | None = ""
+    said: tuple[str | None, bool] = ("", False)
     end: float | None = None
     last_arrival = clock.now()
     garbage = GarbageCollection()
@@ -90,24 +90,32 @@ def _record(
         if clock.now() >= next_flush:
             writer.flush()
             next_flush = clock.now() + flush_s
-            if writer.error != said:
+            if (writer.error, bool(writer.lost)) != said:
                 said = _say(writer, health)
 
 
-def _say(writer: LogWriter, health: HealthPublisher) -> str | None:
+def _say(writer: LogWriter, health: HealthPublisher) -> tuple[str | None, bool]:
     error = writer.error
+    note = f"writing {writer.path}"
     if error is None:
-        log.info("writing %s", writer.path)
-        health.set("running", f"writing {writer.path}")
+        log.info("%s", note)
     else:
         log.error("%s; trying again, %d messages dropped so far", error, writer.counters["dropped"])
-        health.set("running", f"NOT LOGGED: {error}")
-    return error
+        note = f"NOT LOGGED: {error}"
+    if writer.lost:
+        log.error("ticks of the controller never arrived here; the log has gaps, and replay names them")
+        note += "; THE LOG HAS GAPS: messages never arrived, see the counter 'lost ticks'"
+    health.set("running", note)
+    return error, bool(writer.lost)
 
 
 def _finish(writer: LogWriter) -> int:
     if writer.last_bad is not None:
         log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
+    if writer.lost:
+        log.error(
+            "%s: %d ticks never arrived here and are not in it", writer.path, writer.counters["lost ticks"]
+        )
     try:
         writer.close()
     except LogError as error:

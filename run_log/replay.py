@@ -20,6 +20,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 from run_log.difference import Difference, first_byte, first_difference
 from run_log.errors import LogError
+from run_log.gaps import stretches
 from run_log.reader import Entry, Run
 
 NAMED = 8
@@ -42,6 +43,8 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     first_tick: int
     """Where the replay began: the tick after a keyframe."""
     run_ids: list[str]
+    lost_ticks: int
+    """Ticks that could not be replayed, or not compared whole: the log lacks them, or the memory they began with."""
     notes: list[str]
     """What a person should know: other versions, changed settings, an incomplete last tick."""
 
@@ -82,8 +85,8 @@ def replay(
         progress: called with (ticks done, ticks in all).
 
     Raises:
-        LogError: ticks, commands, results or keyframes are missing (named), recorded twice, or do not fit the
-            plant; the log's configuration admits no controller.
+        LogError: there is nothing to begin with, messages are recorded twice or do not fit the plant; the log's
+            configuration admits no controller.
         ConfigError: an override cannot be applied.
     """
     recorded = [_collect(run, run_id) for run_id in run.controllers]
@@ -98,14 +101,14 @@ def replay(
             raise LogError(f"{run.path}: there is no tick {from_tick}; the log has {ranges}")
         recorded = inside
     starts = [_start(run, r, from_tick) for r in recorded]
-    for r, start in zip(recorded, starts, strict=True):
-        _refuse_gaps(run, r, start)
     total = sum(r.last - start for r, start in zip(recorded, starts, strict=True))
     comparison = _Comparison()
     for r, start in zip(recorded, starts, strict=True):
         config = override(r.config, list(overrides)) if overrides else r.config
         with one_blas_thread():
             _replay_one(run, r, config, start, bool(overrides), comparison, progress, total)
+    if not comparison.ticks:
+        raise LogError(f"{run.path}: no tick can be replayed: {'; '.join(comparison.gaps)}{_unreadable(run)}")
     return ReplayResult(
         ticks=comparison.ticks,
         equal=comparison.first is None,
@@ -115,7 +118,8 @@ def replay(
         keyframes=comparison.keyframes,
         first_tick=starts[0] + 1,
         run_ids=[r.run_id for r in recorded],
-        notes=_notes(run, recorded, overrides),
+        lost_ticks=comparison.lost,
+        notes=_notes(run, recorded, overrides) + comparison.gaps,
     )
 
 
@@ -128,6 +132,8 @@ class _Comparison:
         self.first: Difference | None = None
         self.differing: set[tuple[str, int]] = set()
         self.largest: float | None = 0.0
+        self.lost = 0
+        self.gaps: list[str] = []
 
     def compare(self, entry: Entry[Any], replayed: m.Message, name: str) -> None:
         payload = codec.encode(replayed)
@@ -166,26 +172,35 @@ def _replay_one(
         raise (
             error if changed else LogError(f"{run.path}: its configuration admits no controller: {error}")
         ) from error
-    _begin(run, recorded, core, start, changed, comparison)
-    for seq in range(start + 1, recorded.last + 1):
-        tick = recorded.ticks[seq].message
-        if tick.state is not None:
-            try:
-                codec.check_dimensions(topics.PLANT_STATE, tick.state, core.plant.d, core.plant.m)
-            except codec.BadMessage as error:
-                raise LogError(f"{run.path}: tick {seq} does not fit the plant: {error}") from error
-        outputs = core.step(tick)
+    for begin, end in _parts(run, recorded, start, comparison):
+        _begin(run, recorded, core, begin, changed, comparison)
+        for seq in range(begin + 1, end + 1):
+            _replay_tick(run, recorded, core, seq, comparison)
+            if progress is not None:
+                progress(comparison.ticks, total)
+
+
+def _replay_tick(
+    run: Run, recorded: _Recorded, core: ControllerCore, seq: int, comparison: _Comparison
+) -> None:
+    tick = recorded.ticks[seq].message
+    if tick.state is not None:
+        try:
+            codec.check_dimensions(topics.PLANT_STATE, tick.state, core.plant.d, core.plant.m)
+        except codec.BadMessage as error:
+            raise LogError(f"{run.path}: tick {seq} does not fit the plant: {error}") from error
+    outputs = core.step(tick)
+    if seq in recorded.commands:
         comparison.compare(recorded.commands[seq], outputs.command, "command")
         comparison.measure(recorded.commands[seq].message, outputs.command)
+    if seq in recorded.results:
         comparison.compare(recorded.results[seq], outputs.result, "result")
-        if seq in recorded.weights and outputs.output_weights is not None:
-            comparison.compare(recorded.weights[seq], outputs.output_weights, "output_weights")
-        if seq in recorded.keyframes:
-            comparison.compare(recorded.keyframes[seq], core.keyframe(seq), "keyframe")
-            comparison.keyframes += 1
-        comparison.ticks += 1
-        if progress is not None:
-            progress(comparison.ticks, total)
+    if seq in recorded.weights and outputs.output_weights is not None:
+        comparison.compare(recorded.weights[seq], outputs.output_weights, "output_weights")
+    if seq in recorded.keyframes:
+        comparison.compare(recorded.keyframes[seq], core.keyframe(seq), "keyframe")
+        comparison.keyframes += 1
+    comparison.ticks += 1
 
 
 def _begin(
@@ -281,28 +296,51 @@ def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
     )
 
 
-def _refuse_gaps(run: Run, recorded: _Recorded, start: int) -> None:
-    expected = range(start + 1, recorded.last + 1)
-    every = recorded.config.controller.keyframe_every
-    end = recorded.last + 1 if recorded.complete else recorded.last
-    keyframes = [seq for seq in range(start + 1, end) if (seq + 1) % every == 0]
-    kinds: list[tuple[str, Sequence[int], dict[int, Any]]] = [
-        ("ticks", expected, recorded.ticks),
-        ("commands", expected, recorded.commands),
-        ("results", expected, recorded.results),
-        ("keyframes", keyframes, recorded.keyframes),
-    ]
-    gaps = []
-    for name, needed, found in kinds:
-        missing = [seq for seq in needed if seq not in found]
-        if missing:
-            more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-            gaps.append(f"{name} {', '.join(map(str, missing[:NAMED]))}{more}")
-    if gaps:
-        raise LogError(
-            f"{run.path}: {recorded.run_id} cannot be replayed, its log has a gap: missing are "
-            f"{'; '.join(gaps)}{_unreadable(run)}"
+def _parts(run: Run, recorded: _Recorded, start: int, comparison: _Comparison) -> list[tuple[int, int]]:
+    """(keyframe, last tick) of every part that can be replayed, and a word on what lies between them.
+
+    A tick that is missing ends a part: what the controller knew after it is known again at the next keyframe.
+    """
+    every, last = recorded.config.controller.keyframe_every, recorded.last
+    missing = [seq for seq in range(start + 1, last + 1) if seq not in recorded.ticks]
+    parts, begin = [], start
+    while (gap := next((seq for seq in missing if seq > begin), None)) is not None:
+        if gap > begin + 1:
+            parts.append((begin, gap - 1))
+        length = next(count for first, count in stretches(missing) if first <= gap < first + count)
+        again = min(
+            (seq for seq in recorded.keyframes if gap < seq < last and seq + 1 in recorded.ticks),
+            default=None,
         )
+        text = f"gap of {length} tick{'s' * (length > 1)} at tick {gap} of {recorded.run_id}: the recorder lost them"
+        comparison.gaps.append(
+            f"{text}; there is no keyframe behind it to go on from{_unreadable(run)}"
+            if again is None
+            else f"{text}; replay goes on at tick {again + 1}, behind the next keyframe{_unreadable(run)}"
+        )
+        comparison.lost += (last if again is None else again) - gap + 1
+        begin = last if again is None else again
+    if begin < last:
+        parts.append((begin, last))
+    end = last + 1 if recorded.complete else last
+    replayed = [seq for first, until in parts for seq in range(first + 1, until + 1)]
+    needed = [seq for seq in replayed if (seq + 1) % every == 0 and seq < end]
+    uncompared: set[int] = set()
+    for name, expected, found in (
+        ("command", replayed, recorded.commands),
+        ("result", replayed, recorded.results),
+        ("keyframe", needed, recorded.keyframes),
+    ):
+        absent = [seq for seq in expected if seq not in found]
+        uncompared.update(absent)
+        if absent:
+            more = f" and {len(absent) - NAMED} more" if len(absent) > NAMED else ""
+            comparison.gaps.append(
+                f"not compared, the recorder lost them: {name} of tick {', '.join(map(str, absent[:NAMED]))}{more} "
+                f"of {recorded.run_id}{_unreadable(run)}"
+            )
+    comparison.lost += len(uncompared)
+    return parts
 
 
 def _unreadable(run: Run) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from lbmpc.plants import Plant, get_plant
 from protocol import messages as m
 from run_log.errors import LogError
+from run_log.gaps import lost_ticks
 from run_log.reader import Run
 
 TOLERANCE = 1e-6
@@ -37,6 +38,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     late_ticks: int
     """Ticks that began late, or ended after their period."""
     skipped_slots: int
+    lost_ticks: int
+    """Ticks of which the log lacks something: it never reached the recorder, and all figures lack it too."""
     weights_adopted: int
     weights_refused: int
     fallback_ticks: int
@@ -134,6 +137,7 @@ def summarise(run: Run) -> Summary:
         ticks=len(ticks),
         late_ticks=_late(run.config.period, ticks, timings),
         skipped_slots=sum(tick.skipped for tick in ticks),
+        lost_ticks=sum(count for _run_id, _first, count in lost_ticks(run)),
         weights_adopted=sum(r.weights_verdict == "adopted" for r in results),
         weights_refused=sum(r.weights_verdict.startswith("refused") for r in results),
         fallback_ticks=sum(r.mode != "solver" for r in results),

@@ -30,6 +30,8 @@ PROFILE = "tandem"
 FORMAT = "1"
 """Of the log: which channels and attachments there are. Rises when an older reader would be misled."""
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
+COUNTED = ("controller/tick", "controller/result")
+"""Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
 MAX_STRANGERS = 100
 """Channels for keys that are in no topic table; whoever makes up more of them is not logged."""
 
@@ -60,16 +62,20 @@ class LogWriter:
         versions: dict[str, str] | None = None,
         patient: bool = False,
     ):
-        self.counters = {"messages": 0, "bytes": 0, "without view": 0, "dropped": 0}
+        self.counters = {"messages": 0, "bytes": 0, "without view": 0, "dropped": 0, "lost ticks": 0}
         self.bad: dict[str, int] = {}
         """Known topics' payloads that are in the log as they came, but have no view: by reason."""
         self.last_bad: str | None = None
+        self.lost: dict[str, int] = {}
+        """By topic, messages that are missing between others: they never arrived here."""
         self._sink = Sink(path, patient=patient)
         self._views = views(plant)
         self._raw: dict[str, int] = {}
         self._shown: dict[str, int] = {}
         self._next_view: dict[str, int] = {}
         """When, in ns, a topic's next view is due; what comes earlier has none."""
+        self._counted: dict[tuple[str, str], int] = {}
+        """The last number of each run on each of the topics `COUNTED`."""
         self._strangers = 0
         self._mcap = Writer(
             self._sink,  # write, tell and flush are all it uses
@@ -135,6 +141,8 @@ class LogWriter:
                         self._next_view[name] = log_time + int(1e9 / topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
+        if message is not None and name in COUNTED:
+            self._count_lost(name, message)
         sequence = max(message.seq, 0) & 0xFFFFFFFF if message is not None else 0
         self._mcap.add_message(channel, log_time, payload, log_time, sequence)
         if view is not None and shown is not None:
@@ -186,6 +194,18 @@ class LogWriter:
             )
             self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
         return self._shown[name]
+
+    def _count_lost(self, name: str, message: Message) -> None:
+        """Ticks whose messages were made and never came here: cut links, full queues, whatever it was."""
+        key = (name, message.run_id)
+        last = self._counted.get(key)
+        if last is None and len(self._counted) >= MAX_STRANGERS:
+            return
+        self._counted[key] = message.seq
+        if last is not None and message.seq > last + 1:
+            missing = message.seq - last - 1
+            self.lost[name] = self.lost.get(name, 0) + missing
+            self.counters["lost ticks"] = max(self.lost.values())
 
     def _count_bad(self, error: codec.BadMessage) -> None:
         key = f"bad {error.topic}: {error.reason}"

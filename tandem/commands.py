@@ -124,7 +124,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
 
 def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: bool) -> int:
-    """0 when every command and keyframe is equal, 1 when one differs."""
+    """0 when every command and keyframe is equal, 1 when one differs or the log lacks some."""
     with log_packages():
         from run_log.errors import LogError
         from run_log.reader import read_run
@@ -142,9 +142,13 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
         raise Refused(str(error)) from error
     if found.equal:
         text = f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
-        console.print(text, style="green", markup=False, soft_wrap=True)
+        console.print(text, style="yellow" if found.lost_ticks else "green", markup=False, soft_wrap=True)
     else:
         console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+    if found.lost_ticks:
+        console.print(
+            f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps", style="bold red"
+        )
     first = found.first_difference
     if first is not None:
         text = (
@@ -157,7 +161,7 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
         console.print(f"note: {note}", style="yellow", markup=False, soft_wrap=True)
     if as_json:
         terminal.emit(msgspec.to_builtins(found))
-    return 0 if found.equal else 1
+    return 0 if found.equal and not found.lost_ticks else 1
 
 
 def report(file: Path, folder: Path | None, as_json: bool) -> int:

@@ -12,6 +12,7 @@ from run_log.summary import Summary
 KEYS = (
     "ticks",
     "late_ticks",
+    "lost_ticks",
     "weights_adopted",
     "weights_refused",
     "fallback_ticks",
@@ -33,6 +34,7 @@ MEANING = {
     "ticks": "control steps",
     "late_ticks": "began later than they may",
     "skipped_slots": "slots without a tick",
+    "lost_ticks": "never reached the recorder",
     "weights_adopted": "sets of hidden weights",
     "weights_refused": "sets of hidden weights",
     "fallback_ticks": "input not from the solver",
@@ -53,6 +55,7 @@ MEANING = {
 SHOULD_BE_ZERO = (
     "late_ticks",
     "skipped_slots",
+    "lost_ticks",
     "weights_refused",
     "fallback_ticks",
     "constraint_violations",
