@@ -33,7 +33,9 @@ class Router:
         """Listen. Raises `RouterError` when that is not possible, `ConfigError` when the endpoint is none."""
         bus = self.config.bus
         try:
-            self._session = zenoh.open(session_config("router", bus.endpoint, lease_ms(self.config, "router")))
+            self._session = zenoh.open(
+                session_config("router", bus.endpoint, lease_ms(self.config, "router"))
+            )
         except zenoh.ZError as error:
             if "in use" in str(error):
                 raise RouterError(

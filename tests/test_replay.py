@@ -415,8 +415,7 @@ def test_a_controller_that_died_may_leave_half_a_tick(run: Run) -> None:
     assert any("up to tick 88" in note for note in found.notes)
     stopping = msgspec.structs.replace(health, seq=1, status="stopping")
     died.streams[topics.HEALTH["controller"].name].append(Entry(1, codec.encode(stopping), stopping))
-    with pytest.raises(LogError, match="results 89"):
-        replay(died)
+    assert any("result of tick 89" in note for note in replay(died).notes)
 
 
 def test_other_versions_are_mentioned(run: Run) -> None:
