@@ -382,3 +382,11 @@ def test_what_is_certified_holds_without_a_solution_too(family: Certificate, goo
         assert first.lower[0] <= result.plan[0, 0] <= first.upper[0]
         clipped += bool(result.plan[0, 0] != wanted[0])
     assert clipped
+
+
+def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:
+    piece = family.pieces[0]
+    loose = changed(family, 0, G=[*piece.G, [1.0, 1.0]], g=[*piece.g, 2.9])
+    verdict = check(loose)
+    assert not verdict.ok
+    assert "bounds nothing" in verdict.reason

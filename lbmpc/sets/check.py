@@ -9,7 +9,8 @@ It shares nothing with the construction but the libraries. Why it may be believe
 3. No vertex is missing: every edge, that is every d - 1 rows of a basis, is found in exactly two bases. The graph of a
    polyhedron's vertices is connected (Balinski 1961), so a list closed under its edges is complete, and no edge is a
    ray, so the set is bounded, and the hull of its vertices.
-4. For each vertex an input is found for which all rows of the target hold for every w; the rows are linear, so the
+4. Each row touches the set, so that the set is the one that was written down.
+5. For each vertex an input is found for which all rows of the target hold for every w; the rows are linear, so the
    inputs in between serve the states in between.
 
 Rounding: |fl(a'b) - a'b| <= gamma_n |a|'|b|, gamma_n = n u / (1 - n u), u = 2^-53 (Higham 2002, (3.5)), whatever the
@@ -33,6 +34,8 @@ UNIT = 2.0**-53
 ROOM = 1.0 + 1e-9
 WIDEN = 1e-7
 """By how much rows are moved outwards at random, as a share of their scaled length."""
+LOOSE = 3e-4
+"""How far, as a share of X's half-widths, a row may be from the set that it is said to bound."""
 TINY = 1e-300
 
 
@@ -99,6 +102,7 @@ def _check_piece(certificate: Certificate, piece: Piece, random: np.random.Gener
     u_lower, u_upper = np.array(piece.u_lower), np.array(piece.u_upper)
     if (u_lower < np.array(model.U[0])).any() or (u_upper > np.array(model.U[1])).any():
         raise Refuted("it allows inputs outside U")
+    _require_touched(G, g, points)
     step = _Step(certificate, piece, scale)
     inputs = step.inputs(points, u_lower, u_upper)
     if (inputs < u_lower).any() or (inputs > u_upper).any():
@@ -265,6 +269,17 @@ def _require_closed(bases: np.ndarray) -> None:
     _, counts = np.unique(edges, axis=0, return_counts=True)
     if not (counts == 2).all():
         raise Refuted(f"{int((counts != 2).sum())} of its edges lead to no vertex that was found")
+
+
+def _require_touched(G: np.ndarray, g: np.ndarray, points: np.ndarray) -> None:
+    """Every row touches the set: a row further out bounds nothing, and whoever wrote it meant another set."""
+    lengths = np.linalg.norm(G, axis=1)
+    gap = np.full(len(g), np.inf)
+    for part in np.array_split(points, 1 + points.shape[0] * len(g) // 4_000_000):
+        gap = np.minimum(gap, ((g - part @ G.T) / lengths).min(axis=0))
+    worst = int(np.argmax(gap))
+    if gap[worst] > LOOSE:
+        raise Refuted(f"row {worst} bounds nothing: no state of the set comes nearer to it than {gap[worst]:.2g}")
 
 
 def _require_inside(
