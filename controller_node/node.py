@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from node_runtime.health import HealthPublisher
 from node_runtime.inbox import Inbox, Received
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.pacer import Grid, Pacer, Slot
-from node_runtime.realtime import GarbageCollection, one_blas_thread, punctual
+from node_runtime.realtime import GarbageCollection, core_for, on_core, one_blas_thread, punctual, said_of
 from protocol import codec, topics
 from protocol import messages as m
 
@@ -257,14 +258,22 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     with stopped_by_signals(stop) as stopping, one_blas_thread():
         try:
             _check_phase(config)
+            place = core_for(config, "controller", os.sched_getaffinity(0))
             core = ControllerCore(config, run_id)
             log.info("%s", guarantee(config, core.sets))
             with (
                 punctual(config.realtime.priority, keep_awake=config.awake) as note,
                 Bus(config, "controller", run_id, stopping) as bus,
-                HealthPublisher(bus, core.run_info(time.time()), lambda: counts, note) as health,
+                HealthPublisher(
+                    bus,
+                    core.run_info(time.time()),
+                    lambda: counts,
+                    "; ".join(filter(None, (note, said_of(place)))),
+                ) as health,
             ):
-                ControllerNode(core, bus, health, counts).run(stopping)
+                node = ControllerNode(core, bus, health, counts)
+                with on_core(place):
+                    node.run(stopping)
         except ConfigError as error:
             log.error("%s", error)
             return 2

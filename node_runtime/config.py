@@ -180,6 +180,8 @@ class RealtimeConfig(Section, frozen=True):
     """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
     awake: AwakeMode = "auto"
     """Keep the cores from sleeping between slots; "auto": where there is a priority and the period is below 10 ms."""
+    cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0)]] = "auto"
+    """Core of the controller's loop and core of the plant's; "auto": two of their own where `awake` would be needed."""
 
 
 class Config(Section, frozen=True):
@@ -208,8 +210,13 @@ class Config(Section, frozen=True):
     @property
     def awake(self) -> bool:
         """Whether `realtime.awake` keeps the cores from sleeping at this rate."""
-        mode, needed = self.realtime.awake, self.realtime.priority > 0 and self.period < AWAKE_BELOW
-        return mode == "always" or (mode == "auto" and needed)
+        mode = self.realtime.awake
+        return mode == "always" or (mode == "auto" and self.fast)
+
+    @property
+    def fast(self) -> bool:
+        """Whether the loops have a priority and so little time that their cores matter."""
+        return self.realtime.priority > 0 and self.period < AWAKE_BELOW
 
 
 def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:

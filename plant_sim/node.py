@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 
 import numpy as np
@@ -15,7 +16,7 @@ from node_runtime.health import HealthPublisher, run_info
 from node_runtime.inbox import Inbox
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.pacer import Grid, Pacer
-from node_runtime.realtime import GarbageCollection, punctual
+from node_runtime.realtime import GarbageCollection, core_for, on_core, punctual, said_of
 from plant_sim.plant import PlantSim
 from protocol import topics
 from protocol.messages import Command, InputSource
@@ -106,6 +107,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | None) -> int:
     names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
     counts = dict.fromkeys(names, 0)
+    place = core_for(config, "plant", os.sched_getaffinity(0))
     with (
         stopped_by_signals(stop) as stopping,
         punctual(config.realtime.priority, keep_awake=config.awake) as note,
@@ -114,10 +116,14 @@ def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | No
         try:
             with (
                 Bus(config, "plant", run_id, stopping) as bus,
-                HealthPublisher(bus, info, lambda: counts, note) as health,
+                HealthPublisher(
+                    bus, info, lambda: counts, "; ".join(filter(None, (note, said_of(place))))
+                ) as health,
             ):
                 try:
-                    PlantNode(sim, bus, health, counts).run(stopping)
+                    node = PlantNode(sim, bus, health, counts)
+                    with on_core(place):
+                        node.run(stopping)
                 except PlantError as error:
                     log.error("%s", error)
                     health.set("failed", str(error))

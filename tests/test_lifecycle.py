@@ -16,10 +16,10 @@ from live import Ear, health_of, live_config, wait_for
 
 from node_runtime import clock
 from node_runtime.bus import Bus
-from node_runtime.config import Config, override
+from node_runtime.config import Config, ConfigError, override
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
-from node_runtime.realtime import GarbageCollection, awake, punctual, quick_handover
+from node_runtime.realtime import GarbageCollection, awake, core_for, on_core, punctual, quick_handover
 from node_runtime.router import Router
 from protocol import messages as m
 from protocol import topics
@@ -140,6 +140,44 @@ def test_where_cores_may_sleep_the_loop_runs_and_says_so(
 )
 def test_cores_are_kept_awake_where_it_pays(assignments: list[str], awake: bool) -> None:
     assert override(Config(), assignments).awake is awake
+
+
+@pytest.mark.parametrize(
+    ("assignments", "allowed", "controller", "plant"),
+    [
+        (["rate=20"], {0, 1}, None, None),
+        (["rate=1000"], {0, 1}, 1, 0),
+        (["rate=1000"], {2, 5, 7}, 7, 5),
+        (["rate=1000"], {3}, None, None),
+        (["rate=1000", "realtime.priority=0"], {0, 1}, None, None),
+        (["rate=1000", "realtime.cores=any"], {0, 1}, None, None),
+        (["rate=20", "realtime.cores=[0,1]"], {0, 1}, 0, 1),
+        (["rate=20", "realtime.cores=[1,1]"], {0, 1}, 1, 1),
+    ],
+)
+def test_loops_have_cores_of_their_own_where_it_pays(
+    assignments: list[str], allowed: set[int], controller: int | None, plant: int | None
+) -> None:
+    config = override(Config(), assignments)
+    assert core_for(config, "controller", allowed) == controller
+    assert core_for(config, "plant", allowed) == plant
+
+
+@pytest.mark.parametrize("cores", ["[0,9]", "[0]", "[0,1,0]"])
+def test_a_core_that_is_not_there_is_refused(cores: str) -> None:
+    config = override(Config(), [f"realtime.cores={cores}"])
+    with pytest.raises(ConfigError, match=r"write \[controller's core, plant's core\].* may use 0, 1"):
+        core_for(config, "plant", {0, 1})
+
+
+def test_a_loop_stays_on_its_core_and_only_the_loop() -> None:
+    before = os.sched_getaffinity(0)
+    core = max(before)
+    with on_core(core):
+        assert os.sched_getaffinity(0) == {core}
+    assert os.sched_getaffinity(0) == before
+    with on_core(None):
+        assert os.sched_getaffinity(0) == before
 
 
 def test_everything_is_as_before_after_a_punctual_loop() -> None:
