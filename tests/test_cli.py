@@ -21,7 +21,15 @@ COMMANDS = (
     *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {
-    *("ticks", "late_ticks", "weights_adopted", "weights_refused", "fallback_ticks", "soft_ticks"),
+    *(
+        "ticks",
+        "late_ticks",
+        "lost_ticks",
+        "weights_adopted",
+        "weights_refused",
+        "fallback_ticks",
+        "soft_ticks",
+    ),
     *(
         "constraint_violations",
         "cost",

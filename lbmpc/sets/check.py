@@ -279,7 +279,9 @@ def _require_touched(G: np.ndarray, g: np.ndarray, points: np.ndarray) -> None:
         gap = np.minimum(gap, ((g - part @ G.T) / lengths).min(axis=0))
     worst = int(np.argmax(gap))
     if gap[worst] > LOOSE:
-        raise Refuted(f"row {worst} bounds nothing: no state of the set comes nearer to it than {gap[worst]:.2g}")
+        raise Refuted(
+            f"row {worst} bounds nothing: no state of the set comes nearer to it than {gap[worst]:.2g}"
+        )
 
 
 def _require_inside(
