@@ -77,7 +77,7 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
             ax.xaxis.set_minor_locator(NullLocator())
     ax.set_yticks(range(len(results)), [_wrapped(result.label) for result in results])
     ax.set_ylim(len(results) - 0.5, -0.5)
-    ax.set_xlabel(f"{what} (sum of Δz² + Δy² over the run{', above the true h' if what == 'regret' else ''})")
+    ax.set_xlabel(f"{what}: sum of Δz² + Δy²{', above the true h' if what == 'regret' else ''}")
     marked = "; diamond and dashed line: what the others are compared with" if reference else ""
     return [
         Picture(
