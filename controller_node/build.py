@@ -134,6 +134,8 @@ def build_controller(
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
     solver = Solver(problem, chosen.max_iterations, chosen.tolerance, realise or _as_it_is)
+    if isinstance(problem.oracle, DnnOracle):
+        problem.oracle.compile(realise or _as_it_is)
     controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
     _warm_up(controller, config.seed)
     return controller
@@ -142,11 +144,14 @@ def build_controller(
 def _warm_up(controller: Controller, seed: int) -> None:
     """Whatever is slow the first time is slow here and not in the first tick; leaves no trace in any result."""
     solver, state = controller.solver, controller.initial_state(seed)
+    d, m = controller.model.d, controller.model.m
+    controller.oracle.learn(state.oracle, np.zeros(d), np.zeros(m), np.zeros(d))
+    controller.oracle.estimate(state.oracle, np.zeros(d), np.zeros(m))
     x = np.zeros_like(state.predicted)
     theta = controller.oracle.theta(state.oracle)
     # Far enough out that the QP is needed too.
     edge = x.copy()
-    edge[: controller.model.d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
+    edge[:d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
     for start in (x, edge):
         solver.solve(start, theta, state.plan.v)
         if controller.real_time:

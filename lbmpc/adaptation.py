@@ -19,7 +19,7 @@ def project_columns(K: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 
 def adapt(K: np.ndarray, phi: np.ndarray, error: np.ndarray, gamma: float, bounds: np.ndarray) -> np.ndarray:
-    """One step of the law.
+    """One step of the law, as the paper writes it. The tick calls `lbmpc.oracles.last_layer`, which is held to this.
 
     Args:
         K: output weights K_t, (n, d).

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from science import compressor, describe, oracle_named
 
+from controller_node.compile import Compiler
+from lbmpc.adaptation import adapt
 from lbmpc.oracles import DnnOracle, L2nwOracle
 from lbmpc.oracles.base import function
+from lbmpc.oracles.last_layer import Realise
 from protocol.network import hash_layers
 
 MODEL = compressor()
@@ -53,6 +56,33 @@ def test_every_activation_has_the_right_slope(activation: str) -> None:
         up = oracle.estimate(state, x + e[:4], u + e[4:])
         down = oracle.estimate(state, x - e[:4], u - e[4:])
         np.testing.assert_allclose(jacobian[:, k], (up - down) / 2e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "realise", [lambda function: function, Compiler()], ids=["virtual machine", "compiled"]
+)
+@pytest.mark.parametrize("architecture", ["mlp", "rnn", "cnn"])
+def test_what_every_tick_calls_is_the_law_as_written(architecture: str, realise: Realise) -> None:
+    rng = np.random.default_rng(5)
+    oracle = DnnOracle(describe(MODEL, [6, 5], architecture=architecture), gamma=0.7, column_bound=0.01)
+    oracle.compile(realise)
+    state = oracle.begin(oracle.initial_state(rng), rng.normal(size=4), rng.normal(size=1))
+    bounded = 0
+    for k in range(60):
+        if k == 30:
+            # Other hidden layers, as after an adoption.
+            state = {**state, **{f"W{i + 1}": 1.1 * layer for i, layer in enumerate(oracle.hidden(state))}}
+        x, u, h = rng.normal(size=4), rng.normal(size=1), rng.normal(size=4) * 0.02
+        phi, K = oracle.features(state, x, u), state["K"]
+        h_hat = oracle.output_scale * (phi @ K)
+        np.testing.assert_allclose(oracle.estimate(state, x, u), h_hat, rtol=1e-12, atol=1e-16)
+        state = oracle.learn(state, x, u, h)
+        wanted = adapt(K, phi, (h_hat - h) / oracle.output_scale, 0.7, oracle.bounds)
+        np.testing.assert_allclose(state["K"], wanted, rtol=1e-11, atol=1e-14)
+        norms = np.linalg.norm(state["K"], axis=0)
+        assert (norms <= oracle.bounds * (1 + 1e-12)).all()
+        bounded += int((norms > 0.999 * oracle.bounds).sum())
+    assert 0 < bounded < 240
 
 
 def test_unused_slots_of_the_window_do_not_count() -> None:

@@ -15,10 +15,11 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from lbmpc.adaptation import adapt, project_columns, refit
+from lbmpc.adaptation import project_columns, refit
 from lbmpc.oracles import base
 from lbmpc.oracles.backends import ACTIVATIONS, Numbers, Symbols
 from lbmpc.oracles.base import OracleState
+from lbmpc.oracles.last_layer import LastLayer, Realise
 from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription, hash_layers, initial_hidden, why_unacceptable
 
@@ -72,6 +73,7 @@ class DnnOracle:
         self.pairs = description.window
         self._architecture, self._sizes = get_architecture(description.architecture), description.sizes
         self._dense = description.architecture == "mlp" and self.pairs == 1
+        self._last_layer: LastLayer | None = None
 
     # -- expressions ---------------------------------------------------------------------------------------------
 
@@ -85,9 +87,12 @@ class DnnOracle:
         return parts
 
     def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        layers = list(zip(parts[::2], parts[1::2], strict=True))
-        activation = self._architecture.forward(SYMBOLS, self._sizes, layers[:-1], self._window(su))
-        return SYMBOLS.affine(layers[-1], activation) * self.output_scale
+        return SYMBOLS.affine((parts[-2], parts[-1]), self.activation(su, parts)) * self.output_scale
+
+    def activation(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
+        """phi without its leading 1, (n_L, n), of n points (s, u) at once, (D + m, n)."""
+        layers = list(zip(parts[:-2:2], parts[1:-2:2], strict=True))
+        return self._architecture.forward(SYMBOLS, self._sizes, layers, self._window(su))
 
     def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
         return self._forward_mode(su, parts) if self._dense else self._reverse_mode(su, parts)
@@ -178,14 +183,7 @@ class DnnOracle:
 
     def features(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """phi_j(x, u) with the past in this state, (1 + n_L,), with phi[0] = 1."""
-        pair, hidden = np.concatenate([x, u]), self.hidden(state)
-        if self.pairs > 1:
-            return self.features_of(hidden, np.vstack([state["past"], pair]))
-        # Four times in every tick, so without the detour for many points: it takes twice as long as the network.
-        activation = self._architecture.forward(NUMBERS, self._sizes, hidden, [pair / self.input_scale])
-        phi = np.empty(len(activation) + 1)
-        phi[0], phi[1:] = 1.0, activation
-        return phi
+        return self.features_of(self.hidden(state), np.vstack([self.past(state), np.concatenate([x, u])]))
 
     def features_of(self, hidden: Sequence[np.ndarray], window: np.ndarray) -> np.ndarray:
         """phi of a window, (k, d + m), oldest pair first, under hidden layers; or of many, (points, k, d + m)."""
@@ -193,13 +191,16 @@ class DnnOracle:
         activation = self._architecture.forward(NUMBERS, self._sizes, hidden, pairs)
         return np.concatenate([np.ones((*activation.shape[:-1], 1)), activation], axis=-1)
 
+    def compile(self, realise: Realise) -> None:
+        """Let `realise` turn what every tick calls into something faster; the virtual machine runs it otherwise."""
+        self._last_layer = LastLayer(self, realise)
+
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return self.output_scale * (self.features(state, x, u) @ state["K"])
+        return self._every_tick().estimate(self.hidden(state), state["K"], self._point(state, x, u))
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
-        phi = self.features(state, x, u)
-        error = phi @ state["K"] - h / self.output_scale
-        learned = {**state, "K": adapt(state["K"], phi, error, self.gamma, self.bounds)}
+        K = self._every_tick().learn(self.hidden(state), state["K"], self._point(state, x, u), h)
+        learned = {**state, "K": K}
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
         if self.refit is not None:
@@ -232,6 +233,15 @@ class DnnOracle:
         swapped = {f"W{i + 1}": layer.astype(float) for i, layer in enumerate(layers)}
         swapped["version"] = np.array([version], dtype=np.int64)
         return {**state, **swapped, "K": self._K_under(self.hidden(swapped), state)}, "adopted"
+
+    def _every_tick(self) -> LastLayer:
+        if self._last_layer is None:
+            self._last_layer = LastLayer(self, lambda function: function)
+        return self._last_layer
+
+    def _point(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """(s, u), (D + m,)."""
+        return np.concatenate([x, u] if self.pairs == 1 else [x, state["past"].ravel(), u])
 
     def _K_under(self, hidden: list[np.ndarray], state: OracleState) -> np.ndarray:
         """K for new hidden layers, scaled, (1 + n_L, d)."""
