@@ -76,7 +76,7 @@ class CertifiedSets:
                 raise CertificateError(f"a damaged gzip file: {error}") from error
         try:
             content = msgspec.json.decode(data, type=_Content)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise CertificateError(f"not a file of certified sets, or a damaged one: {error}") from error
         actual = _hash(content.found, bytes(content.certificate))
         if actual != content.sha256:

@@ -17,8 +17,10 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Sequence = Annotated[int, msgspec.Meta(ge=-1)]
+LARGEST = 2**63 - 1
+"""Memories, logs and third parties' readers hold numbers in 64 bits with a sign."""
+Count = Annotated[int, msgspec.Meta(ge=0, le=LARGEST)]
+Sequence = Annotated[int, msgspec.Meta(ge=-1, le=LARGEST)]
 """A sequence number; -1 stands for "none yet"."""
 RunId = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Digest = Annotated[str, msgspec.Meta(max_length=64)]
@@ -37,6 +39,10 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     seq: Sequence
 
 
+LONGEST = 2**40
+DIMENSIONS = 8
+
+
 class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A dense array: little-endian, row-major. No object dtypes, no pickle."""
 
@@ -45,6 +51,9 @@ class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     data: bytes
 
     def __post_init__(self) -> None:
+        # A shape with a 0 in it fits no data at all, whatever its other numbers; numpy refuses those it cannot hold.
+        if len(self.shape) > DIMENSIONS or math.prod(max(1, length) for length in self.shape) > LONGEST:
+            raise ValueError(f"no array has the shape {str(self.shape)[:80]}")
         expected = math.prod(self.shape) * np.dtype(self.dtype).itemsize
         if expected != len(self.data):
             raise ValueError(
@@ -166,6 +175,8 @@ class TickResult(Message, frozen=True):
     None where there are no such sets, or no state."""
     set_piece: int = -1
     """Which of the certified sets the state is in; -1: none."""
+    weights_rolled_back: str = ""
+    """Why the hidden weights and K from before came back in this tick; empty where they did not."""
 
 
 class TickTiming(Message, frozen=True):
