@@ -51,6 +51,14 @@ class Grid:
         self._next = index + 1
         return Slot(index, self.due(index), skipped)
 
+    def again(self, slot: Slot, now: float) -> Slot:
+        """The slot to run instead of `slot`, which was slept through until `now`; itself where it still may be run."""
+        if now - slot.time <= self._grace * self.period:
+            return slot
+        self._next = slot.index - slot.skipped
+        self.skipped -= slot.skipped
+        return self.next(now)
+
     def due(self, index: int) -> float:
         """When slot `index` is due."""
         return self._anchor + index * self.period
@@ -81,9 +89,15 @@ class Pacer:
     def next(self) -> tuple[Slot, float] | None:
         """Sleep until the next slot; it and its lateness in seconds, or None when told to stop."""
         slot = self.grid.next(clock.now())
-        if not self.sleep_until(slot.time):
-            return None
-        return slot, max(0.0, clock.now() - slot.time)
+        while True:
+            if not self.sleep_until(slot.time):
+                return None
+            now = clock.now()
+            # A process that was frozen, or without a core, wakes long after its slot: that one is over.
+            newer = self.grid.again(slot, now)
+            if newer is slot:
+                return slot, max(0.0, now - slot.time)
+            slot = newer
 
     def sleep_until(self, time: float) -> bool:
         """Sleep until `time`, seconds on the monotonic clock; False when told to stop."""

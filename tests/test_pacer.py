@@ -56,6 +56,33 @@ def test_never_a_burst(durations: list[float]) -> None:
     assert all(time >= index * PERIOD - 1e-9 for time, index, _ in begun)
 
 
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60))
+def test_slots_that_were_slept_through_are_skipped_not_run_in_a_burst(oversleeps: list[float]) -> None:
+    grid, now = Grid(PERIOD, 0.0), 0.0
+    begun: list[tuple[float, int]] = []
+    for oversleep in oversleeps:
+        slot = grid.next(now)
+        now = max(now, slot.time) + oversleep
+        while (newer := grid.again(slot, now)) is not slot:
+            slot, now = newer, max(now, newer.time)
+        begun.append((now, slot.index))
+    assert all(b[0] - a[0] >= 0.5 * PERIOD - 1e-9 for a, b in itertools.pairwise(begun))
+    assert all(-1e-9 <= time - index * PERIOD <= 0.5 * PERIOD + 1e-9 for time, index in begun)
+    assert begun[-1][1] == len(begun) - 1 + grid.skipped
+
+
+def test_a_frozen_loop_goes_on_with_the_newest_slot() -> None:
+    """What SIGSTOP and a host that takes the cores away do: the thread sleeps far longer than it asked for."""
+    grid = Grid(PERIOD, 0.0)
+    assert grid.next(0.0).index == 0
+    slot = grid.next(0.01)
+    assert (slot.index, slot.skipped) == (1, 0)
+    late = grid.again(slot, 20.2 * PERIOD)
+    assert (late.index, late.skipped) == (20, 19)
+    assert grid.again(late, 20.2 * PERIOD) is late
+    assert grid.next(20.3 * PERIOD).index == 21
+
+
 @given(st.floats(-10.0, 10.0))
 def test_slewing_finds_the_phase_of_the_events_without_leaps(phase_of_events: float) -> None:
     grid = Grid(PERIOD, 0.0)
