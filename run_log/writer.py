@@ -19,6 +19,7 @@ from mcap.writer import LIBRARY_IDENTIFIER, CompressionType, Writer
 from lbmpc.plants import Plant
 from node_runtime.config import Config, to_toml
 from node_runtime.health import versions as installed
+from node_runtime.inbox import Follower
 from protocol import codec, topics
 from protocol.messages import Message
 from protocol.topics import Topic
@@ -74,6 +75,7 @@ class LogWriter:
         self._shown: dict[str, int] = {}
         self._next_view: dict[str, int] = {}
         """When, in ns, a topic's next view is due; what comes earlier has none."""
+        self._speakers = {name: Follower(config.bus.follow_silence) for name in COUNTED}
         self._counted: dict[tuple[str, str], int] = {}
         """The last number of each run on each of the topics `COUNTED`."""
         self._strangers = 0
@@ -142,7 +144,7 @@ class LogWriter:
             except codec.BadMessage as error:
                 self._count_bad(error)
         if message is not None and name in COUNTED:
-            self._count_lost(name, message)
+            self._count_lost(name, message, log_time)
         sequence = max(message.seq, 0) & 0xFFFFFFFF if message is not None else 0
         self._mcap.add_message(channel, log_time, payload, log_time, sequence)
         if view is not None and shown is not None:
@@ -195,8 +197,13 @@ class LogWriter:
             self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
         return self._shown[name]
 
-    def _count_lost(self, name: str, message: Message) -> None:
-        """Ticks whose messages were made and never came here: cut links, full queues, whatever it was."""
+    def _count_lost(self, name: str, message: Message, log_time: int) -> None:
+        """Ticks whose messages were made and never came here: cut links, full queues, whatever it was.
+
+        What is out of order, or of another run than the one that speaks, was sent again or by a stranger.
+        """
+        if self._speakers[name].accept(message.run_id, message.seq, log_time * 1e-9) != "ok":
+            return
         key = (name, message.run_id)
         last = self._counted.get(key)
         if last is None and len(self._counted) >= MAX_STRANGERS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import msgspec
 import pytest
 from live import Process, live_config, wait_for
 from run_log_samples import RUN, synthetic
@@ -76,6 +77,21 @@ def test_what_never_arrived_is_counted_by_the_recorder_and_said_in_the_figures(t
     assert lost_ticks(run) == [(RUN, 20, 7), (RUN, 40, 1)]
     assert summarise(run).lost_ticks == 8
     assert summarise(gather(config, messages)).lost_ticks == 0
+
+
+def test_what_is_sent_again_or_by_a_stranger_is_no_gap(tmp_path: Path) -> None:
+    config, messages = synthetic(steps=60)
+    with LogWriter(tmp_path / "run.mcap", config, get_plant(config.plant.model)) as writer:
+        for topic, message, log_time in messages:
+            writer.write_message(topic, message, log_time)
+            if topic is topics.RESULT and message.seq == 30:
+                old = next(one for of, one, _ in messages if of is topics.RESULT and one.seq == 10)
+                writer.write_message(topic, old, log_time + 1)
+                strange = msgspec.structs.replace(message, run_id="stranger", seq=500)
+                for seq in (500, 900):
+                    again = msgspec.structs.replace(strange, seq=seq)
+                    writer.write_message(topic, again, log_time + 2)
+        assert writer.lost == {}
 
 
 def test_stretches() -> None:
