@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper bench test compose-test lint format clean
+.PHONY: help setup run simulate paper bench test compose-test faults fuzz soak lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -36,6 +36,15 @@ test: $(READY)  ## all tests
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s -o pythonpath=tests tests/compose/live_compose.py $(ARGS)
+
+faults: $(READY)  ## kill, freeze, cut off and attack real processes, into docs/faults.md: hours; root; ARGS=--list names them
+	$(BIN)/python -m tests.faults --document docs/faults.md $(ARGS)
+
+fuzz: $(READY)  ## 10 million bad payloads through everything that reads bytes, into docs/faults.md: minutes
+	$(BIN)/python -m benchmarks.fuzz --document docs/faults.md $(ARGS)
+
+soak: $(READY)  ## 30 minutes live at 50 Hz: memory and lateness, into docs/faults.md; ARGS="--minutes 1" for a look
+	$(BIN)/python -m benchmarks.soak --document docs/faults.md $(ARGS)
 
 lint: $(READY)  ## style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -1,0 +1,162 @@
+"""What must hold: each check looks at a run, and at one without the fault, and says what does not, or None."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from .facts import Facts
+
+Held = Callable[[Facts, Facts], str | None]
+"""(the run, the run with the same seed and no fault) -> why it does not hold."""
+
+CONTROL_BACK_S = 1.0
+READABLE_S = 0.6
+"""Half a second between flushes, a state every 50 ms, and the time a flush takes."""
+COST_SHARE = 0.05
+SAYS_SO = re.compile("NOT LOGGED|silent|ended")
+OBEYED = {
+    "plant/state": "controller",
+    "controller/command": "plant",
+    "controller/samples": "trainer",
+    "controller/output_weights": "trainer",
+    "trainer/hidden_weights": "controller",
+}
+"""Topics that somebody acts on, and who does. The others are only shown and logged, as they come."""
+
+
+def constraints(run: Facts, calm: Facts) -> str | None:
+    """The true plant keeps its constraints wherever the run without a fault keeps them."""
+    if run.violations > calm.violations:
+        return f"{run.violations} samples outside, {calm.violations} without the fault"
+    return None
+
+
+def control_back(run: Facts, calm: Facts) -> str | None:
+    """Fresh commands drive the plant within a second of the process or the link being back."""
+    if run.control_after is None:
+        return "control did not come back"
+    if run.control_after > CONTROL_BACK_S:
+        return f"control came back {run.control_after:.2f} s after what was hurt"
+    return None
+
+
+def punctual(run: Facts, calm: Facts) -> str | None:
+    """No late tick in what was not hurt, but for those in which the machine itself stood still."""
+    late = run.late - run.late_by_machine
+    return f"{late} late" if late > 0 else None
+
+
+def no_burst(run: Facts, calm: Facts) -> str | None:
+    """Two commands within a period at most: the one that was late, and the next."""
+    return f"{run.burst} commands within a period" if run.burst > 2 else None
+
+
+def plan_then_safe(run: Facts, calm: Facts) -> str | None:
+    """The plant follows the rest of the plan, then its safe input, and nothing in another order."""
+    order = [source for source in run.sources if source != "command"]
+    first = order[: order.index("safe") + 1] if "safe" in order else order[:1]
+    return None if first in ([], ["plan"], ["plan", "safe"]) else f"driven by {', '.join(run.sources)}"
+
+
+def merged(run: Facts, calm: Facts) -> str | None:
+    """The trainer has every sample once."""
+    if run.samples_held is None:
+        return "the trainer did not say how many samples it has"
+    if run.samples_held != run.samples_made:
+        return f"the trainer holds {run.samples_held} of {run.samples_made} samples"
+    return None
+
+
+def control_kept(run: Facts, calm: Facts) -> str | None:
+    """The loop goes on: fresh commands never ceased, as far as the machine itself did not stand still."""
+    if run.plan_s and not run.late_by_machine:
+        return f"no fresh command for {run.plan_s:.2f} s"
+    return None
+
+
+def readable(run: Facts, calm: Facts) -> str | None:
+    """All but the last half second of the log can be read, and what can be read replays."""
+    if run.readable_gap is None:
+        return "the log cannot be read"
+    if run.readable_gap > READABLE_S:
+        return f"the last {run.readable_gap:.2f} s before the kill cannot be read"
+    if run.log_missing:
+        return f"{run.log_missing} ticks before the last second are not in the log"
+    return None if run.replay.startswith("exact") else run.replay
+
+
+def replays(run: Facts, calm: Facts) -> str | None:
+    """The log gives back every command, byte for byte."""
+    return None if run.replay.startswith("exact") else run.replay
+
+
+def none_obeyed(run: Facts, calm: Facts) -> str | None:
+    """No command and no state of a stranger was used."""
+    if run.foreign_commands or run.foreign_states:
+        return f"{run.foreign_commands} commands and {run.foreign_states} states of strangers obeyed"
+    return None
+
+
+def all_counted(run: Facts, calm: Facts) -> str | None:
+    """Each that went to a process that obeys its topic is in that process's counters, and nothing else is."""
+    for topic, process in OBEYED.items():
+        sent = int(run.extra.get(f"sent {topic}", 0))
+        found = {name: count for name, count in run.counted.items() if name.startswith(f"{process} ")}
+        bad = sum(count for name, count in found.items() if name.startswith(f"{process} bad {topic}:"))
+        # A flood makes room in a full mailbox by dropping the oldest, whosever it was.
+        dropped = found.get(f"{process} overflow {topic}", 0)
+        if not bad <= sent <= bad + dropped:
+            return f"{sent} sent to {topic}, {bad} counted by the {process}, {dropped} dropped"
+    return None
+
+
+def weights_refused(run: Facts, calm: Facts) -> str | None:
+    """Whatever was forged was refused, or rolled back soon after."""
+    if not run.extra.get("sent trainer/hidden_weights"):
+        return "nothing was forged"
+    if run.forged_adopted > run.rolled_back:
+        return f"{run.forged_adopted} forged sets adopted, {run.rolled_back} rolled back"
+    return None
+
+
+def whole(run: Facts, calm: Facts) -> str | None:
+    """The log has everything, and replays byte for byte."""
+    if run.log_missing:
+        return f"{run.log_missing} ticks are not in the log"
+    return None if run.replay == "exact" else run.replay
+
+
+def view_says(run: Facts, calm: Facts) -> str | None:
+    """At the end of the run the live view says that nothing is logged."""
+    return None if SAYS_SO.search(run.view_at_end) else f"the live view shows {run.view_at_end!r}"
+
+
+def view_said(run: Facts, calm: Facts) -> str | None:
+    """The recorder said that nothing was logged for a while, and is well at the end."""
+    if not any("NOT LOGGED" in text for text in run.said):
+        return "the recorder never said it"
+    return f"the live view still shows {run.view_at_end!r}" if SAYS_SO.search(run.view_at_end) else None
+
+
+def log_time(run: Facts, calm: Facts) -> str | None:
+    """The log's own times go on as if nothing had happened."""
+    if run.log_time_off is None or abs(run.log_time_off) > 1.0:
+        return f"the log's times are {run.log_time_off} s off"
+    return None
+
+
+def as_fast(run: Facts, calm: Facts) -> str | None:
+    """The tick's p99 is less than doubled."""
+    if run.tick_p99_ms is None or calm.tick_p99_ms is None:
+        return "no tick was timed"
+    if run.tick_p99_ms >= 2.0 * calm.tick_p99_ms:
+        return f"tick p99 {run.tick_p99_ms:.1f} ms, {calm.tick_p99_ms:.1f} ms without"
+    return None
+
+
+def as_good(run: Facts, calm: Facts) -> str | None:
+    """The closed loop costs at most 5 % more."""
+    if run.cost > (1.0 + COST_SHARE) * calm.cost:
+        return f"cost {run.cost:.2f}, {calm.cost:.2f} without"
+    return None

@@ -1,0 +1,368 @@
+"""One run of the real processes, to be killed, frozen and cut off; what dies it starts again, as a supervisor would."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from node_runtime import clock
+from node_runtime.bus import Bus, Mailbox
+from node_runtime.config import Config, override, to_toml
+from node_runtime.lifecycle import new_run_id
+from protocol import codec, topics
+from protocol import messages as m
+
+from . import link as links
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+COMMANDS = {
+    "router": "router",
+    "recorder": "record",
+    "trainer": "trainer",
+    "controller": "controller",
+    "plant": "",
+}
+STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
+RESTARTED = ("router", "trainer", "controller")
+"""A recorder that has died stays dead, as under `tandem run`: its log is never overwritten."""
+RESTART_S = 0.5
+"""As `tandem run` waits before it starts a dead process again."""
+READY_S = 60.0
+STOP_S = 8.0
+LOOK_S = 0.01
+LISTENING = "router listening on"
+
+Place = Literal["loopback", "veth", "wire"]
+
+
+class RigError(RuntimeError):
+    """The run did not come about, whatever the fault: a process did not start, no command came."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """One message as the suite heard it on the bus."""
+
+    at: float
+    """Seconds on the monotonic clock."""
+    topic: str
+    payload: bytes
+
+
+@dataclass
+class Running:
+    """One process, and when it was started and killed; seconds on the monotonic clock."""
+
+    name: str
+    words: list[str]
+    environment: dict[str, str]
+    output: Path
+    popen: subprocess.Popen[bytes] | None = None
+    started: list[float] = field(default_factory=list)
+    killed: list[float] = field(default_factory=list)
+    restart_at: float | None = None
+
+    def start(self) -> None:
+        with self.output.open("ab") as output:
+            self.popen = subprocess.Popen(
+                self.words,
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=os.environ | self.environment,
+                process_group=0,
+            )
+        self.started.append(clock.now())
+
+    @property
+    def alive(self) -> bool:
+        return self.popen is not None and self.popen.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        if self.popen is not None and self.alive:
+            os.killpg(self.popen.pid, number)
+
+    def said(self) -> str:
+        return self.output.read_text(errors="replace") if self.output.exists() else ""
+
+
+class Rig:
+    """A router, recorder, trainer, controller and plant, started on entry, all gone on exit.
+
+    Args:
+        folder: everything is written here: configurations, outputs, the log, the plant's trace.
+        config: the run's; endpoint and log are set here.
+        places: where "plant" and "trainer" are: beside the others, as the rest is, or behind a link.
+        environment: of each process by name, added to this one's; under "" what all get.
+        seed: of what happens on a lossy link.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        places: dict[str, Place] | None = None,
+        *,
+        environment: dict[str, dict[str, str]] | None = None,
+        seed: int = 0,
+    ):
+        self.folder, self._places = folder, places or {}
+        self._seed, self._environment = seed, environment or {}
+        port = _free_port()
+        self.config = override(
+            config, [f'bus.endpoint="tcp/127.0.0.1:{port}"', f'log.path="{folder / "disk" / "run.mcap"}"']
+        )
+        self.log = folder / "disk" / "run.mcap"
+        self.trace = folder / "trace.jsonl"
+        self.heard: list[Heard] = []
+        self.events: list[tuple[float, str]] = []
+        """What was done to the run, and when; seconds on the monotonic clock."""
+        self.first_command: float | None = None
+        self.processes: dict[str, Running] = {}
+        self.links: dict[str, links.Link] = {}
+        self._port = port
+        self._stack = ExitStack()
+        self._mailbox: Mailbox | None = None
+        self._command_key = topics.COMMAND.name
+        self.restarts = True
+        self.ended_at = math.inf
+        """When all were told to stop."""
+        self.listening_at: dict[int, float] = {}
+        """When the router listened after its n-th start."""
+
+    # -- begin and end -----------------------------------------------
+
+    def __enter__(self) -> Rig:
+        try:
+            self._begin()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _begin(self) -> None:
+        (self.folder / "disk").mkdir(parents=True, exist_ok=True)
+        for number, (name, place) in enumerate(self._places.items()):
+            if place != "loopback":
+                self.links[name] = self._stack.enter_context(links.link(place, number, self._seed))
+        self._stack.callback(self._kill_all)
+        for name in COMMANDS:
+            self.processes[name] = self._prepare(name)
+        self._watch_the_machine()
+        for running in self.processes.values():
+            running.start()
+        deadline = clock.now() + READY_S
+        while LISTENING not in self.processes["router"].said():
+            if clock.now() > deadline or not self.processes["router"].alive:
+                raise RigError(f"the router did not start: {self.processes['router'].said()[-800:]}")
+            clock.sleep_until(clock.now() + LOOK_S)
+        bus = Bus(self.config, "monitor", new_run_id("witness"))
+        bus.open()
+        self._stack.callback(bus.close, 0.5)
+        self._mailbox = bus.everything()
+        self.wait(
+            lambda: all(self._ready(name) for name in COMMANDS if name != "plant"), READY_S, "all ready"
+        )
+        plant = self.processes["plant"].popen
+        assert plant is not None
+        assert plant.stdin is not None
+        plant.stdin.write(b"begin\n")
+        plant.stdin.flush()
+        self.wait(lambda: self.first_command is not None, READY_S, "the first command")
+
+    def _prepare(self, name: str) -> Running:
+        """What its process will be; the router is not at the same address everywhere, so each has its configuration."""
+        config = self.config
+        prefix: list[str] = []
+        if name in self.links:
+            prefix = self.links[name].prefix
+            config = override(config, [f'bus.endpoint="tcp/{self.links[name].here}:{self._port}"'])
+        elif name == "router" and self.links:
+            config = override(config, [f'bus.endpoint="tcp/0.0.0.0:{self._port}"'])
+        file = self.folder / f"{name}.toml"
+        file.write_text(to_toml(config), encoding="utf-8")
+        if name == "plant":
+            words = [
+                sys.executable,
+                str(HERE / "traced_plant.py"),
+                str(os.getpid()),
+                str(file),
+                str(self.trace),
+            ]
+        else:
+            child = [sys.executable, "-m", "tandem.child", str(os.getpid())]
+            words = [*child, COMMANDS[name], "--config", str(file)]
+        environment = self._environment.get("", {}) | self._environment.get(name, {})
+        return Running(name, [*prefix, *words], environment, self.folder / f"{name}.txt")
+
+    def _watch_the_machine(self) -> None:
+        priority = self.config.realtime.priority
+        for core in sorted(os.sched_getaffinity(0)):
+            above = str(priority + 5 if priority else 0)
+            words = [
+                sys.executable,
+                str(HERE / "stalls.py"),
+                str(self.folder / "stalls.txt"),
+                str(core),
+                above,
+            ]
+            process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+            self._stack.callback(process.wait)
+            self._stack.callback(process.kill)
+
+    def end(self) -> None:
+        """Stop all politely, in the order of a supervisor; what does not stop is killed, and is an event."""
+        self.restarts = False
+        self.ended_at = clock.now()
+        for name in STOP_ORDER:
+            running = self.processes[name]
+            running.signal(signal.SIGTERM)
+            deadline = clock.now() + STOP_S
+            while running.alive and clock.now() < deadline:
+                self.look()
+            if running.alive:
+                self.note(f"{name} did not stop")
+                running.signal(signal.SIGKILL)
+
+    def _kill_all(self) -> None:
+        for running in self.processes.values():
+            running.signal(signal.SIGKILL)
+        for running in self.processes.values():
+            if running.popen is not None:
+                running.popen.communicate()
+
+    # -- time ----------------------------------------------------------
+
+    def look(self) -> None:
+        """A hundredth of a second: hear what was said, start again what has died."""
+        clock.sleep_until(clock.now() + LOOK_S)
+        assert self._mailbox is not None
+        prefix = topics.everything(self.config.name).removesuffix("**")
+        for delivery in self._mailbox.drain():
+            at, topic = delivery.received_ns * 1e-9, delivery.key.removeprefix(prefix)
+            if self.first_command is None and topic == self._command_key:
+                self.first_command = at
+            self.heard.append(Heard(at, topic, delivery.payload))
+        router = self.processes["router"]
+        if (starts := len(router.started)) not in self.listening_at and router.said().count(
+            LISTENING
+        ) >= starts:
+            self.listening_at[starts] = clock.now()
+        for name in RESTARTED if self.restarts else ():
+            running = self.processes[name]
+            if not running.started or running.alive:
+                continue
+            if running.restart_at is None:
+                running.restart_at = clock.now() + RESTART_S
+            elif clock.now() >= running.restart_at:
+                running.restart_at = None
+                running.start()
+                self.note(f"{running.name} started again")
+
+    def run_for(self, seconds: float) -> None:
+        """Let the run go on."""
+        self.run_until(clock.now() + seconds)
+
+    def run_until(self, moment: float) -> None:
+        """Let the run go on until `moment` on the monotonic clock."""
+        while clock.now() < moment:
+            self.look()
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Let the run go on until something is so. Raises `RigError` when it is not in time."""
+        deadline = clock.now() + timeout_s
+        while not condition():
+            if clock.now() > deadline:
+                dead = [f"{p.name}:\n{p.said()[-800:]}" for p in self.processes.values() if not p.alive]
+                raise RigError(f"not within {timeout_s:g} s: {what}. {' '.join(dead)}")
+            self.look()
+
+    # -- faults --------------------------------------------------------
+
+    def note(self, text: str) -> None:
+        """Remember that something was done now."""
+        self.events.append((clock.now(), text))
+
+    def kill(self, *names: str) -> None:
+        """kill -9 of these at once."""
+        self.note(f"kill {' and '.join(names)}")
+        for name in names:
+            self.processes[name].killed.append(clock.now())
+            self.processes[name].signal(signal.SIGKILL)
+
+    def freeze(self, name: str, seconds: float) -> None:
+        """SIGSTOP, and SIGCONT after a while."""
+        self.note(f"stop {name}")
+        self.processes[name].signal(signal.SIGSTOP)
+        self.run_for(seconds)
+        self.processes[name].signal(signal.SIGCONT)
+        self.note(f"{name} goes on")
+
+    def shape(self, name: str, shape: links.Shape, seconds: float) -> None:
+        """What happens to the packets of the plant's or the trainer's link for a while."""
+        self.note(f"{name}'s link: {shape}")
+        self.links[name].shape(shape)
+        self.run_for(seconds)
+        self.links[name].shape(links.Shape())
+        self.note(f"{name}'s link is back")
+
+    def attack(self, kind: str, rate: float, seconds: float, seed: int) -> dict[str, float]:
+        """Let a stranger send bad messages for a while; how many it sent, by topic."""
+        words = [sys.executable, "-m", "tests.faults.attacker", str(self.folder / "attacker.toml")]
+        file = self.folder / "attacker.toml"
+        file.write_text(to_toml(self.config), encoding="utf-8")
+        self.note(f"attack: {kind}")
+        out, err = self.folder / "attacker.json", self.folder / "attacker.txt"
+        with out.open("wb") as stdout, err.open("wb") as stderr:
+            words += [kind, str(rate), str(seconds), str(seed)]
+            process = subprocess.Popen(words, stdout=stdout, stderr=stderr, cwd=ROOT)
+            self._stack.callback(process.wait)
+            self._stack.callback(process.kill)
+            self.wait(lambda: process.poll() is not None, seconds + 15.0, "the attacker's end")
+        if process.returncode:
+            raise RigError(f"the attacker failed: {err.read_text()[-800:]}")
+        self.note("the attack is over")
+        sent: dict[str, float] = msgspec.json.decode(out.read_bytes(), type=dict[str, float])
+        return {f"sent {topic}": count for topic, count in sent.items()}
+
+    # -- what is known while it runs -------------------------------------
+
+    def health(self, process: str) -> list[tuple[float, m.Health]]:
+        """All that a process said of itself so far, and when it was heard."""
+        topic = topics.HEALTH[process]
+        return [
+            (heard.at, message)
+            for heard in self.heard
+            if heard.topic == topic.name and isinstance(message := _decoded(topic, heard), m.Health)
+        ]
+
+    def _ready(self, name: str) -> bool:
+        return any(health.status in ("ready", "running") for _, health in self.health(name))
+
+
+def _decoded(topic: topics.Topic, heard: Heard) -> m.Message | None:
+    try:
+        return codec.decode(topic, heard.payload)
+    except codec.BadMessage:
+        return None
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,89 @@
+"""What surrounds a run from its start until its figures are gathered: a disk that can fail, a clock that can step.
+
+Each is a context manager that is given the run's folder and yields what the processes need in their environment.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+Environment = dict[str, dict[str, str]]
+"""Variables of each process, by its name; those under "" are everybody's."""
+Scene = Callable[[Path], AbstractContextManager[Environment]]
+
+DISK, BALLAST, OFFSET = "disk", "ballast", "clock.offset"
+
+
+@contextmanager
+def nothing(folder: Path) -> Iterator[Environment]:
+    """The usual."""
+    yield {}
+
+
+@contextmanager
+def memory_disk(folder: Path) -> Iterator[Environment]:
+    """The log lies on a small disk of its own, which `fill` can fill."""
+    with _mounted(folder, "-t", "tmpfs", "-o", "size=32m", "tmpfs"):
+        yield {}
+
+
+def fill(folder: Path) -> None:
+    """From now on nothing more can be written to the log's disk."""
+    free = os.statvfs(folder / DISK)
+    with (folder / DISK / BALLAST).open("wb") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, free.f_bavail * free.f_frsize)
+
+
+def empty(folder: Path) -> None:
+    """There is room again."""
+    (folder / DISK / BALLAST).unlink()
+
+
+@contextmanager
+def real_disk(folder: Path) -> Iterator[Environment]:
+    """The log lies on an ext4 file system of its own, which `write_protect` can make read-only under way."""
+    image = folder / "image"
+    with image.open("wb") as file:
+        file.truncate(64 * 1024 * 1024)
+    subprocess.run(["mkfs.ext4", "-q", str(image)], check=True, capture_output=True)
+    with _mounted(folder, "-o", "loop", str(image)):
+        yield {}
+    image.unlink()
+
+
+def write_protect(folder: Path) -> None:
+    """As Linux does by itself after an error of the disk: read-only from now on, for files that are open too."""
+    subprocess.run(["mount", "-o", "remount,abort", str(folder / DISK)], check=True, capture_output=True)
+
+
+@contextmanager
+def _mounted(folder: Path, *words: str) -> Iterator[None]:
+    place = folder / DISK
+    place.mkdir(parents=True, exist_ok=True)
+    subprocess.run(["mount", *words, str(place)], check=True, capture_output=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(place)], check=True, capture_output=True)
+
+
+@contextmanager
+def own_wall_clock(folder: Path) -> Iterator[Environment]:
+    """All processes have a wall clock that `step_clock` can step; the machine's own stays as it is."""
+    folder.mkdir(parents=True, exist_ok=True)
+    library, offset = folder / "clock_shim.so", folder / OFFSET
+    source = Path(__file__).with_name("clock_shim.c")
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"], check=True)
+    offset.write_bytes(struct.pack("@q", 0))
+    yield {"": {"LD_PRELOAD": str(library), "TANDEM_CLOCK_OFFSET": str(offset)}}
+
+
+def step_clock(folder: Path, seconds: float) -> None:
+    """Step the wall clock of all processes of the run, for good."""
+    with (folder / OFFSET).open("r+b") as file:
+        file.write(struct.pack("@q", round(seconds * 1e9)))

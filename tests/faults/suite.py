@@ -1,0 +1,134 @@
+"""Runs faults: which moment, which seed, what is kept. One run is one line of a file, so that a suite can go on."""
+
+from __future__ import annotations
+
+import shutil
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from node_runtime import clock
+from node_runtime.config import Config, override
+from run_log.errors import LogError
+
+from .facts import Facts, gather
+from .faults import Fault, Stage
+from .rig import Place, Rig, RigError
+from .scenes import nothing
+
+EARLIEST_S = 0.3
+"""After the first command; what comes before concerns no run."""
+SETTLED_S = 4.0
+"""The fault comes within so many seconds of the beginning, where the plant moves most."""
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """One run, as it stands in the file."""
+
+    fault: str
+    """Empty: without one."""
+    stage: str
+    index: int
+    seed: int
+    at: float
+    """When, in seconds after the first command."""
+    wall_s: float
+    facts: Facts | None
+    error: str = ""
+    """Why there are no facts."""
+    not_held: list[str] = []
+
+
+def moment(fault: Fault, index: int, seed: int) -> float:
+    """When the fault comes in its `index`-th run, seconds after the first command."""
+    rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode()), index])
+    return float(rng.uniform(EARLIEST_S, SETTLED_S))
+
+
+def run(
+    stage: Stage, fault: Fault | None, index: int, seed: int, folder: Path, settings: list[str]
+) -> Outcome:
+    """One run with a fault, or one without; its folder is kept only where something did not hold."""
+    began = clock.now()
+    at = 0.0 if fault is None else moment(fault, index, seed)
+    config = override(Config(seed=seed + index), [*stage.settings, *settings])
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    facts, error = None, ""
+    try:
+        facts = _live(stage, fault, at, config, folder)
+    except (RigError, LogError) as problem:
+        error = str(problem)
+    return Outcome(
+        fault="" if fault is None else fault.name,
+        stage=stage.name,
+        index=index,
+        seed=seed,
+        at=at,
+        wall_s=clock.now() - began,
+        facts=facts,
+        error=error,
+    )
+
+
+def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: Path) -> Facts:
+    scene = nothing if fault is None else fault.scene
+    with scene(folder) as environment:
+        places: dict[str, Place] = {"plant": stage.plant, "trainer": stage.trainer}
+        rig = Rig(folder, config, places, environment=environment, seed=config.seed)
+        extra = _hurt(rig, stage, fault, at)
+        # While the log's disk is still there.
+        return gather(rig, stage.seconds, extra)
+
+
+def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, float]:
+    """The run itself, from the start of its processes to their end; what the fault measured."""
+    extra: dict[str, float] = {}
+    with rig:
+        assert rig.first_command is not None
+        if fault is not None:
+            rig.run_until(rig.first_command + at)
+            extra = fault.inflict(rig, rig.config.seed) or {}
+            rig.run_for(fault.after)
+        rig.run_until(rig.first_command + stage.seconds)
+        rig.end()
+    return extra
+
+
+def judged(outcome: Outcome, fault: Fault, calm: Facts) -> Outcome:
+    """With what did not hold."""
+    if outcome.facts is None:
+        return msgspec.structs.replace(outcome, not_held=[outcome.error])
+    found = [why for held in fault.holds if (why := held(outcome.facts, calm)) is not None]
+    return msgspec.structs.replace(outcome, not_held=found)
+
+
+class Results:
+    """The file of outcomes; what is in it is not run again."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = path.read_bytes().splitlines() if path.exists() else []
+        decoder = msgspec.json.Decoder(Outcome)
+        self.outcomes = [decoder.decode(line) for line in lines]
+
+    def find(self, fault: str, stage: str, index: int, seed: int) -> Outcome | None:
+        for outcome in self.outcomes:
+            if (outcome.fault, outcome.stage, outcome.index, outcome.seed) == (fault, stage, index, seed):
+                return outcome
+        return None
+
+    def get(self, make: Callable[[], Outcome], fault: str, stage: str, index: int, seed: int) -> Outcome:
+        """From the file, or made and put there. A run without facts is kept, but made again next time."""
+        found = self.find(fault, stage, index, seed)
+        if found is not None and found.facts is not None:
+            return found
+        made = make()
+        self.outcomes = [outcome for outcome in self.outcomes if outcome is not found] + [made]
+        with self.path.open("ab") as file:
+            file.write(msgspec.json.encode(made) + b"\n")
+        return made
