@@ -29,7 +29,7 @@ from node_runtime.realtime import READER_PRIORITY, punctual
 
 from . import link, table
 from .faults import ALL, Fault, Stage
-from .suite import Outcome, Results, judged, run
+from .suite import Outcome, Results, ResultsError, judged, run
 from .table import DocumentError, Pair
 
 START_AND_STOP_S = 8.0
@@ -93,7 +93,7 @@ def main(settings: Suite) -> int:
         sys.stdout.write(text + "\n")
         if settings.document is not None:
             table.put(settings.document, text)
-    except DocumentError as error:
+    except (DocumentError, ResultsError) as error:
         console.print(str(error), markup=False)
         return 2
     return int(any(pair.outcome.not_held for found in pairs.values() for pair in found))

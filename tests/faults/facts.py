@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from benchmarks import stalls
 from lbmpc.plants import Plant, get_plant
 from node_runtime.config import ConfigError
 from node_runtime.mailbox import Delivery
@@ -174,7 +175,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         log_missing=_missing(rig, witness, log),
         replay=replayed,
         forged_adopted=_forged_adopted(witness),
-        rolled_back=sum("rolled back" in r.weights_verdict for r in results),
+        rolled_back=sum(bool(r.weights_rolled_back) for r in results),
         view_at_end=_view(rig),
         log_time_off=_log_time_off(log),
         verdicts=dict(Counter(_short(r.weights_verdict) for r in results if r.weights_verdict != "none")),
@@ -250,7 +251,7 @@ def _late(
 ) -> tuple[int, int]:
     """Late or skipped: how many, and how many of them while the machine itself stood still."""
     period, share = rig.config.period, rig.config.controller.late_fraction
-    stalls = _stalls(rig)
+    noted = stalls.read(rig.folder / "stalls.txt")
     hurt = any("controller" in text for _, text in rig.events)
     until = math.inf if control_at is None else control_at + SETTLE_S
     intervals = [(one.state.t, one.at) for one in sampled if one.at - one.state.t > share * period]
@@ -266,15 +267,8 @@ def _late(
         end = tick.state.t + tick.lateness + (cost.tick_ms * 1e-3 if overrun and cost else 0.0) + 0.002
         if not (hurt and begin < until and end > fault_at):
             intervals += [(begin, end)] * max(1, tick.skipped)
-    excused = sum(any(due < end and due + late > begin for due, late in stalls) for begin, end in intervals)
+    excused = sum(stalls.during(noted, begin, end) for begin, end in intervals)
     return len(intervals), excused
-
-
-def _stalls(rig: Rig) -> list[tuple[float, float]]:
-    path = rig.folder / "stalls.txt"
-    lines = path.read_text().splitlines() if path.exists() else []
-    words = (line.split() for line in lines)
-    return [(float(pair[0]), float(pair[1])) for pair in words if len(pair) == 2]
 
 
 # -- learning -------------------------------------------------------------

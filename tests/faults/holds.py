@@ -103,10 +103,17 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
     for topic, process in OBEYED.items():
         sent = int(run.extra.get(f"sent {topic}", 0))
         found = {name: count for name, count in run.counted.items() if name.startswith(f"{process} ")}
-        bad = sum(count for name, count in found.items() if name.startswith(f"{process} bad {topic}:"))
+        reasons = {
+            name.partition(": ")[2]: n
+            for name, n in found.items()
+            if name.startswith(f"{process} bad {topic}:")
+        }
+        bad = sum(reasons.values())
+        # What the run's own trainer sent may be refused too.
+        surely = bad - sum(reasons.get(reason, 0) for reason in ("refused", "for another run"))
         # A flood makes room in a full mailbox by dropping the oldest, whosever it was.
         dropped = found.get(f"{process} overflow {topic}", 0)
-        if not bad <= sent <= bad + dropped:
+        if not surely <= sent <= bad + dropped:
             return f"{sent} sent to {topic}, {bad} counted by the {process}, {dropped} dropped"
     return None
 

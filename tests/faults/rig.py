@@ -16,6 +16,7 @@ from typing import Literal
 
 import msgspec
 
+from benchmarks import stalls
 from node_runtime import clock
 from node_runtime.bus import Bus, Mailbox
 from node_runtime.config import Config, override, to_toml
@@ -163,7 +164,7 @@ class Rig:
         self._stack.callback(self._kill_all)
         for name in COMMANDS:
             self.processes[name] = self._prepare(name)
-        self._watch_the_machine()
+        self._stack.enter_context(stalls.watched(self.folder / "stalls.txt", self.config.realtime.priority))
         for running in self.processes.values():
             running.start()
         deadline = clock.now() + READY_S
@@ -209,21 +210,6 @@ class Rig:
             words = [*child, COMMANDS[name], "--config", str(file)]
         environment = self._environment.get("", {}) | self._environment.get(name, {})
         return Running(name, [*prefix, *words], environment, self.folder / f"{name}.txt")
-
-    def _watch_the_machine(self) -> None:
-        priority = self.config.realtime.priority
-        for core in sorted(os.sched_getaffinity(0)):
-            above = str(priority + 5 if priority else 0)
-            words = [
-                sys.executable,
-                str(HERE / "stalls.py"),
-                str(self.folder / "stalls.txt"),
-                str(core),
-                above,
-            ]
-            process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
-            self._stack.callback(process.wait)
-            self._stack.callback(process.kill)
 
     def end(self) -> None:
         """Stop all politely, in the order of a supervisor; what does not stop is killed, and is an event."""

@@ -106,18 +106,31 @@ def judged(outcome: Outcome, fault: Fault, calm: Facts) -> Outcome:
     return msgspec.structs.replace(outcome, not_held=found)
 
 
+class ResultsError(Exception):
+    """The results of an earlier run cannot be gone on from; the text says why and what to do."""
+
+
 class Results:
     """The file of outcomes; what is in it is not run again."""
 
     def __init__(self, path: Path):
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        lines = path.read_bytes().splitlines() if path.exists() else []
+        text = path.read_bytes() if path.exists() else b""
+        whole = text[: text.rfind(b"\n") + 1]
+        if whole != text:
+            # The suite was killed while it wrote a line.
+            path.write_bytes(whole)
         decoder = msgspec.json.Decoder(Outcome)
-        self.outcomes = [decoder.decode(line) for line in lines]
+        try:
+            self.outcomes = [decoder.decode(line) for line in whole.splitlines()]
+        except msgspec.ValidationError as error:
+            raise ResultsError(
+                f"{path} is of another version of the suite ({error}); begin again with --fresh"
+            ) from None
 
     def find(self, fault: str, stage: str, index: int, seed: int) -> Outcome | None:
-        for outcome in self.outcomes:
+        for outcome in reversed(self.outcomes):
             if (outcome.fault, outcome.stage, outcome.index, outcome.seed) == (fault, stage, index, seed):
                 return outcome
         return None

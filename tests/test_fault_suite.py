@@ -1,0 +1,332 @@
+"""The fault suite itself: what its checks see, that it goes on where it stopped, and three faults on real processes."""
+
+from __future__ import annotations
+
+import ast
+import socket
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from faults import facts as measured
+from faults import holds, link, suite, table
+from faults.facts import Facts
+from faults.faults import ALL, BY_NAME, Fault, Stage
+from faults.rig import Rig
+from faults.suite import Outcome, Results
+from faults.traced_plant import Sampled
+
+from benchmarks import stalls
+from node_runtime import clock
+from protocol import messages as m
+
+ROOT = Path(__file__).resolve().parent.parent
+CALM = Facts(
+    violations=0,
+    deepest=0.0,
+    cost=24.0,
+    samples=200,
+    ticks=200,
+    late=0,
+    late_by_machine=0,
+    tick_p99_ms=5.0,
+    sources=["command"],
+    plan_s=0.0,
+    safe_s=0.0,
+    ready_after=None,
+    control_after=0.0,
+    burst=2,
+    foreign_commands=0,
+    foreign_states=0,
+    samples_made=199,
+    samples_held=199,
+    readable_gap=None,
+    log_missing=0,
+    replay="exact",
+    forged_adopted=0,
+    rolled_back=0,
+    view_at_end="recorder running writing run.mcap",
+    log_time_off=0.0,
+    verdicts={},
+    counted={},
+    said=[],
+    extra={},
+)
+
+
+def seen(**changes: Any) -> Facts:
+    return msgspec.structs.replace(CALM, **changes)
+
+
+@pytest.mark.parametrize(
+    ("check", "bad"),
+    [
+        (holds.constraints, {"violations": 1}),
+        (holds.control_back, {"control_after": 1.2}),
+        (holds.control_back, {"control_after": None}),
+        (holds.control_kept, {"plan_s": 0.1}),
+        (holds.punctual, {"late": 3, "late_by_machine": 2}),
+        (holds.no_burst, {"burst": 3}),
+        (holds.plan_then_safe, {"sources": ["command", "safe", "command"]}),
+        (holds.merged, {"samples_held": 198}),
+        (holds.merged, {"samples_held": 200}),
+        (holds.merged, {"samples_held": None}),
+        (holds.readable, {"readable_gap": 0.7}),
+        (holds.readable, {"readable_gap": 0.1, "replay": "DIFFERS: x"}),
+        (holds.readable, {"readable_gap": 0.1, "log_missing": 1}),
+        (holds.replays, {"replay": "no replay: it is empty"}),
+        (holds.whole, {"replay": "exact, but 3 ticks are not in the log"}),
+        (holds.none_obeyed, {"foreign_commands": 1}),
+        (holds.none_obeyed, {"foreign_states": 1}),
+        (
+            holds.all_counted,
+            {"extra": {"sent plant/state": 2}, "counted": {"controller bad plant/state: x": 1}},
+        ),
+        (holds.all_counted, {"counted": {"plant bad controller/command: foreign": 1}}),
+        (holds.weights_refused, {"extra": {"sent trainer/hidden_weights": 3}, "forged_adopted": 1}),
+        (holds.weights_refused, {}),
+        (holds.view_says, {}),
+        (holds.view_said, {}),
+        (holds.log_time, {"log_time_off": 3600.0}),
+        (holds.as_fast, {"tick_p99_ms": 10.0}),
+        (holds.as_good, {"cost": 25.3}),
+    ],
+)
+def test_every_check_can_fail(check: holds.Held, bad: dict[str, Any]) -> None:
+    assert check(seen(**bad), CALM)
+
+
+def test_every_check_can_hold() -> None:
+    good = seen(
+        late=2,
+        late_by_machine=2,
+        readable_gap=0.4,
+        sources=["command", "plan", "safe", "command"],
+        extra={"sent plant/state": 3, "sent trainer/hidden_weights": 2},
+        counted={
+            "controller bad plant/state: malformed": 2,
+            "controller overflow plant/state": 1,
+            "controller bad trainer/hidden_weights: refused": 2,
+        },
+        said=["recorder: NOT LOGGED: full"],
+    )
+    checks = {held for fault in ALL for held in fault.holds} - {holds.view_says}
+    assert [check(good, CALM) for check in checks] == [None] * len(checks)
+    assert holds.view_says(seen(view_at_end="recorder silent"), CALM) is None
+
+
+def sampled(source: str, t: float) -> Sampled:
+    state = m.PlantState(
+        run_id="plant-1",
+        seq=0,
+        t=t,
+        x=[0.0],
+        applied=[0.0],
+        source=source,
+        command_seq=0,  # type: ignore[arg-type]
+    )
+    return Sampled(t, state)
+
+
+def test_control_is_back_with_the_first_fresh_command_that_is_followed_by_no_outage() -> None:
+    sources = (
+        ["command"] * 3
+        + ["plan", "safe", "command", "plan", "command", "command"]
+        + ["command"] * 20
+        + ["plan"]
+    )
+    motion = [sampled(source, 0.1 * i) for i, source in enumerate(sources)]
+    assert measured._control_at(motion, 0.25, 0.45) == pytest.approx(0.7)
+    assert measured._control_at(motion[:3], 0.05, None) == 0.05
+    assert measured._control_at(motion[:5], 0.25, None) is None
+
+
+def test_a_burst_is_what_arrives_within_a_period() -> None:
+    assert measured._burst([0.0, 0.05, 0.1, 0.101, 0.102, 0.15], 0.05) == 3
+    assert measured._burst([], 0.05) == 0
+
+
+def test_a_stall_excuses_what_it_overlaps(tmp_path: Path) -> None:
+    path = tmp_path / "stalls.txt"
+    path.write_text("10.0 0.02\n5.0 0.5\n11.")
+    noted = stalls.read(path)
+    assert noted == [(5.0, 0.5), (10.0, 0.02)]
+    assert stalls.during(noted, 10.01, 10.5)
+    assert not stalls.during(noted, 5.6, 9.9)
+
+
+def test_moments_follow_from_the_seed_and_differ() -> None:
+    fault = ALL[0]
+    moments = [suite.moment(fault, index, 3) for index in range(20)]
+    assert moments == [suite.moment(fault, index, 3) for index in range(20)]
+    assert len(set(moments)) == 20
+    assert all(suite.EARLIEST_S <= at <= suite.SETTLED_S for at in moments)
+    assert moments[0] != suite.moment(ALL[1], 0, 3)
+    assert len(BY_NAME) == len(ALL)
+
+
+def outcome(index: int, facts: Facts | None = CALM, **more: Any) -> Outcome:
+    return Outcome(
+        fault=ALL[0].name, stage="usual", index=index, seed=0, at=1.0, wall_s=1.0, facts=facts, **more
+    )
+
+
+def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    path, made = tmp_path / "results.jsonl", []
+
+    def make() -> Outcome:
+        made.append(1)
+        return outcome(0, None if len(made) == 1 else CALM, error="the machine was too slow")
+
+    for expected in (1, 2, 2):
+        Results(path).get(make, ALL[0].name, "usual", 0, 0)
+        assert len(made) == expected
+    # A line that was being written when the suite was killed.
+    path.write_bytes(path.read_bytes() + b'{"fault": "kil')
+    assert Results(path).find(ALL[0].name, "usual", 0, 0) is not None
+    path.write_bytes(b'{"fault": "of another version"}\n')
+    with pytest.raises(suite.ResultsError, match="--fresh"):
+        Results(path)
+
+
+def test_the_table_names_what_did_not_hold(tmp_path: Path) -> None:
+    good = suite.judged(outcome(0), ALL[0], CALM)
+    bad = suite.judged(outcome(1, seen(violations=2, deepest=0.03)), ALL[0], CALM)
+    dead = suite.judged(outcome(2, None, error="no first command"), ALL[0], CALM)
+    text = table.markdown({ALL[0].name: [table.Pair(one, CALM) for one in (good, bad, dead)]}, ALL, ["head"])
+    row = next(line for line in text.splitlines() if line.startswith(f"| {ALL[0].name}"))
+    assert row.split(" | ")[1:5] == ["3", "1", "2, 0", "3.0, 0.0"]
+    assert "run 1 at 1.00 s: 2 samples outside, 0 without the fault" in text
+    assert "run 2 at 1.00 s: no first command" in text
+    document = tmp_path / "faults.md"
+    document.write_text(f"before\n{table.BEGIN}\nold\n{table.END}\nbehind\n")
+    table.put(document, text)
+    assert document.read_text().startswith(f"before\n{table.BEGIN}\n\nhead\n")
+    assert document.read_text().endswith(f"{table.END}\nbehind\n")
+    assert "\nold\n" not in document.read_text()
+    document.write_text("no marks")
+    with pytest.raises(table.DocumentError, match="lacks"):
+        table.put(document, text)
+
+
+ECHO = """
+import socket, sys
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as echo:
+    echo.bind(("0.0.0.0", 9999))
+    print("ready", flush=True)
+    while True:
+        data, whence = echo.recvfrom(100)
+        echo.sendto(data, whence)
+"""
+
+
+@pytest.mark.live
+@pytest.mark.skipif(not link.available(), reason="links to network namespaces need root")
+def test_a_wire_delays_drops_and_cuts() -> None:
+    with link.link("wire", 50) as wire, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
+        words = [*wire.prefix, sys.executable, "-c", ECHO]
+        with subprocess.Popen(words, stdout=subprocess.PIPE) as echo:
+            try:
+                assert echo.stdout is not None
+                assert echo.stdout.readline()
+                there = (wire.here.rpartition(".")[0] + f".{int(wire.here.rpartition('.')[2]) + 1}", 9999)
+
+                def answered(count: int, wait: float) -> list[float]:
+                    begin, times = clock.now(), []
+                    for number in range(count):
+                        here.sendto(b"%d" % number, there)
+                    here.settimeout(wait)
+                    try:
+                        while len(times) < count:
+                            here.recv(100)
+                            times.append(clock.now() - begin)
+                    except TimeoutError:
+                        pass
+                    return times
+
+                assert len(answered(5, 2.0)) == 5
+                wire.shape(link.Shape(delay=0.1))
+                assert min(answered(3, 2.0)) >= 0.2
+                wire.shape(link.Shape(loss=0.5))
+                assert 20 < len(answered(200, 0.5)) < 100
+                wire.shape(link.Shape(cut=True))
+                assert answered(3, 0.3) == []
+                wire.shape(link.Shape())
+                assert len(answered(5, 2.0)) == 5
+            finally:
+                echo.kill()
+
+
+WALL_CLOCK = {"time", "time_ns", "localtime", "gmtime", "ctime", "now", "today", "utcnow"}
+MAY_READ_IT = {
+    "node_runtime/health.py run_info": "for people: when this process began",
+    "controller_node/node.py main": "the same",
+    "run_log/record.py main": "the log's beginning",
+    "run_log/record.py _record": "once, the offset of all times in the log",
+    "node_runtime/credentials.py *": "certificates end at a date",
+    "tandem/keys*.py *": "the same",
+}
+
+
+def test_nothing_but_these_reads_the_wall_clock() -> None:
+    """So a step of it can change nothing else; `make faults` steps it, and this says why that holds."""
+    found = set()
+    for package in (
+        "lbmpc",
+        "protocol",
+        "node_runtime",
+        "controller_node",
+        "trainer_node",
+        "plant_sim",
+        "run_log",
+        "tandem",
+    ):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not isinstance(function, ast.FunctionDef):
+                    continue
+                for node in ast.walk(function):
+                    if (
+                        isinstance(node, ast.Attribute)
+                        and node.attr in WALL_CLOCK
+                        and isinstance(node.value, ast.Name)
+                        and node.value.id in ("time", "datetime", "date")
+                    ):
+                        found.add(f"{path.relative_to(ROOT)} {function.name}")
+    assert "run_log/record.py _record" in found
+    assert [place for place in found if not any(fnmatch(place, known) for known in MAY_READ_IT)] == []
+
+
+@pytest.mark.live
+def test_three_faults_on_real_processes(tmp_path: Path) -> None:
+    """A quick run of what `make faults` does at length: a frozen controller, garbage, a killed controller."""
+
+    def inflict(rig: Rig, seed: int) -> dict[str, float]:
+        rig.freeze("controller", 0.5)
+        sent = rig.attack("garbage", 500.0, 0.5, seed)
+        # The last counters that a killed process told of are up to half a second old.
+        rig.run_for(0.7)
+        rig.kill("controller")
+        return sent
+
+    settings = ("network.hidden=[6]", "controller.horizon=20", "controller.solver.compile=never")
+    stage = Stage("quick", plant="loopback", settings=settings, seconds=1.0)
+    checks = (
+        holds.no_burst,
+        holds.control_back,
+        holds.none_obeyed,
+        holds.all_counted,
+        holds.replays,
+    )
+    fault = Fault("three in turn", "quick", inflict, checks, stage, after=4.0)
+    ran = suite.run(stage, fault, 0, 1, tmp_path / "run", [])
+    assert ran.facts is not None, ran.error
+    assert suite.judged(ran, fault, ran.facts).not_held == []
+    assert ran.facts.extra["sent plant/state"] > 5
+    assert {"plan", "command"} <= set(ran.facts.sources)
+    assert ran.facts.ready_after is not None
+    assert ran.facts.ticks > 30
