@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import casadi as ca
@@ -11,6 +12,7 @@ from lbmpc.controller import Controller
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.dnn import Refit
+from lbmpc.oracles.trial import Trial
 from lbmpc.plants import Plant, get_plant
 from lbmpc.problem import build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
@@ -21,6 +23,8 @@ from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription
 
 Realise = Callable[[ca.Function], ca.Function]
+SHORTEST_WATCH = 8
+"""Samples, also where the loop is slow."""
 
 
 def build_plant(config: Config) -> Plant:
@@ -94,6 +98,22 @@ def build_oracle(config: Config, model: Model) -> Oracle:
         adaptation.initial_scale * period,
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
+        describe_trial(config),
+    )
+
+
+def describe_trial(config: Config) -> Trial | None:
+    """The trial of hidden weights at the configured rate; None where it is switched off."""
+    settings = config.adaptation.trial
+    if not settings.enabled:
+        return None
+    return Trial(
+        capacity=settings.samples,
+        stride=max(1, round(settings.seconds * config.rate / settings.samples)),
+        window=max(SHORTEST_WATCH, math.ceil(settings.confirm * config.rate - 1e-9)),
+        margin=settings.margin,
+        floor=settings.floor,
+        floor_after=settings.floor_after,
     )
 
 

@@ -14,6 +14,7 @@ import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -23,6 +24,7 @@ from controller_node.compile import Compiler
 from controller_node.sets import CertifiedSets, find_sets
 from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
+from lbmpc.oracles.dnn import IN_USE, NEWEST
 from lbmpc.rows import Box
 from lbmpc.solution import Solution
 from node_runtime.config import Config, to_json
@@ -30,6 +32,7 @@ from protocol import messages as m
 from protocol.codec import encode
 from protocol.network import hash_layers
 
+WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
 
 
@@ -106,7 +109,7 @@ class ControllerCore:
         self._timed.seconds = 0.0
         seen = self._observe(tick)
         self.state, result = self.controller.step(self.state, seen)
-        if result.verdict == "adopted":
+        if result.verdict == "adopted" or result.rolled_back:
             self._hidden_hash = self._hash_hidden()
         command = self._command(tick, result)
         return Outputs(
@@ -125,8 +128,7 @@ class ControllerCore:
     def keyframe(self, seq: int) -> m.Keyframe:
         """The whole memory after tick `seq`, -1 before the first."""
         arrays = {
-            name: m.Array.of(array, "<i8" if array.dtype.kind == "i" else "<f8")
-            for name, array in self.state.to_arrays().items()
+            name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in self.state.to_arrays().items()
         }
         return m.Keyframe(run_id=self.run_id, seq=seq, arrays=arrays)
 
@@ -154,7 +156,7 @@ class ControllerCore:
         return m.HiddenSnapshot(
             run_id=self.run_id,
             seq=seq,
-            hidden_version=self._version(),
+            hidden_version=self._version(NEWEST),
             hidden_sha256=self._hidden_hash,
             description=msgspec.json.encode(self.description).decode(),
             layers=layers,
@@ -244,6 +246,7 @@ class ControllerCore:
             weights_verdict=result.verdict,
             set_margin=result.first.margin if result.first else None,
             set_piece=result.first.piece if result.first else -1,
+            weights_rolled_back=result.rolled_back,
         )
 
     def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:
@@ -260,13 +263,13 @@ class ControllerCore:
         return m.OutputWeights(
             run_id=self.run_id,
             seq=tick.seq,
-            hidden_version=self._version(),
+            hidden_version=self._version(NEWEST),
             hidden_sha256=self._hidden_hash,
             K=m.Array.of(self.state.oracle["K"]),
         )
 
-    def _version(self) -> int:
-        return int(self.state.oracle["version"][0]) if self._dnn else -1
+    def _version(self, which: int = IN_USE) -> int:
+        return int(self.state.oracle["version"][which]) if self._dnn else -1
 
     def _hash_hidden(self) -> str:
         return hash_layers(self._dnn.hidden(self.state.oracle)) if self._dnn else ""

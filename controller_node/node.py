@@ -42,6 +42,7 @@ COUNTS = (
     "states stale",
     "weights adopted",
     "weights refused",
+    "weights rolled back",
 )
 
 
@@ -219,9 +220,10 @@ class ControllerNode:
             if len(self._unsent) >= self._samples_batch:
                 self._send_samples()
         adopted = outputs.result.weights_verdict == "adopted"
-        if outputs.output_weights is not None and (adopted or self._seq % self._weights_every == 0):
+        changed = adopted or bool(outputs.result.weights_rolled_back)
+        if outputs.output_weights is not None and (changed or self._seq % self._weights_every == 0):
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if adopted:
+        if changed:
             self._remember_hidden()
         if (self._seq + 1) % self._settings.keyframe_every == 0:
             self._keyframe_seq = self._seq
@@ -240,6 +242,9 @@ class ControllerNode:
         if verdict.startswith("refused"):
             counts["weights refused"] += 1
             self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", verdict)
+        if rolled_back := outputs.result.weights_rolled_back:
+            counts["weights rolled back"] += 1
+            log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
 
     def _send_samples(self) -> None:
         for batch in self._outbox.batches(self._unsent):

@@ -145,9 +145,7 @@ class _LockStep:
             self.plant.change(self.changes.pop(0)[1])
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
-        weights = None
-        while self.on_the_way and self.on_the_way[0][0] <= seq:
-            weights = self.on_the_way.pop(0)[1]
+        weights = self._arriving(seq)
         tick = m.Tick(
             run_id=CONTROLLER,
             seq=seq,
@@ -181,6 +179,13 @@ class _LockStep:
         self._learn(seq, outputs)
         if (seq + 1) % self.config.controller.keyframe_every == 0:
             self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
+
+    def _arriving(self, seq: int) -> m.HiddenWeights | None:
+        """The newest hidden weights that are here by now."""
+        weights = None
+        while self.on_the_way and self.on_the_way[0][0] <= seq:
+            weights = self.on_the_way.pop(0)[1]
+        return weights
 
     def _learn(self, seq: int, outputs: Outputs) -> None:
         if outputs.output_weights is not None:

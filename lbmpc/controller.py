@@ -1,7 +1,8 @@
 """One control step, pure: the same function live, in lock-step simulation and in replay.
 
 Within a step the order is what makes a swap of hidden weights correct: first the label of the previous input is
-learned with the features it was applied under, phi_j, then new hidden weights may come in, then the problem is solved.
+learned with the features it was applied under, phi_j, then hidden weights that disappoint may go and new ones may come
+in, then the problem is solved.
 """
 
 from __future__ import annotations
@@ -122,6 +123,8 @@ class StepResult:
     label: Label | None
     verdict: str
     """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
+    rolled_back: str
+    """Why the hidden weights and K from before came back; empty where they did not."""
     delay: float
     """Seconds for which the sample was predicted ahead, to when the command acts."""
     first: FirstInputs | None
@@ -182,6 +185,9 @@ class Controller:
         if seen.x is not None and not np.isfinite(seen.x).all():
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
+        rolled_back = ""
+        if label is not None and isinstance(self.oracle, DnnOracle):
+            oracle, rolled_back = self.oracle.confirm(oracle)
         oracle, verdict = self._adopt(oracle, seen.hidden)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
@@ -195,7 +201,7 @@ class Controller:
         x, u = s[: self.model.d], plan.v[0]
         predicted = follow(s, u, self.model.A @ x + self.model.B @ u + self.oracle.estimate(oracle, x, u))
         after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
-        return after, StepResult(plan.v, mode, solution, label, verdict, delay, first)
+        return after, StepResult(plan.v, mode, solution, label, verdict, rolled_back, delay, first)
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending

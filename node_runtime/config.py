@@ -120,6 +120,24 @@ class RefitConfig(Section, frozen=True):
     """Weight that holds K where it was."""
 
 
+class TrialConfig(Section, frozen=True):
+    """Of new hidden weights, before they are adopted and for a while after (docs/decisions/0020)."""
+
+    enabled: bool = True
+    seconds: Positive = 4.0
+    """How far the controller's own samples reach back, on which a set on offer is tried."""
+    samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
+    """How many there are of them; a fast loop takes one every few ticks, a slow one reaches further back."""
+    confirm: Positive = 1.0
+    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back."""
+    margin: NonNegative = 0.2
+    """Share by which the mean squared error of a new set may be larger than the old one's."""
+    floor: NonNegative = 0.003
+    """RMS error, as a share of `network.output_scale`, below which a set on offer is good enough in any case."""
+    floor_after: NonNegative = 0.1
+    """The same for a set that was adopted: what K has not learned yet is no reason to roll back."""
+
+
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
@@ -134,6 +152,7 @@ class AdaptationConfig(Section, frozen=True):
     at_adoption: AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
     refit: RefitConfig = RefitConfig()
+    trial: TrialConfig = TrialConfig()
 
 
 class L2nwConfig(Section, frozen=True):

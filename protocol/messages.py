@@ -209,6 +209,7 @@ class OutputWeights(Message, frozen=True):
     """K_t after the adaptation of tick `seq`, and which hidden weights it belongs to."""
 
     hidden_version: Sequence
+    """Highest that was adopted so far: what is trained next needs a higher one. After a rollback the hash says more."""
     hidden_sha256: Digest
     K: Array
     """(1 + n_L, d), first row the bias; scaled outputs."""
@@ -218,6 +219,7 @@ class HiddenSnapshot(Message, frozen=True):
     """The hidden weights that the controller holds, for a trainer that joins late; `run_id` is the controller's."""
 
     hidden_version: Sequence
+    """Highest that was adopted so far."""
     hidden_sha256: Digest
     description: str
     """The `NetworkDescription`, as JSON."""

@@ -160,6 +160,7 @@ def _error(data: Traces) -> Draw:
         for mask, marker, colour, label in (
             (data.adopted, "^", GREEN, "weights adopted"),
             (data.refused, "x", VERMILION, "weights refused"),
+            (data.rolled_back, "v", VERMILION, "weights rolled back"),
         ):
             if mask.any():
                 level = np.nanmax(_positive(data.error)) * 1.5 if np.isfinite(data.error).any() else 1.0
@@ -197,6 +198,7 @@ def _weights(data: Traces) -> Draw:
         for mask, marker, colour, label in (
             (data.adopted, "^", GREEN, "adopted"),
             (data.refused, "x", VERMILION, "refused"),
+            (data.rolled_back, "v", VERMILION, "rolled back"),
         ):
             if mask.any():
                 ax.plot(data.t[mask], data.version[mask], marker, color=colour, markersize=6, label=label)

@@ -42,6 +42,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Ticks of which the log lacks something: it never reached the recorder, and all figures lack it too."""
     weights_adopted: int
     weights_refused: int
+    weights_rolled_back: int
+    """Sets that were adopted and did not hold what their trial promised."""
     fallback_ticks: int
     """Ticks whose input did not come from the solver."""
     soft_ticks: int
@@ -140,6 +142,7 @@ def summarise(run: Run) -> Summary:
         lost_ticks=sum(count for _run_id, _first, count in lost_ticks(run)),
         weights_adopted=sum(r.weights_verdict == "adopted" for r in results),
         weights_refused=sum(r.weights_verdict.startswith("refused") for r in results),
+        weights_rolled_back=sum(bool(r.weights_rolled_back) for r in results),
         fallback_ticks=sum(r.mode != "solver" for r in results),
         soft_ticks=sum(r.slack > SOFT for r in results),
         constraint_violations=int(outside(motion, plant).sum()),

@@ -38,6 +38,7 @@ class Traces:
     """(n,) hidden weights in force, -1 before the first."""
     adopted: np.ndarray
     refused: np.ndarray
+    rolled_back: np.ndarray
     """(n,) booleans."""
     late: np.ndarray
     solve_ms: np.ndarray
@@ -79,6 +80,7 @@ def traces(run: Run) -> Traces:
         version=np.array([r.hidden_version for r in results]),
         adopted=np.array([r.weights_verdict == "adopted" for r in results]),
         refused=np.array([r.weights_verdict.startswith("refused") for r in results]),
+        rolled_back=np.array([bool(r.weights_rolled_back) for r in results]),
         late=np.array([key in ticks and ticks[key].late for key in keys]),
         solve_ms=np.array([timings[key].solve_ms if key in timings else np.nan for key in keys]),
         tick_ms=np.array([timings[key].tick_ms if key in timings else np.nan for key in keys]),

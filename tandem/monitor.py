@@ -107,6 +107,7 @@ class Snapshot:
     weights_version: int
     adopted: int
     refused: int
+    rolled_back: int
     loss: tuple[float, float] | None
     """Of the last training: before, after."""
     samples: int
@@ -151,7 +152,7 @@ class Monitor:
         self._trend: deque[float] = deque(maxlen=TREND_SECONDS)
         self._trend_second = 0
         self._first_slot = self._ticks = self._late = self._skipped = self._fallback = self._soft = 0
-        self._adopted = self._refused = 0
+        self._adopted = self._refused = self._rolled_back = 0
         self._outside = self._outside_now = 0
         self._events: deque[Event] = deque(maxlen=200)
         self._new_events: deque[Event] = deque(maxlen=200)
@@ -231,6 +232,9 @@ class Monitor:
                 f"tick {result.seq}: the command comes from {result.mode} ({result.status})", now, weight
             )
         self._take_margin(result, now)
+        if result.weights_rolled_back:
+            self._rolled_back += 1
+            self.say(f"tick {result.seq}: hidden weights {result.weights_rolled_back}", now, "bad")
         if result.weights_verdict == "adopted":
             self._adopted += 1
             self.say(f"tick {result.seq}: hidden weights {result.hidden_version} adopted", now, "good")
@@ -344,6 +348,7 @@ class Monitor:
             weights_version=result.hidden_version if result else -1,
             adopted=self._adopted,
             refused=self._refused,
+            rolled_back=self._rolled_back,
             loss=(self._weights.loss_before, self._weights.loss_after) if self._weights else None,
             samples=self._weights.samples if self._weights else 0,
             processes=tuple(self._row(name, now) for name in topics.PROCESSES),

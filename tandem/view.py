@@ -75,7 +75,9 @@ def line(now: Snapshot) -> str:
         parts.append(f"solve p50 {now.solve_ms[0]:.1f} p99 {now.solve_ms[1]:.1f} ms")
     if now.prediction_error is not None:
         parts.append(f"error {now.prediction_error:.1e}")
-    parts.append(f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused)")
+    parts.append(
+        f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused, {now.rolled_back} rolled back)"
+    )
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
@@ -233,6 +235,7 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("each second", spark(now.trend, max(4, width - 18))),
             ("weights", Text.assemble(f"version {_version(now)}   {now.adopted} adopted")),
             ("refused", _counted(now.refused, "sets")),
+            ("rolled back", _counted(now.rolled_back, "sets")),
             ("loss", Text(loss)),
             ("buffer", Text(f"{now.samples} samples")),
             ("bad messages", _counted(now.bad_messages, "not obeyed")),

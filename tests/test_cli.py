@@ -27,6 +27,7 @@ KEYS = {
         "lost_ticks",
         "weights_adopted",
         "weights_refused",
+        "weights_rolled_back",
         "fallback_ticks",
         "soft_ticks",
     ),

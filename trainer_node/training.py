@@ -183,7 +183,7 @@ class Trainer:
             raise _Kept("loss not lower")
         self._bases.move_to_end(output.hidden_sha256)
         self._take(trained)
-        self.version += 1
+        self.version = max(self.version, output.hidden_version) + 1
         self.counters["trained"] += 1
         return HiddenWeights(
             run_id=self.run_id,

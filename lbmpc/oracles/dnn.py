@@ -16,10 +16,11 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.adaptation import project_columns, refit
-from lbmpc.oracles import base
+from lbmpc.oracles import base, watch
 from lbmpc.oracles.backends import ACTIVATIONS, Numbers, Symbols
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.last_layer import LastLayer, Realise
+from lbmpc.oracles.trial import Finding, Trial, empty, newest, remember
 from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription, hash_layers, initial_hidden, why_unacceptable
 
@@ -27,6 +28,12 @@ SYMBOLS, NUMBERS = Symbols(), Numbers()
 Start = Literal["random", "zero", "pretrained"]
 """K_0: drawn with `initial_scale`; all zero; or drawn, then fitted to h = 0, the middle of W, all over X x U."""
 PRETRAINING, PRETRAINING_RIDGE = 2000, 1e-4
+IN_USE, NEWEST = 0, 1
+"""Entries of `version`: that of the hidden layers in use, and the highest that was ever adopted."""
+LEAP = 10**9
+"""By which a version may rise at once: after the largest number that there is nobody's weights would be newer."""
+Network = tuple[list[np.ndarray], np.ndarray]
+"""W_1..W_{L-1} and K."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,7 @@ class DnnOracle:
         initial_scale: standard deviation of the entries of K_0, in units of h.
         start: how K_0 comes about.
         refit: what happens to K when hidden layers are adopted; None: it is kept.
+        trial: what hidden layers must show before and after they are adopted; None: nothing.
     """
 
     name = "dnn"
@@ -60,6 +68,7 @@ class DnnOracle:
         initial_scale: float = 1e-3,
         start: Start = "random",
         refit: Refit | None = None,
+        trial: Trial | None = None,
     ):
         self.description = description
         self.d, self.m = description.states, description.inputs
@@ -67,7 +76,7 @@ class DnnOracle:
         self.output_scale = np.array(description.output_scale)
         self.input_scale = np.array(description.input_scale)
         self.bounds = column_bound / self.output_scale
-        self.initial_scale, self.start, self.refit = initial_scale, start, refit
+        self.initial_scale, self.start, self.refit, self.trial = initial_scale, start, refit, trial
         self.shapes = [*description.layer_shapes, (description.features, self.d)]
         self.parameters = sum(rows * columns for rows, columns in self.shapes)
         self.pairs = description.window
@@ -143,12 +152,15 @@ class DnnOracle:
         hidden = initial_hidden(self.description, rng)
         state = {f"W{i + 1}": layer for i, layer in enumerate(hidden)}
         state["K"] = self._first_K(hidden, rng)
-        state["version"] = np.zeros(1, dtype=np.int64)
+        state["version"] = np.zeros(2, dtype=np.int64)
         if self.pairs > 1:
             state["past"] = np.zeros((self.pairs - 1, self.d + self.m))
         if self.refit is not None:
             state["samples"] = np.zeros((self.refit.window, self.pairs * (self.d + self.m) + self.d))
             state["sampled"] = np.zeros(1, dtype=np.int64)
+        if self.trial is not None:
+            state |= empty(self.trial, self.pairs * (self.d + self.m) + self.d)
+            state |= watch.nothing(self.hidden(state), state["K"])
         return state
 
     def _first_K(self, hidden: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -203,13 +215,15 @@ class DnnOracle:
         learned = {**state, "K": K}
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
-        if self.refit is not None:
-            number = int(state["sampled"][0])
-            learned["samples"] = state["samples"].copy()
-            learned["samples"][number % self.refit.window] = np.concatenate(
-                [self.past(state).ravel(), x, u, h / self.output_scale]
-            )
-            learned["sampled"] = np.array([number + 1], dtype=np.int64)
+        if self.refit is not None or self.trial is not None:
+            row = np.concatenate([self.past(state).ravel(), x, u, h / self.output_scale])
+            if self.refit is not None:
+                number = int(state["sampled"][0])
+                learned["samples"] = state["samples"].copy()
+                learned["samples"][number % self.refit.window] = row
+                learned["sampled"] = np.array([number + 1], dtype=np.int64)
+            if self.trial is not None:
+                learned |= remember(self.trial, state, row)
         return learned
 
     def adopt(
@@ -220,9 +234,11 @@ class DnnOracle:
         Returns:
             The state and "adopted", or the state unchanged and "refused: <reason>".
         """
-        current = int(state["version"][0])
-        if version <= current:
-            return state, f"refused: version {version} is not newer than {current}"
+        known = int(state["version"][NEWEST])
+        if version <= known:
+            return state, f"refused: version {version} is not newer than {known}"
+        if version > known + LEAP:
+            return state, f"refused: version {version} leaps too far ahead of {known}"
         if network_sha256 != self.description.sha256():
             return state, "refused: trained for another network description"
         reason = why_unacceptable(self.description, layers)
@@ -230,9 +246,51 @@ class DnnOracle:
             return state, f"refused: {reason}"
         if hash_layers(layers) != sha256:
             return state, "refused: sha256 does not match the layers"
-        swapped = {f"W{i + 1}": layer.astype(float) for i, layer in enumerate(layers)}
-        swapped["version"] = np.array([version], dtype=np.int64)
-        return {**state, **swapped, "K": self._K_under(self.hidden(swapped), state)}, "adopted"
+        # What the hash is of.
+        hidden = [layer.astype(np.float32).astype(float) for layer in layers]
+        K = self._K_under(hidden, state)
+        watched: OracleState = {}
+        if self.trial is not None:
+            samples = newest(self.trial, state)
+            if len(samples) < self.trial.least:
+                return state, f"refused: trial: {len(samples)} samples so far, {self.trial.least} are needed"
+            found = self._compare(samples, (hidden, K), (self.hidden(state), state["K"]))
+            if self.trial.refuses(found):
+                return state, f"refused: trial: {found}"
+            watched = watch.adopted(self.trial, state, self.hidden(state), K)
+        swapped = {f"W{i + 1}": layer for i, layer in enumerate(hidden)}
+        swapped["version"] = np.array([version, version], dtype=np.int64)
+        return {**state, **swapped, **watched, "K": K}, "adopted"
+
+    def confirm(self, state: OracleState) -> tuple[OracleState, str]:
+        """After a sample was learned: whether the set that was adopted last holds what its trial promised.
+
+        Returns:
+            The state and "", or the state with the hidden layers and K from before, and a text that says why.
+        """
+        if self.trial is None or not watch.due(self.trial, state):
+            return state, ""
+        samples = newest(self.trial, state, watch.since(state))
+        before = watch.before(state, len(self.shapes) - 1)
+        found = self._compare(samples, (self.hidden(state), watch.K_adopted(state)), before)
+        if self.trial.regrets(found):
+            hidden, K = before
+            version = np.array([watch.version(state), state["version"][NEWEST]], dtype=np.int64)
+            text = f"version {int(state['version'][0])} back to version {int(version[0])}: {found}"
+            restored = {f"W{i + 1}": layer for i, layer in enumerate(hidden)}
+            return {**state, **restored, "K": K, "version": version, **watch.over(state)}, text
+        return (state if not watch.ends(state) else {**state, **watch.over(state)}), ""
+
+    def _compare(self, samples: np.ndarray, new: Network, old: Network) -> Finding:
+        """Two networks, each hidden layers and K, on the same samples, (n, row)."""
+        windows = samples[:, : -self.d].reshape(len(samples), self.pairs, self.d + self.m)
+        h = samples[:, -self.d :]
+
+        def error(hidden: list[np.ndarray], K: np.ndarray) -> float:
+            missed = self.features_of(hidden, windows) @ K - h
+            return float((missed * missed).sum() / max(1, len(samples)))
+
+        return Finding(error(*new), error(*old), len(samples))
 
     def _every_tick(self) -> LastLayer:
         if self._last_layer is None:

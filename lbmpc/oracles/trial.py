@@ -1,0 +1,92 @@
+"""Hidden weights on trial: before they are adopted, and for a while after.
+
+Both compare two networks, each with its K held still, on the controller's own labelled samples, which nobody else can
+write. A set on offer must not predict the newest samples worse than the network in use; a set that was adopted must not
+predict the samples that came since worse than the network that it replaced.
+
+    worse:   mean |h_hat_new - h|^2  >  max((1 + margin) mean |h_hat_old - h|^2, floor^2)
+
+in units of the network's output scale. Below the floor both are as good as perfect, and rounding decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+State = dict[str, np.ndarray]
+CHECKS = 4
+"""How often an adopted set is judged before it is confirmed."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a trial asks for."""
+
+    capacity: int
+    """Samples remembered, the newest."""
+    stride: int
+    """Every how manieth sample is remembered: a fast loop's neighbours say the same."""
+    window: int
+    """Samples, remembered or not, after which an adopted set is confirmed."""
+    least: int = 10
+    """Remembered samples without which nothing can be tried."""
+    margin: float = 0.2
+    """Share by which the mean squared error may be larger."""
+    floor: float = 0.003
+    """RMS error, of the output scale, below which a network on offer is good enough."""
+    floor_after: float = 0.1
+    """The same for one that was adopted."""
+
+    @property
+    def check_every(self) -> int:
+        """Samples between two judgements of an adopted set."""
+        return -(-self.window // CHECKS)
+
+    def refuses(self, found: Finding) -> bool:
+        """Whether a set on offer is not to be adopted."""
+        return not found.new <= max((1.0 + self.margin) * found.old, self.floor**2)
+
+    def regrets(self, found: Finding) -> bool:
+        """Whether a set that was adopted is to be rolled back."""
+        return not found.new <= max((1.0 + self.margin) * found.old, self.floor_after**2)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Two mean squared errors on the same samples."""
+
+    new: float
+    old: float
+    samples: int
+
+    def __str__(self) -> str:
+        return f"error {self.new**0.5:.3g} against {self.old**0.5:.3g} (RMS of {self.samples} samples, output scale)"
+
+
+# -- the ring of samples: rows (window of pairs, h / scale) ----------------------------------------------------------
+
+
+def empty(trial: Trial, row: int) -> State:
+    """No samples yet; `row`: entries of one."""
+    return {"recent": np.zeros((trial.capacity, row)), "seen": np.zeros(1, dtype=np.int64)}
+
+
+def remember(trial: Trial, state: State, row: np.ndarray) -> State:
+    """What one more sample changes."""
+    number = int(state["seen"][0])
+    changed = {"seen": np.array([number + 1], dtype=np.int64)}
+    if number % trial.stride == 0:
+        recent = state["recent"].copy()
+        recent[number // trial.stride % trial.capacity] = row
+        changed["recent"] = recent
+    return changed
+
+
+def newest(trial: Trial, state: State, since: int = 0) -> np.ndarray:
+    """The remembered samples numbered `since` or later, (n, row), in no particular order."""
+    stride, capacity = trial.stride, trial.capacity
+    end = -(-int(state["seen"][0]) // stride)
+    begin = max(end - capacity, -(-since // stride))
+    return state["recent"][np.arange(begin, end) % capacity]
