@@ -93,6 +93,8 @@ class ControllerConfig(Section, frozen=True):
     """A tick is late when it starts later than this share of a period after its slot."""
     phase_ms: NonNegative | None = None
     """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
+    checkpoint: str = ""
+    """File from which the controller takes its memory when it is started again; "": none."""
     solver: SolverConfig = SolverConfig()
 
 
@@ -180,9 +182,19 @@ class TrainerConfig(Section, frozen=True):
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
+class TlsConfig(Section, frozen=True):
+    keys: str | None = None
+    """Folder of this process's own certificate, as `tandem keys create` makes one for each role."""
+
+
 class BusConfig(Section, frozen=True):
     endpoint: str = "tcp/127.0.0.1:7447"
-    """Where the router listens; nodes are its clients."""
+    """Where the router listens; nodes are its clients. tls/HOST:PORT needs `tls.keys` (docs/remote.md)."""
+    remote: str | None = None
+    """Where the router listens for other machines as well: tls/0.0.0.0:7448. Only the router reads it."""
+    insecure: bool = False
+    """True: no warning that everybody who reaches a tcp/ endpoint beyond this machine may command the plant."""
+    tls: TlsConfig = TlsConfig()
     lease_ms: PositiveInt = 1500
     follow_silence: Positive = 1.0
     """Seconds of silence after which another process incarnation may take over a topic."""

@@ -1,18 +1,27 @@
-"""`tandem router`: the Zenoh router that all nodes are clients of."""
+"""`tandem router`: the Zenoh router that all nodes are clients of.
+
+It listens on `bus.endpoint`, and on `bus.remote` for other machines, where every client needs a certificate and may do
+what its role may (`protocol.rights`).
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 import logging
 import threading
 
 import zenoh
 
+from node_runtime import zenoh_log
+from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus, OpenInterrupted
 from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import punctual
-from node_runtime.session import lease_ms, session_config
+from node_runtime.session import lease_ms, secure, session_config
+from protocol import topics
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +31,7 @@ class RouterError(RuntimeError):
 
 
 class Router:
-    """A Zenoh session in router mode, listening on `config.bus.endpoint`. A context manager."""
+    """A Zenoh session in router mode, listening on `config.bus.endpoint` and `bus.remote`. A context manager."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -30,19 +39,35 @@ class Router:
         self._session: zenoh.Session | None = None
 
     def open(self) -> None:
-        """Listen. Raises `RouterError` when that is not possible, `ConfigError` when the endpoint is none."""
+        """Listen. Raises `RouterError` when that is not possible.
+
+        Raises:
+            ConfigError: an endpoint is none, or the router's certificate cannot be used.
+        """
         bus = self.config.bus
-        try:
-            self._session = zenoh.open(
-                session_config("router", bus.endpoint, lease_ms(self.config, "router"))
+        places = " and ".join(filter(None, (bus.endpoint, bus.remote)))
+        if bus.remote is not None and not secure(bus.remote):
+            raise ConfigError(
+                f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
             )
+        settings = None
+        if remote(self.config):
+            from node_runtime import access, credentials
+
+            own = credentials.of_process(bus.tls.keys, "router", self.config.name)
+            settings = access.router_settings(own, self.config.name)
+        routing = session_config(
+            "router", bus.endpoint, lease_ms(self.config, "router"), bus.remote, settings
+        )
+        try:
+            self._session = zenoh.open(routing)
         except zenoh.ZError as error:
             if "in use" in str(error):
                 raise RouterError(
-                    f"{bus.endpoint} is taken: another router may be running. "
-                    "Stop it, or set bus.endpoint to another port."
+                    f"{places} is taken: another router may be running. "
+                    "Stop it, or set bus.endpoint or bus.remote to another port."
                 ) from error
-            raise RouterError(f"the router cannot listen on {bus.endpoint}: {error}") from error
+            raise RouterError(f"the router cannot listen on {places}: {error}") from error
 
     def close(self) -> None:
         if self._session is not None:
@@ -57,20 +82,54 @@ class Router:
         self.close()
 
 
+def remote(config: Config) -> bool:
+    """Whether the router of this configuration listens where certificates are needed."""
+    return config.bus.remote is not None or secure(config.bus.endpoint)
+
+
+def open_to_all(endpoint: str) -> bool:
+    """Whether this is a plain endpoint that may be reached from elsewhere: none of loopback."""
+    protocol, _, place = endpoint.partition("/")
+    host = place.rpartition(":")[0].strip("[]")
+    if protocol != "tcp" or host == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:  # a name
+        return True
+
+
 def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it is none."""
+    """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it cannot be used."""
+    bad = BadMessages()
+    if open_to_all(config.bus.endpoint) and not config.bus.insecure:
+        log.warning(
+            "%s is neither encrypted nor authenticated: whoever reaches it may command the plant. Let it listen on "
+            "127.0.0.1, and on bus.remote for other machines (docs/remote.md); bus.insecure=true says that it is meant",
+            config.bus.endpoint,
+        )
     # Every state and every command passes through here, so the router must be as punctual as the loops.
     with (
         stopped_by_signals(stop) as stopping,
         punctual(config.realtime.priority, keep_awake=config.awake) as note,
+        contextlib.ExitStack() as while_listening,
     ):
+        if remote(config):
+            # At a thousand ticks a second a line of log for each message would cost more than the messages.
+            fast = config.rate > topics.GATHER_ABOVE
+            filters = zenoh_log.REFUSED if fast else zenoh_log.DENIED
+            while_listening.enter_context(zenoh_log.listening(bad, filters))
         try:
             with Router(config) as router:
                 log.info("router listening on %s", config.bus.endpoint)
+                if config.bus.remote is not None:
+                    log.info("and for other machines, with certificates, on %s", config.bus.remote)
                 # Its health travels like everybody else's, through a client of itself.
                 with (
                     Bus(config, "router", router.run_id, stopping) as bus,
-                    HealthPublisher(bus, run_info(config, "router", router.run_id), note=note) as health,
+                    HealthPublisher(
+                        bus, run_info(config, "router", router.run_id), bad.counters, note=note
+                    ) as health,
                 ):
                     health.set("running")
                     stopping.wait()

@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import threading
+from collections.abc import Mapping
 from concurrent.futures import Future
 from concurrent.futures import wait as wait_for
 from typing import Any, Literal
@@ -29,16 +30,25 @@ class OpenInterrupted(RuntimeError):
     """The process was told to stop while it still waited for the router."""
 
 
-def session_config(mode: Literal["client", "router"], endpoint: str, lease_ms: int) -> zenoh.Config:
-    """Zenoh's configuration: an explicit endpoint, no scouting, no shared memory.
+def session_config(
+    mode: Literal["client", "router"],
+    endpoint: str,
+    lease_ms: int,
+    remote: str | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> zenoh.Config:
+    """Zenoh's configuration: explicit endpoints, no scouting, no shared memory.
+
+    remote: where a router listens as well; more: settings on top, for links with certificates.
 
     Raises:
         ConfigError: `endpoint` is not like `tcp/127.0.0.1:7447`. Zenoh itself would try it again for ever.
     """
-    if not ENDPOINT.fullmatch(endpoint):
-        raise ConfigError(
-            f"bus.endpoint = {endpoint!r} is not an endpoint; write tcp/HOST:PORT, or tls/ or quic/ for tcp/"
-        )
+    for key, place in (("endpoint", endpoint), ("remote", remote)):
+        if place is not None and not ENDPOINT.fullmatch(place):
+            raise ConfigError(
+                f"bus.{key} = {place!r} is not an endpoint; write tcp/HOST:PORT, or tls/ or quic/ for tcp/"
+            )
     settings: dict[str, Any] = {
         "mode": mode,
         "scouting/multicast/enabled": False,
@@ -63,18 +73,23 @@ def session_config(mode: Literal["client", "router"], endpoint: str, lease_ms: i
         }
     else:
         settings |= {
-            "listen/endpoints": [endpoint],
+            "listen/endpoints": [endpoint] if remote is None else [endpoint, remote],
             "connect/endpoints": [],
             "listen/exit_on_failure": True,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": GIVE_UP_US,
         }
     config = zenoh.Config()
-    for key, value in settings.items():
+    for key, value in (settings | dict(more or {})).items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise ConfigError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
     return config
+
+
+def secure(endpoint: str) -> bool:
+    """Whether links to this endpoint need certificates."""
+    return endpoint.startswith(("tls/", "quic/"))
 
 
 def lease_ms(config: Config, process: str) -> int:
@@ -95,10 +110,19 @@ def connect(config: Config, stop: threading.Event, process: str) -> zenoh.Sessio
 
     Raises:
         OpenInterrupted: `stop` was set first.
-        ConfigError: the endpoint is none.
+        ConfigError: the endpoint is none; our certificate cannot be used; or the router and we refuse each other,
+            which no waiting heals. The text says why.
     """
     endpoint = config.bus.endpoint
-    client = session_config("client", endpoint, lease_ms(config, process))
+    door = None
+    if secure(endpoint):
+        # Only here, for a machine that needs no certificates loads nothing for them.
+        from node_runtime.door import Door
+
+        door = Door(config, process)
+    client = session_config(
+        "client", endpoint, lease_ms(config, process), more=None if door is None else door.settings
+    )
     result: Future[zenoh.Session] = Future()
 
     def open_session() -> None:
@@ -114,6 +138,9 @@ def connect(config: Config, stop: threading.Event, process: str) -> zenoh.Sessio
         if stop.is_set():
             result.add_done_callback(_discard)
             raise OpenInterrupted(f"stopped while waiting for the router at {endpoint}")
+        if door is not None and (reason := door.refused(clock.now() - started)) is not None:
+            result.add_done_callback(_discard)
+            raise ConfigError(f"no link to the router at {endpoint}: {reason}")
         if not told and clock.now() - started > 2.0:
             told = True
             log.warning("no router at %s yet; waiting for it (start it with `tandem router`)", endpoint)

@@ -20,6 +20,7 @@ from tyro.conf import Positional, Suppress, UseAppendAction, arg, subcommand
 
 from node_runtime.choices import OracleName, ProcessName, TighteningName
 from tandem.cli_base import FROM_CONFIG, Command, Configured
+from tandem.cli_keys import KeysCommand
 from tandem.cli_sets import SetsCommand
 
 
@@ -39,6 +40,8 @@ class Run(Configured):
     """Of everything random."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
     """The log; a file of that name is moved aside, never overwritten. The picture lies beside it."""
+    no_trainer: bool = False
+    """Start no trainer here: it comes from another machine (docs/remote.md), or not at all."""
 
     def flags(self) -> dict[str, tuple[str, Any]]:
         return {
@@ -52,7 +55,9 @@ class Run(Configured):
         config, given = self.resolve()
         from tandem import run_command
 
-        return run_command.run(config, self.seconds, "endpoint" in given.get("bus", {}), self.json)
+        return run_command.run(
+            config, self.seconds, "endpoint" in given.get("bus", {}), self.json, trainer=not self.no_trainer
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,6 +308,7 @@ AnyCommand = (
     | Annotated[Health, subcommand("health")]
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[SetsCommand, subcommand("sets")]
+    | Annotated[KeysCommand, subcommand("keys")]
     | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[ConfigCommand, subcommand("config")]
 )

@@ -82,13 +82,21 @@ class Supervisor:
         monitor: is fed with everything on the bus.
         wish: when to stop.
         show: is called about five times a second with what there is to see.
+        trainer: False: none is started, for it runs elsewhere.
     """
 
     def __init__(
-        self, config: Config, config_file: Path, folder: Path, monitor: Monitor, wish: Wish, show: Show
+        self,
+        config: Config,
+        config_file: Path,
+        folder: Path,
+        monitor: Monitor,
+        wish: Wish,
+        show: Show,
+        trainer: bool = True,
     ):
         self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
-        table = [process for process in TABLE if process.name != "trainer" or trains(config)]
+        table = [process for process in TABLE if process.name != "trainer" or (trainer and trains(config))]
         self.children = {process.name: Child(process, config_file, folder) for process in table}
         self._bus: Bus | None = None
         self._mailbox: Mailbox | None = None

@@ -28,8 +28,10 @@ from tandem.screen import Screen
 INTERRUPTED = 130
 
 
-def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> int:
+def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool, trainer: bool = True) -> int:
     """Run everything for `seconds` from the first command; returns the exit code.
+
+    trainer: False: it runs elsewhere.
 
     Raises:
         Refused: there is nothing to run, or no place for the log.
@@ -50,7 +52,7 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> 
         files.config.write_text(to_toml(resolved), encoding="utf-8")
         monitor = Monitor(resolved, plant, seconds)
         try:
-            trouble, logged = _supervise(resolved, files, monitor, wish, console)
+            trouble, logged = _supervise(resolved, files, monitor, wish, console, trainer)
         except StartError as error:
             terminal.complain(f"{error}\nAll output is in {files.folder}.", as_json)
             return 2 if error.exit_code == 2 else 1
@@ -62,7 +64,7 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool) -> 
 
 
 def _supervise(
-    config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console
+    config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console, trainer: bool
 ) -> tuple[str | None, bool]:
     """Why the run ended badly, or None; and whether its log is whole."""
     priority = min(READER_PRIORITY, config.realtime.priority)
@@ -74,7 +76,7 @@ def _supervise(
             screen.show(now)
             garbage.idle()
 
-        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, show)
+        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, show, trainer)
         trouble = supervisor.run()
         return trouble, not supervisor.recorder_died
 

@@ -1,0 +1,83 @@
+"""Who may do what on the bus: the one table behind the router's rules and `tandem keys show`.
+
+What a role may publish follows from the writers in `protocol.topics`; what it may read, ask and answer is stated
+here. Whatever is not stated is denied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol import topics
+from protocol.topics import Topic
+
+OPERATOR = "operator"
+"""Whoever looks: `tandem health`, a live view. It publishes nothing."""
+ROLES = (*topics.PROCESSES, OPERATOR)
+READS_ALL = ("recorder", OPERATOR)
+QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
+
+_READS: dict[str, tuple[Topic, ...]] = {
+    "controller": (topics.PLANT_STATE, topics.HIDDEN_WEIGHTS),
+    "plant": (topics.COMMAND,),
+    "trainer": (topics.SAMPLES, topics.OUTPUT_WEIGHTS),
+}
+_ASKS: dict[str, tuple[str, ...]] = {"trainer": QUERIES}
+_ANSWERS: dict[str, tuple[str, ...]] = {"controller": QUERIES}
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What one role may do, for the plant of its certificate alone."""
+
+    role: str
+    publishes: tuple[Topic, ...]
+    reads: tuple[Topic, ...]
+    """Empty for who reads everything."""
+    reads_all: bool
+    asks: tuple[str, ...]
+    answers: tuple[str, ...]
+
+    def publish_keys(self, plant: str) -> list[str]:
+        """Every key that it may publish at."""
+        return _keys(self.publishes, plant)
+
+    def read_keys(self, plant: str) -> list[str]:
+        """Key expressions that it may subscribe to; what it hears is covered by them."""
+        return [topics.everything(plant)] if self.reads_all else _keys(self.reads, plant)
+
+    def ask_keys(self, plant: str) -> list[str]:
+        return [f"{topics.PREFIX}/{plant}/{name}" for name in self.asks]
+
+    def answer_keys(self, plant: str) -> list[str]:
+        return [f"{topics.PREFIX}/{plant}/{name}" for name in self.answers]
+
+
+def rights_of(role: str) -> Rights:
+    """The rights of one of `ROLES`. Raises `KeyError` for another word."""
+    if role not in ROLES:
+        raise KeyError(f"{role!r} is no role; one of {', '.join(ROLES)}")
+    return Rights(
+        role,
+        publishes=tuple(topic for topic in topics.ALL if topic.writer == role),
+        reads=_READS.get(role, ()),
+        reads_all=role in READS_ALL,
+        asks=_ASKS.get(role, ()),
+        answers=_ANSWERS.get(role, ()),
+    )
+
+
+def role_of(process: str) -> str:
+    """The role in which a process of this name speaks: its own, or the operator's."""
+    return process if process in topics.PROCESSES else OPERATOR
+
+
+def common_name(role: str, plant: str) -> str:
+    """The name in a certificate: `trainer.jet1`."""
+    return f"{role}.{plant}"
+
+
+def _keys(of: tuple[Topic, ...], plant: str) -> list[str]:
+    # A fast loop's control messages travel at their direct key as well.
+    direct = [topic.direct_key(plant) for topic in of if topic.gathered and topic.lane == "control"]
+    return [topic.key(plant) for topic in of] + direct
