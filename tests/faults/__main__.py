@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -87,6 +88,8 @@ def main(settings: Suite) -> int:
         if settings.fresh:
             shutil.rmtree(settings.out, ignore_errors=True)
         results = Results(settings.out / "results.jsonl")
+        # Ended politely by whatever way: namespaces, mounts and processes must not stay behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         with punctual(min(READER_PRIORITY, RealtimeConfig().priority), silent=True):
             pairs = _measure(settings, chosen, results, console)
         text = table.markdown(pairs, chosen, _head(settings))
@@ -96,6 +99,9 @@ def main(settings: Suite) -> int:
     except (DocumentError, ResultsError) as error:
         console.print(str(error), markup=False)
         return 2
+    except KeyboardInterrupt:
+        console.print(f"interrupted; the same command goes on from {settings.out}")
+        return 130
     return int(any(pair.outcome.not_held for found in pairs.values() for pair in found))
 
 

@@ -32,6 +32,7 @@ from .rig import RESTARTED, Rig, RigError
 from .traced_plant import Commanded, Sampled, read
 
 OTHERWISE = ("plan", "safe")
+COMMANDING = ("router", "controller")
 APART_S = 0.5
 BACK = ("goes on", "is back", "is over")
 """How events end that say that something is whole again."""
@@ -143,7 +144,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     deviation = (x - plant.x_e)[:, list(plant.performance)][: round(seconds * config.rate)]
 
     fault_at = rig.events[0][0] if rig.events else math.inf
-    back_at = _back_at(rig, witness, fault_at)
+    back_at = _back_at(rig, fault_at)
     control_at = _control_at(moving, fault_at, back_at)
     late, by_machine = _late(rig, witness, sampled, fault_at, control_at)
     timings, results = witness.messages(topics.TIMING), witness.messages(topics.RESULT)
@@ -195,20 +196,15 @@ def _deepest(x: np.ndarray, applied: np.ndarray, plant: Plant) -> float:
 # -- control ------------------------------------------------------------
 
 
-def _back_at(rig: Rig, witness: Witness, fault_at: float) -> float | None:
-    """When the last of what was hurt was there again: a new process's first word, a link, a continued process."""
-    moments = []
-    for name, running in rig.processes.items():
-        if not running.killed or name not in RESTARTED:
-            continue
-        if name == "router":
-            # Its own first word travels through itself; what it writes is as early as it can be known.
-            moments.append(rig.listening_at.get(len(running.started), math.inf))
-            continue
-        spoke = [at for at, _ in witness.health(name) if at > running.started[-1]]
-        moments.append(spoke[0] if spoke else math.inf)
+def _back_at(rig: Rig, fault_at: float) -> float | None:
+    """When the last of what was hurt was there again: a new process's first word, a link, a continued process.
+
+    Commands do not wait for a trainer, so beside others it does not count.
+    """
+    killed = [name for name in RESTARTED if rig.processes[name].killed]
+    moments = [rig.back_at(name) for name in killed if name in COMMANDING or len(killed) == 1]
     moments += [at for at, text in rig.events if text.endswith(BACK)]
-    known = [at for at in moments if at > fault_at and math.isfinite(at)]
+    known = [at for at in moments if at is not None and at > fault_at]
     return max(known) if known and len(known) == len(moments) else None
 
 

@@ -16,6 +16,8 @@ from .scenes import Scene
 ATTACK_RATE, WEIGHTS_RATE = 1000.0, 4.0
 """Messages a second."""
 ATTACK_S = 4.0
+RESTART_PATIENCE_S = 20.0
+"""A busy machine takes long to start a process; what is measured begins when it has started."""
 Inflict = Callable[[Rig, int], dict[str, float] | None]
 """Does the damage, from the moment it is called; with the run's seed. It may let the run go on meanwhile."""
 LINK = "plant's link"
@@ -64,6 +66,7 @@ def _kill(*names: str) -> Inflict:
         if len(processes) < len(names):
             # Longer than the lease: the router takes the plant for gone, and both must find each other again.
             rig.shape("plant", Shape(cut=True), 2.0)
+        rig.await_restarted(RESTART_PATIENCE_S)
 
     return inflict
 
@@ -77,7 +80,7 @@ def _kill_row(*names: str) -> Fault:
     killed = " and ".join(name for name in names if name != LINK)
     words = [f"kill -9 of {killed}"] if killed else []
     words += ["plant's link cut for 2 s"] if LINK in names else []
-    return Fault(", ".join(words), "kill", _kill(*names), tuple(checks), after=6.0)
+    return Fault(", ".join(words), "kill", _kill(*names), tuple(checks), span=3.5, after=2.0)
 
 
 def _freeze_row(seconds: float) -> Fault:

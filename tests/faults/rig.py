@@ -291,6 +291,23 @@ class Rig:
             self.processes[name].killed.append(clock.now())
             self.processes[name].signal(signal.SIGKILL)
 
+    def await_restarted(self, timeout_s: float) -> None:
+        """Let the run go on until all that was killed and is started again has spoken, at most for `timeout_s`."""
+        killed = [name for name in RESTARTED if self.processes[name].killed]
+        deadline = clock.now() + timeout_s
+        while clock.now() < deadline and not all(self.back_at(name) for name in killed):
+            self.look()
+
+    def back_at(self, name: str) -> float | None:
+        """When a process that was killed spoke again; None: not yet."""
+        running = self.processes[name]
+        if len(running.started) <= len(running.killed):
+            return None
+        if name == "router":
+            # Its own first word travels through itself; what it writes is as early as it can be known.
+            return self.listening_at.get(len(running.started))
+        return next((at for at, _ in self.health(name) if at > running.started[-1]), None)
+
     def freeze(self, name: str, seconds: float) -> None:
         """SIGSTOP, and SIGCONT after a while."""
         self.note(f"stop {name}")
