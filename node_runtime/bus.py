@@ -2,13 +2,14 @@
 
 Two client sessions to one router. *Control* (states, commands) is dropped rather than queued, sent at once,
 at real-time priority. *Bulk* (weights, logs) blocks when the link is full, so it has a session and a thread
-of its own, and a full link never delays a command. Receiving threads only copy the payload into a bounded
-mailbox: a slow reader loses its own oldest messages and stalls nobody.
+of its own, and a full link never delays a command; what is large travels in pieces. Receiving threads only
+copy the payload into a bounded mailbox: a slow reader loses its own oldest messages and stalls nobody.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import queue
 import threading
@@ -23,6 +24,7 @@ from node_runtime.bad_messages import BadMessages
 from node_runtime.config import Config, ConfigError
 from node_runtime.gathering import Gathered, Gathering, Separating, size_of
 from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
+from node_runtime.pieces import Assembler, split
 from node_runtime.session import OpenInterrupted, connect, session_config
 from protocol import codec, topics
 from protocol.messages import Message
@@ -61,6 +63,7 @@ class Bus:
         self._lock = threading.Lock()
         self._outgoing: queue.SimpleQueue[tuple[Topic, Payload] | None] = queue.SimpleQueue()
         self._gathering = Gathering(run_id)
+        self._in_pieces = itertools.count()
         self._outgoing_count = 0
         self._outgoing_bytes = 0
         self._idle = threading.Condition(self._lock)
@@ -200,8 +203,10 @@ class Bus:
         while (item := self._outgoing.get()) is not None:
             topic, payload = item
             size = len(payload) if isinstance(payload, bytes) else size_of(payload)
-            # Put together here, where nobody waits for it.
-            self._put(topic, payload if isinstance(payload, bytes) else self._gathering.encode(payload))
+            # Put together, and cut in pieces, here, where nobody waits for it.
+            whole = payload if isinstance(payload, bytes) else self._gathering.encode(payload)
+            for part in split(whole, self.run_id, next(self._in_pieces)):
+                self._put(topic, part)
             with self._idle:
                 self._outgoing_count -= 1
                 self._outgoing_bytes -= size
@@ -274,6 +279,7 @@ class Bus:
         """`only`: what `key` is the key of, None where it covers many."""
         bad = self.bad
         plain = None if only is None else only.key(self.config.name)
+        assembler = Assembler(2 * (LARGEST if only is None else only.max_bytes), bad)
 
         # Runs on the link's receiving thread, so it must be short: a stamp, a copy, an append.
         def arrived(sample: zenoh.Sample) -> None:
@@ -287,7 +293,10 @@ class Bus:
                 name = "unknown topic" if topic is None else topic.name
                 bad.count(name, "oversized", f"{size} bytes, at most {limit}")
             elif sample.kind == zenoh.SampleKind.PUT:
-                sink(Delivery(key, payload.to_bytes(), received_ns))
+                arrived_now = payload.to_bytes()
+                whole = arrived_now if topic is None else assembler.whole(topic.name, arrived_now, limit)
+                if whole is not None:
+                    sink(Delivery(key, whole, received_ns))
 
         callback = zenoh.handlers.Callback(arrived, indirect=False)
         self._entities.append(session.declare_subscriber(key, callback))
@@ -318,6 +327,7 @@ class Bus:
         key = f"{topics.PREFIX}/{self.config.name}/{name}"
         answers = Mailbox(f"answers from {name}", capacity=10_000)
         done = threading.Event()
+        assembler = Assembler(2 * LARGEST, self.bad)
 
         def arrived(reply: zenoh.Reply) -> None:
             if reply.ok is None:
@@ -327,9 +337,9 @@ class Bus:
             elif len(reply.ok.payload) > LARGEST:
                 self.bad.count(name, "oversized", f"{len(reply.ok.payload)} bytes, at most {LARGEST}")
             else:
-                answers.put(
-                    Delivery(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), time.monotonic_ns())
-                )
+                whole = assembler.whole(name, reply.ok.payload.to_bytes(), LARGEST)
+                if whole is not None:
+                    answers.put(Delivery(str(reply.ok.key_expr), whole, time.monotonic_ns()))
 
         try:
             self._session().get(
@@ -349,6 +359,7 @@ class Bus:
         while not done.wait(min(0.1, max(0.0, deadline - clock.now()))):
             if self._stop.is_set() or clock.now() >= deadline:
                 break
+        assembler.end()
         return [delivery.payload for delivery in answers.drain()]
 
     def _answer(self) -> None:
@@ -365,7 +376,8 @@ class Bus:
                     continue
                 try:
                     for payload in payloads:
-                        query.reply(key, payload)
+                        for part in split(payload, self.run_id, next(self._in_pieces)):
+                            query.reply(key, part)
                 except zenoh.ZError:
                     self._count("answers not sent")
 

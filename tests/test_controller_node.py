@@ -88,7 +88,7 @@ class Run:
 def weights(snapshot: m.HiddenSnapshot, version: int, **changes: object) -> m.HiddenWeights:
     """A trainer's answer to the controller's present hidden weights."""
     description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
-    layers = [array.numpy() * np.float32(1.01) for array in snapshot.layers]
+    layers = [array.numpy() * np.float32(1.0001) for array in snapshot.layers]
     good = m.HiddenWeights(
         run_id="trainer-a",
         seq=version,
@@ -132,6 +132,8 @@ def run() -> Iterator[Run]:
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 1, for_run="controller-other"))
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 2, sha256="0" * 64))
             ear.until(tick_with_weights)
+            # Nothing is adopted before there are samples to try it on.
+            ear.until(lambda message: isinstance(message, m.Samples) and message.seq >= 15)
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 3))
             ear.until(tick_with_weights)
             ear.until(lambda message: isinstance(message, m.TickResult) and message.seq >= 47)
