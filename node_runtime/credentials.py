@@ -114,7 +114,7 @@ def of_process(folder: str | None, role: str, plant: str) -> Credentials:
     folder: `bus.tls.keys`; role: one of `protocol.rights.ROLES`; plant: its name.
     """
     wanted = common_name(role, plant)
-    if folder is None:
+    if not folder:
         raise ConfigError(
             f"bus.tls.keys is missing: a tls/ or quic/ endpoint needs the folder with the certificate of {wanted}"
         )
@@ -132,8 +132,9 @@ def of_process(folder: str | None, role: str, plant: str) -> Credentials:
 
 def load_certificate(path: Path) -> x509.Certificate:
     """Raises `ConfigError` when it cannot be read, or is none."""
+    pem = read_bytes(path)
     try:
-        return x509.load_pem_x509_certificate(read_bytes(path))
+        return x509.load_pem_x509_certificate(pem)
     except ValueError as error:
         raise ConfigError(f"{path}: no certificate in PEM: {error}") from error
 

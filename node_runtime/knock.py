@@ -21,7 +21,7 @@ _ALERTS = {
     "CERTIFICATE_REQUIRED": "it wants a certificate and got none",
     "BAD_CERTIFICATE": "it takes our certificate for malformed",
     "CERTIFICATE_UNKNOWN": "it does not accept our certificate",
-    "DECRYPT_ERROR": "our certificate's signature is not that of its authority",
+    "DECRYPT_ERROR": "our certificate was made by another authority of the same name",
 }
 # Of OpenSSL's X509_V_ERR_*.
 _EXPIRED, _NOT_YET = 10, 9

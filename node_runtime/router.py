@@ -46,7 +46,7 @@ class Router:
         """
         bus = self.config.bus
         places = " and ".join(filter(None, (bus.endpoint, bus.remote)))
-        if bus.remote is not None and not secure(bus.remote):
+        if bus.remote and not secure(bus.remote):
             raise ConfigError(
                 f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
             )
@@ -57,7 +57,7 @@ class Router:
             own = credentials.of_process(bus.tls.keys, "router", self.config.name)
             settings = access.router_settings(own, self.config.name)
         routing = session_config(
-            "router", bus.endpoint, lease_ms(self.config, "router"), bus.remote, settings
+            "router", bus.endpoint, lease_ms(self.config, "router"), bus.remote or None, settings
         )
         try:
             self._session = zenoh.open(routing)
@@ -84,7 +84,7 @@ class Router:
 
 def remote(config: Config) -> bool:
     """Whether the router of this configuration listens where certificates are needed."""
-    return config.bus.remote is not None or secure(config.bus.endpoint)
+    return bool(config.bus.remote) or secure(config.bus.endpoint)
 
 
 def open_to_all(endpoint: str) -> bool:
@@ -122,7 +122,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         try:
             with Router(config) as router:
                 log.info("router listening on %s", config.bus.endpoint)
-                if config.bus.remote is not None:
+                if config.bus.remote:
                     log.info("and for other machines, with certificates, on %s", config.bus.remote)
                 # Its health travels like everybody else's, through a client of itself.
                 with (

@@ -47,6 +47,7 @@ _KNOWN = {*topics.BY_NAME, topics.OUTBOX_QUERY, topics.HIDDEN_QUERY}
 _REASONS = (
     ("peer sent no certificates", "it has no certificate"),
     ("UnknownIssuer", "its certificate comes from another authority"),
+    ("BadSignature", "its certificate comes from another authority"),
     ("certificate expired", "its certificate has expired"),
     ("certificate not valid yet", "its certificate is not valid yet"),
     ("UnknownCA", "it does not know the authority of our certificate"),

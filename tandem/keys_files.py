@@ -186,7 +186,11 @@ def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
 
 
 def _authority(plant: str, key: ec.EllipticCurvePrivateKey) -> x509.Certificate:
-    name = _name(common_name(AUTHORITY_FOLDER, plant))
+    # Two authorities of one plant are two names, so that who refuses the other's certificates can say so.
+    number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest.hex()
+    name = x509.Name(
+        [*_name(common_name(AUTHORITY_FOLDER, plant)), x509.NameAttribute(NameOID.SERIAL_NUMBER, number)]
+    )
     return (
         _dated(name, name, key.public_key(), AUTHORITY_DAYS)
         # It signs these certificates and no further authority.

@@ -48,7 +48,9 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool, tra
         console.print(said, markup=False, soft_wrap=True)
         bus = config.bus if endpoint_given else msgspec.structs.replace(config.bus, endpoint=_free_endpoint())
         log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
-        resolved = msgspec.structs.replace(config, bus=bus, log=log)
+        # A run is a new experiment: it begins with what the configuration says and nothing else.
+        controller = msgspec.structs.replace(config.controller, checkpoint="")
+        resolved = msgspec.structs.replace(config, bus=bus, log=log, controller=controller)
         files.config.write_text(to_toml(resolved), encoding="utf-8")
         monitor = Monitor(resolved, plant, seconds)
         try:
