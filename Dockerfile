@@ -30,6 +30,8 @@ RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/
 
 FROM base AS controller
 COPY --from=controller-build /opt/tandem /opt/tandem
+# A new volume takes its owner from here.
+RUN mkdir /memory && chown 10001:10001 /memory
 USER 10001:10001
 WORKDIR /tmp
 ENTRYPOINT ["tandem"]

@@ -6,7 +6,10 @@ import functools
 import json
 import os
 import shutil
+import signal
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 BASE = "python:3.11-slim"
@@ -71,6 +74,41 @@ class Project:
             capture_output=True,
             check=False,
         )
+
+    @contextmanager
+    def foreground(self, timeout_s: float = 120.0) -> Iterator[subprocess.Popen[str]]:
+        """`compose up` as a person starts it; at the end of the block Ctrl-C, and the wait for its end."""
+        up = subprocess.Popen(
+            [*self._command, "up", "--no-build"],
+            cwd=ROOT,
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        try:
+            yield up
+            up.send_signal(signal.SIGINT)
+            up.wait(timeout_s)
+        finally:
+            if up.poll() is None:
+                up.kill()
+                up.wait()
+
+    def last_words(self, lines: int = 15) -> str:
+        """How the containers are and what each said last: for the report of a failure."""
+        parts = [
+            subprocess.run(
+                [*self._command, *command],
+                cwd=ROOT,
+                env=self._environment,
+                capture_output=True,
+                text=True,
+                check=False,
+            ).stdout
+            for command in (("ps", "-a"), ("logs", "--no-color", f"--tail={lines}"))
+        ]
+        return "\n".join(parts)
 
     def recorder(self, *arguments: str, entrypoint: str = "tandem") -> str:
         """Run a command in the recorder's image, with the volume of the logs."""

@@ -1,0 +1,19 @@
+"""A failed test shows how the containers were and what they said last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from project import Project
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    outcome = yield
+    report = outcome.get_result()  # type: ignore[attr-defined]
+    if not report.failed:
+        return
+    for name, value in getattr(item, "funcargs", {}).items():
+        if isinstance(value, Project):
+            report.sections.append((f"containers of {name}", value.last_words()))
