@@ -216,7 +216,7 @@ def _control_at(moving: list[Sampled], fault_at: float, back_at: float | None) -
     end = ceased[0]
     for before, after in pairwise(ceased):
         # A single sample without a fresh command, long after, is a late tick and counts as such.
-        if after - before > APART_S and (back_at is None or before >= back_at):
+        if after - before > APART_S and (back_at is None or after > back_at):
             break
         end = after
     fresh = [one.state.t for one in moving if one.state.t > end and one.state.source == "command"]

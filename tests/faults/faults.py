@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
-from . import holds, scenes
+from . import holds, scenes, stranger
 from .attacker import KINDS, WEIGHTS
 from .holds import Held
 from .link import Shape
@@ -15,7 +15,7 @@ from .scenes import Scene
 
 ATTACK_RATE, WEIGHTS_RATE = 1000.0, 4.0
 """Messages a second."""
-ATTACK_S = 4.0
+ATTACK_S, KNOCKS_S = 4.0, 2.0
 RESTART_PATIENCE_S = 20.0
 """A busy machine takes long to start a process; what is measured begins when it has started."""
 Inflict = Callable[[Rig, int], dict[str, float] | None]
@@ -188,6 +188,20 @@ def _clock_row(hours: float) -> Fault:
     return Fault(f"wall clock stepped by {hours:+g} h", "clock", inflict, checks, scene=scenes.own_wall_clock)
 
 
+def _door_row(kind: str) -> Fault:
+    def inflict(rig: Rig, _seed: int) -> dict[str, float]:
+        return rig.knock(kind, rig.folder / scenes.KEYS, KNOCKS_S)
+
+    checks = (
+        holds.constraints,
+        holds.refused_on_both_sides,
+        holds.none_obeyed,
+        holds.control_kept,
+        holds.replays,
+    )
+    return Fault(f"certificate: {kind}", "certificates", inflict, checks, scene=scenes.door_with_certificates)
+
+
 ALL: tuple[Fault, ...] = (
     *(_kill_row(name) for name in KILLABLE),
     *(_kill_row(*pair) for pair in combinations(KILLABLE, 2)),
@@ -202,6 +216,7 @@ ALL: tuple[Fault, ...] = (
     _read_only_row(),
     *(_attack_row(kind) for kind in KINDS),
     *(_weights_row(kind) for kind in WEIGHTS),
+    *(_door_row(kind) for kind in stranger.KINDS),
     *(_clock_row(hours) for hours in (1.0, -1.0)),
 )
 BY_NAME = {fault.name: fault for fault in ALL}

@@ -118,6 +118,20 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
     return None
 
 
+def refused_on_both_sides(run: Facts, calm: Facts) -> str | None:
+    """Nobody came in, or got further than its role; the stranger was told why, and the router counts it."""
+    tries, refused = run.extra.get("tries", 0), run.extra.get("refused", 0)
+    if not tries or refused < tries:
+        return f"{tries - refused:g} of {tries:g} tries were let in"
+    if not any(name.startswith("said: ") for name in run.extra):
+        return "the stranger was not told why"
+    if not any(
+        name.startswith(("router bad TLS link: refused", "router bad from trainer")) for name in run.counted
+    ):
+        return "the router did not say why"
+    return None
+
+
 def weights_refused(run: Facts, calm: Facts) -> str | None:
     """Whatever was forged was refused, or rolled back soon after."""
     if not run.extra.get("sent trainer/hidden_weights"):

@@ -25,6 +25,7 @@ from protocol import codec, topics
 from protocol import messages as m
 
 from . import link as links
+from .scenes import Surroundings
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
@@ -106,7 +107,7 @@ class Rig:
         folder: everything is written here: configurations, outputs, the log, the plant's trace.
         config: the run's; endpoint and log are set here.
         places: where "plant" and "trainer" are: beside the others, as the rest is, or behind a link.
-        environment: of each process by name, added to this one's; under "" what all get.
+        around: what its scene adds to environment and configurations.
         seed: of what happens on a lossy link.
     """
 
@@ -116,11 +117,11 @@ class Rig:
         config: Config,
         places: dict[str, Place] | None = None,
         *,
-        environment: dict[str, dict[str, str]] | None = None,
+        around: Surroundings | None = None,
         seed: int = 0,
     ):
         self.folder, self._places = folder, places or {}
-        self._seed, self._environment = seed, environment or {}
+        self._seed, self._around = seed, around or Surroundings()
         port = _free_port()
         self.config = override(
             config, [f'bus.endpoint="tcp/127.0.0.1:{port}"', f'log.path="{folder / "disk" / "run.mcap"}"']
@@ -138,6 +139,8 @@ class Rig:
         self._mailbox: Mailbox | None = None
         self._command_key = topics.COMMAND.name
         self.restarts = True
+        self.door: str | None = None
+        """Where the router listens for other machines."""
         self.ended_at = math.inf
         """When all were told to stop."""
         self.listening_at: dict[int, float] = {}
@@ -165,8 +168,9 @@ class Rig:
         for name in COMMANDS:
             self.processes[name] = self._prepare(name)
         self._stack.enter_context(stalls.watched(self.folder / "stalls.txt", self.config.realtime.priority))
-        for running in self.processes.values():
-            running.start()
+        for name, running in self.processes.items():
+            if name != "controller":
+                running.start()
         deadline = clock.now() + READY_S
         while LISTENING not in self.processes["router"].said():
             if clock.now() > deadline or not self.processes["router"].alive:
@@ -194,7 +198,10 @@ class Rig:
             prefix = self.links[name].prefix
             config = override(config, [f'bus.endpoint="tcp/{self.links[name].here}:{self._port}"'])
         elif name == "router" and self.links:
-            config = override(config, [f'bus.endpoint="tcp/0.0.0.0:{self._port}"'])
+            config = override(config, [f'bus.endpoint="tcp/0.0.0.0:{self._port}"', "bus.insecure=true"])
+        config = override(config, self._around.settings.get(name, []))
+        if name == "router":
+            self.door = config.bus.remote
         file = self.folder / f"{name}.toml"
         file.write_text(to_toml(config), encoding="utf-8")
         if name == "plant":
@@ -208,8 +215,7 @@ class Rig:
         else:
             child = [sys.executable, "-m", "tandem.child", str(os.getpid())]
             words = [*child, COMMANDS[name], "--config", str(file)]
-        environment = self._environment.get("", {}) | self._environment.get(name, {})
-        return Running(name, [*prefix, *words], environment, self.folder / f"{name}.txt")
+        return Running(name, [*prefix, *words], self._around.environment, self.folder / f"{name}.txt")
 
     def end(self) -> None:
         """Stop all politely, in the order of a supervisor; what does not stop is killed, and is an event."""
@@ -326,22 +332,34 @@ class Rig:
 
     def attack(self, kind: str, rate: float, seconds: float, seed: int) -> dict[str, float]:
         """Let a stranger send bad messages for a while; how many it sent, by topic."""
-        words = [sys.executable, "-m", "tests.faults.attacker", str(self.folder / "attacker.toml")]
-        file = self.folder / "attacker.toml"
-        file.write_text(to_toml(self.config), encoding="utf-8")
-        self.note(f"attack: {kind}")
-        out, err = self.folder / "attacker.json", self.folder / "attacker.txt"
+        sent = self._beside(
+            "attacker", self.config, kind, str(rate), str(seconds), str(seed), seconds=seconds
+        )
+        return {f"sent {topic}": count for topic, count in sent.items()}
+
+    def knock(self, kind: str, folder: Path, seconds: float) -> dict[str, float]:
+        """Let a stranger try the router's door for other machines for a while; what it was told."""
+        far = override(self.config, [f'bus.endpoint="{self.door}"'])
+        return self._beside("stranger", far, kind, str(folder), str(seconds), seconds=seconds)
+
+    def _beside(
+        self, program: str, config: Config, kind: str, *words: str, seconds: float
+    ) -> dict[str, float]:
+        """Run a program of this folder beside the run until it ends; the counts that it prints."""
+        file = self.folder / f"{program}.toml"
+        file.write_text(to_toml(config), encoding="utf-8")
+        command = [sys.executable, "-m", f"tests.faults.{program}", str(file), kind, *words]
+        self.note(f"{program}: {kind}")
+        out, err = self.folder / f"{program}.json", self.folder / f"{program}.txt"
         with out.open("wb") as stdout, err.open("wb") as stderr:
-            words += [kind, str(rate), str(seconds), str(seed)]
-            process = subprocess.Popen(words, stdout=stdout, stderr=stderr, cwd=ROOT)
+            process = subprocess.Popen(command, stdout=stdout, stderr=stderr, cwd=ROOT)
             self._stack.callback(process.wait)
             self._stack.callback(process.kill)
-            self.wait(lambda: process.poll() is not None, seconds + 15.0, "the attacker's end")
+            self.wait(lambda: process.poll() is not None, seconds + 15.0, f"the {program}'s end")
         if process.returncode:
-            raise RigError(f"the attacker failed: {err.read_text()[-800:]}")
-        self.note("the attack is over")
-        sent: dict[str, float] = msgspec.json.decode(out.read_bytes(), type=dict[str, float])
-        return {f"sent {topic}": count for topic, count in sent.items()}
+            raise RigError(f"the {program} failed: {err.read_text()[-800:]}")
+        self.note("that is over")
+        return msgspec.json.decode(out.read_bytes(), type=dict[str, float])
 
     # -- what is known while it runs -------------------------------------
 

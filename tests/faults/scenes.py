@@ -1,35 +1,49 @@
 """What surrounds a run from its start until its figures are gathered: a disk that can fail, a clock that can step.
 
-Each is a context manager that is given the run's folder and yields what the processes need in their environment.
+Each is a context manager that is given the run's folder and yields what the processes need in their environment and
+in their configurations.
 """
 
 from __future__ import annotations
 
 import os
+import socket
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-Environment = dict[str, dict[str, str]]
-"""Variables of each process, by its name; those under "" are everybody's."""
-Scene = Callable[[Path], AbstractContextManager[Environment]]
+from . import stranger
 
-DISK, BALLAST, OFFSET = "disk", "ballast", "clock.offset"
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is different for the processes of one run."""
+
+    environment: dict[str, str] = field(default_factory=dict)
+    """Variables of all."""
+    settings: dict[str, list[str]] = field(default_factory=dict)
+    """`section.key=value` of one process, by its name."""
+
+
+Scene = Callable[[Path], AbstractContextManager[Surroundings]]
+
+DISK, BALLAST, OFFSET, KEYS = "disk", "ballast", "clock.offset", "keys"
 
 
 @contextmanager
-def nothing(folder: Path) -> Iterator[Environment]:
+def nothing(folder: Path) -> Iterator[Surroundings]:
     """The usual."""
-    yield {}
+    yield Surroundings()
 
 
 @contextmanager
-def memory_disk(folder: Path) -> Iterator[Environment]:
+def memory_disk(folder: Path) -> Iterator[Surroundings]:
     """The log lies on a small disk of its own, which `fill` can fill."""
     with _mounted(folder, "-t", "tmpfs", "-o", "size=32m", "tmpfs"):
-        yield {}
+        yield Surroundings()
 
 
 def fill(folder: Path) -> None:
@@ -45,14 +59,14 @@ def empty(folder: Path) -> None:
 
 
 @contextmanager
-def real_disk(folder: Path) -> Iterator[Environment]:
+def real_disk(folder: Path) -> Iterator[Surroundings]:
     """The log lies on an ext4 file system of its own, which `write_protect` can make read-only under way."""
     image = folder / "image"
     with image.open("wb") as file:
         file.truncate(64 * 1024 * 1024)
     subprocess.run(["mkfs.ext4", "-q", str(image)], check=True, capture_output=True)
     with _mounted(folder, "-o", "loop", str(image)):
-        yield {}
+        yield Surroundings()
     image.unlink()
 
 
@@ -73,17 +87,35 @@ def _mounted(folder: Path, *words: str) -> Iterator[None]:
 
 
 @contextmanager
-def own_wall_clock(folder: Path) -> Iterator[Environment]:
+def own_wall_clock(folder: Path) -> Iterator[Surroundings]:
     """All processes have a wall clock that `step_clock` can step; the machine's own stays as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     library, offset = folder / "clock_shim.so", folder / OFFSET
     source = Path(__file__).with_name("clock_shim.c")
     subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"], check=True)
     offset.write_bytes(struct.pack("@q", 0))
-    yield {"": {"LD_PRELOAD": str(library), "TANDEM_CLOCK_OFFSET": str(offset)}}
+    yield Surroundings({"LD_PRELOAD": str(library), "TANDEM_CLOCK_OFFSET": str(offset)})
 
 
 def step_clock(folder: Path, seconds: float) -> None:
     """Step the wall clock of all processes of the run, for good."""
     with (folder / OFFSET).open("r+b") as file:
         file.write(struct.pack("@q", round(seconds * 1e9)))
+
+
+@contextmanager
+def door_with_certificates(folder: Path) -> Iterator[Surroundings]:
+    """The router listens for other machines too, by TLS; `stranger` has keys that should not open, or not that far."""
+    stranger.keys(_made(folder / KEYS))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    router = folder / KEYS / "good" / "router"
+    yield Surroundings(
+        settings={"router": [f'bus.remote="tls/127.0.0.1:{port}"', f'bus.tls.keys="{router}"']},
+    )
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    return folder

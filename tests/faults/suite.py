@@ -76,9 +76,9 @@ def run(
 
 def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: Path) -> Facts:
     scene = nothing if fault is None else fault.scene
-    with scene(folder) as environment:
+    with scene(folder) as around:
         places: dict[str, Place] = {"plant": stage.plant, "trainer": stage.trainer}
-        rig = Rig(folder, config, places, environment=environment, seed=config.seed)
+        rig = Rig(folder, config, places, around=around, seed=config.seed)
         extra = _hurt(rig, stage, fault, at)
         # While the log's disk is still there.
         return gather(rig, stage.seconds, extra)
