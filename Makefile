@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper bench test compose-test faults fuzz soak lint format clean
+.PHONY: help setup run simulate paper bench test compose-test remote-test faults fuzz soak lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -36,6 +36,9 @@ test: $(READY)  ## all tests
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s -o pythonpath=tests tests/compose/live_compose.py $(ARGS)
+
+remote-test: $(READY)  ## docs/remote.md to the letter, the trainer in another network namespace: 2 minutes; needs root
+	$(BIN)/pytest -x -s tests/remote/live_remote.py $(ARGS)
 
 faults: $(READY)  ## kill, freeze, cut off and attack real processes, into docs/faults.md: hours; root; ARGS=--list names them
 	$(BIN)/python -m tests.faults --document docs/faults.md $(ARGS)

@@ -211,6 +211,7 @@ def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
         pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"),
         context.wrap_socket(plain, server_hostname=host) as link,
     ):
+        link.settimeout(5.0)
         link.recv(1)
     site.router.heard("bad TLS link: refused, it has no certificate")
 
