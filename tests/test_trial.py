@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -11,19 +10,18 @@ from science import compressor, describe
 
 from controller_node.build import describe_trial
 from controller_node.core import ControllerCore
-from experiments.faults import Faults
-from experiments.lockstep import CONTROLLER, _LockStep
+from experiments.attacks import Forge, crude, drift, follow_attacked, noise
+from experiments.lockstep import simulate
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import IN_USE, NEWEST
 from lbmpc.oracles.trial import Finding, Trial, empty, newest, remember
 from node_runtime.config import Config, ConfigError, load, override
-from protocol import messages as m
 from protocol.network import hash_layers
-from run_log.reader import Run
 from run_log.replay import replay
 from run_log.summary import Summary, summarise
 
+STEPS = 200
 TRIAL = Trial(capacity=40, stride=1, window=20)
 MODEL = compressor()
 ORACLE = DnnOracle(describe(MODEL, [8, 8]), trial=TRIAL)
@@ -163,84 +161,10 @@ def test_a_version_near_the_end_of_all_numbers_does_not_shut_out_everybody_else(
 
 # -- the closed loop under attack ----------------------------------------------------------------------------
 
-Forge = Callable[[int, Layers, np.random.Generator], Layers]
-
-
-class _Attacked(_LockStep):
-    """A stolen trainer sends sets at every `every`th tick at which the real one sends none."""
-
-    def __init__(self, config: Config, forge: Forge, every: int, instead: bool):
-        super().__init__(config, Faults())
-        self.forge, self.every, self.instead = forge, every, instead
-        self.rng = np.random.default_rng(99)
-
-    def _arriving(self, seq: int) -> m.HiddenWeights | None:
-        real = super()._arriving(seq)
-        if self.instead:
-            return (
-                None
-                if real is None
-                else self._evil(seq, [a.numpy().astype(float) for a in real.layers], real.seq)
-            )
-        if real is not None or seq % self.every:
-            return real
-        snapshot = self.core.hidden_snapshot(seq)
-        assert snapshot is not None
-        layers = [layer.numpy().astype(float) for layer in snapshot.layers]
-        return self._evil(seq, layers, snapshot.hidden_version + 1)
-
-    def _evil(self, seq: int, good: Layers, version: int) -> m.HiddenWeights:
-        layers = [layer.astype(np.float32) for layer in self.forge(seq, good, self.rng)]
-        assert self.core.description is not None
-        sha256 = "0" * 64 if seq % 5 == 3 and not self.instead else hash_layers(layers)
-        return m.HiddenWeights(
-            run_id="stolen",
-            seq=version,
-            for_run=CONTROLLER,
-            trained_on=seq,
-            base_sha256="",
-            samples=1,
-            loss_before=1.0,
-            loss_after=0.0,
-            network_sha256=self.core.description.sha256(),
-            sha256=sha256,
-            layers=[m.Array.of(layer, "<f4") for layer in layers],
-        )
-
-
-def crude(seq: int, good: Layers, rng: np.random.Generator) -> Layers:
-    """NaN, within the norm but huge, of another shape, sign reversed, random; every fifth with a wrong hash."""
-    kind = seq % 7
-    if kind == 0:
-        return [layer * np.nan for layer in good]
-    if kind == 1:
-        return [layer * (99.0 / np.linalg.norm(layer)) for layer in good]
-    if kind == 2:
-        return [layer[:, :-1] for layer in good]
-    if kind == 3:
-        return [*good[:-1], -good[-1]]
-    return [rng.standard_normal(layer.shape) * np.std(layer) for layer in good]
-
-
-def noise(share: float) -> Forge:
-    return lambda _seq, good, rng: [
-        layer + share * np.std(layer) * rng.standard_normal(layer.shape) for layer in good
-    ]
-
-
-def drift(seq: int, good: Layers, _rng: np.random.Generator) -> Layers:
-    """Always a little further in one direction."""
-    always = np.random.default_rng(5)
-    return [layer + 0.01 * np.std(layer) * always.standard_normal(layer.shape) for layer in good]
-
-
-def attacked(forge: Forge, every: int = 1, instead: bool = False, *settings: str) -> Run:
-    return _Attacked(load(None, ["seed=0", *settings]), forge, every, instead).run(200, None).run
-
 
 @cache
 def calm() -> Summary:
-    return summarise(_LockStep(load(None, ["seed=0"]), Faults()).run(200, None).run)
+    return summarise(simulate(load(None, ["seed=0"]), STEPS))
 
 
 @pytest.mark.parametrize(
@@ -249,7 +173,7 @@ def calm() -> Summary:
     ids=["crude", "10 % noise", "10 % noise on every trained set", "drift"],
 )
 def test_the_plant_does_not_notice_a_stolen_trainer(forge: Forge, every: int, instead: bool) -> None:
-    summary = summarise(attacked(forge, every, instead))
+    summary = summarise(follow_attacked(load(None, ["seed=0"]), STEPS, forge, every, instead))
     assert summary.cost < 1.05 * calm().cost
     assert summary.constraint_violations == 0
     assert summary.fallback_ticks == 0
@@ -264,15 +188,15 @@ def test_ordinary_training_is_neither_refused_nor_rolled_back() -> None:
     assert calm().weights_rolled_back == 0
 
 
+# Anything goes before, nothing after: sets are adopted that are then rolled back.
+LOOSE = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adaptation.trial.margin=0.0"]
 SMALL = ["controller.horizon=15", "controller.keyframe_every=10", "network.hidden=[8, 8]", "trainer.steps=20"]
 
 
 def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe_between_adoption_and_rollback() -> (
     None
 ):
-    # A floor so low, and a margin so wide before, that sets are adopted which are then rolled back.
-    loose = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adaptation.trial.margin=0.0"]
-    run = attacked(noise(0.3), 9, False, *SMALL, *loose)
+    run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = [result.seq for result in run.results if result.weights_rolled_back]
     assert back
     assert replay(run).equal
@@ -285,8 +209,7 @@ def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe_betwee
 
 
 def test_after_a_rollback_the_newest_version_and_the_hash_in_use_are_told() -> None:
-    loose = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adaptation.trial.margin=0.0"]
-    run = attacked(noise(0.3), 9, False, *SMALL, *loose)
+    run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = next(result for result in run.results if result.weights_rolled_back)
     told = next(weights for weights in run.output_weights if weights.seq == back.seq)
     assert told.hidden_sha256 == back.hidden_sha256
