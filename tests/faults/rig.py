@@ -180,6 +180,9 @@ class Rig:
         bus.open()
         self._stack.callback(bus.close, 0.5)
         self._mailbox = bus.everything()
+        # The log begins with the memory that the controller begins with.
+        self.wait(lambda: self._ready("recorder"), READY_S, "the recorder ready")
+        self.processes["controller"].start()
         self.wait(
             lambda: all(self._ready(name) for name in COMMANDS if name != "plant"), READY_S, "all ready"
         )
