@@ -25,8 +25,8 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel .
 FROM build AS controller-build
 RUN pip --python /opt/tandem/bin/python install --no-cache-dir -r controller.txt
 COPY --from=wheel /wheel /wheel
-COPY docker/slim.sh ./
-RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && sh slim.sh
+COPY docker/slim.py ./
+RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && python slim.py /opt/tandem
 
 FROM base AS controller
 COPY --from=controller-build /opt/tandem /opt/tandem
@@ -39,8 +39,8 @@ ENTRYPOINT ["tandem"]
 FROM build AS recorder-build
 RUN pip --python /opt/tandem/bin/python install --no-cache-dir -r recorder.txt
 COPY --from=wheel /wheel /wheel
-COPY docker/slim.sh ./
-RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && sh slim.sh
+COPY docker/slim.py ./
+RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && python slim.py /opt/tandem
 
 FROM base AS recorder
 COPY --from=recorder-build /opt/tandem /opt/tandem
@@ -53,8 +53,8 @@ ENTRYPOINT ["tandem"]
 FROM build AS trainer-build
 RUN pip --python /opt/tandem/bin/python install --no-cache-dir -r trainer.txt
 COPY --from=wheel /wheel /wheel
-COPY docker/slim.sh ./
-RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && sh slim.sh
+COPY docker/slim.py ./
+RUN pip --python /opt/tandem/bin/python install --no-cache-dir --no-deps /wheel/*.whl && python slim.py /opt/tandem
 
 FROM base AS trainer
 COPY --from=trainer-build /opt/tandem /opt/tandem
