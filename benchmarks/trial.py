@@ -11,7 +11,7 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from experiments.attacks import Forge, crude, drift, follow_attacked, noise, random, reversed_sign
+from experiments.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise, random, reversed_sign
 from experiments.faults import Faults
 from experiments.lockstep import follow
 from node_runtime.config import load
@@ -33,6 +33,7 @@ ATTACKS: dict[str, Forge] = {
     "10 % noise": noise(0.1),
     "30 % noise": noise(0.3),
     "drift": drift,
+    "right here, wrong elsewhere": elsewhere(1.0),
 }
 SENT = {"every tick": (1, False), "every 7th": (7, False), "instead": (1, True)}
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
+from controller_node.core import Outputs
 from experiments.faults import Faults
 from experiments.lockstep import CONTROLLER, _LockStep
 from node_runtime.config import Config
@@ -15,8 +17,23 @@ from protocol.network import hash_layers
 from run_log.reader import Run
 
 Layers = list[np.ndarray]
-Forge = Callable[[int, Layers, np.random.Generator], Layers]
-"""(tick, good layers, draws) -> the layers to send; good: those in use, or those that were just trained."""
+KNOWN = 80
+"""Newest samples that the attacker has heard."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What the attacker knows when it sends a set."""
+
+    tick: int
+    good: Layers
+    """Hidden layers in use, or those that were just trained."""
+    points: np.ndarray
+    """(n, d + m) the newest (x, u), scaled as the network sees them."""
+
+
+Forge = Callable[[Known, np.random.Generator], Layers]
+"""The layers to send."""
 
 
 def follow_attacked(config: Config, steps: int, forge: Forge, every: int = 1, instead: bool = False) -> Run:
@@ -37,6 +54,7 @@ class _Attacked(_LockStep):
     def __init__(self, config: Config, forge: Forge, every: int, instead: bool):
         super().__init__(config, Faults())
         self.forge, self.every, self.instead = forge, every, instead
+        self.points: list[list[float]] = []
         self.rng = np.random.default_rng([config.seed, 0xBAD])
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
@@ -49,9 +67,16 @@ class _Attacked(_LockStep):
         assert snapshot is not None
         return self._forged(seq, _numbers(snapshot.layers), snapshot.hidden_version + 1)
 
+    def _learn(self, seq: int, outputs: Outputs) -> None:
+        if outputs.sample is not None:
+            self.points = [*self.points, [*outputs.sample.x, *outputs.sample.u]][-KNOWN:]
+        super()._learn(seq, outputs)
+
     def _forged(self, seq: int, good: Layers, version: int) -> m.HiddenWeights:
-        layers = [layer.astype(np.float32) for layer in self.forge(seq, good, self.rng)]
         assert self.core.description is not None
+        scale = np.array(self.core.description.input_scale)
+        known = Known(seq, good, np.array(self.points).reshape(-1, len(scale)) / scale)
+        layers = [layer.astype(np.float32) for layer in self.forge(known, self.rng)]
         return m.HiddenWeights(
             run_id="stolen",
             seq=version,
@@ -74,38 +99,62 @@ def _numbers(layers: list[m.Array]) -> Layers:
 # -- what is sent --------------------------------------------------------------------------------------------
 
 
-def crude(seq: int, good: Layers, rng: np.random.Generator) -> Layers:
+def crude(known: Known, rng: np.random.Generator) -> Layers:
     """In turn: NaN, huge within the norm, of another shape, sign reversed, and random three times."""
-    kind = seq % 7
+    kind = known.tick % 7
     if kind == 0:
-        return [layer * np.nan for layer in good]
+        return [layer * np.nan for layer in known.good]
     if kind == 1:
-        return [layer * (99.0 / np.linalg.norm(layer)) for layer in good]
+        return [layer * (99.0 / np.linalg.norm(layer)) for layer in known.good]
     if kind == 2:
-        return [layer[:, :-1] for layer in good]
+        return [layer[:, :-1] for layer in known.good]
     if kind == 3:
-        return reversed_sign(seq, good, rng)
-    return random(seq, good, rng)
+        return reversed_sign(known, rng)
+    return random(known, rng)
 
 
-def reversed_sign(_seq: int, good: Layers, _rng: np.random.Generator) -> Layers:
+def reversed_sign(known: Known, _rng: np.random.Generator) -> Layers:
     """Of the last hidden layer."""
-    return [*good[:-1], -good[-1]]
+    return [*known.good[:-1], -known.good[-1]]
 
 
-def random(_seq: int, good: Layers, rng: np.random.Generator) -> Layers:
+def random(known: Known, rng: np.random.Generator) -> Layers:
     """Of the size of the good ones."""
-    return [rng.standard_normal(layer.shape) * np.std(layer) for layer in good]
+    return [rng.standard_normal(layer.shape) * np.std(layer) for layer in known.good]
 
 
 def noise(share: float) -> Forge:
     """The good ones with noise, `share` of their own spread."""
-    return lambda _seq, good, rng: [
-        layer + share * np.std(layer) * rng.standard_normal(layer.shape) for layer in good
+    return lambda known, rng: [
+        layer + share * np.std(layer) * rng.standard_normal(layer.shape) for layer in known.good
     ]
 
 
-def drift(_seq: int, good: Layers, _rng: np.random.Generator) -> Layers:
+def drift(known: Known, _rng: np.random.Generator) -> Layers:
     """The good ones a little further in a direction that is always the same."""
     always = np.random.default_rng(5)
-    return [layer + 0.01 * np.std(layer) * always.standard_normal(layer.shape) for layer in good]
+    return [layer + 0.01 * np.std(layer) * always.standard_normal(layer.shape) for layer in known.good]
+
+
+def elsewhere(size: float) -> Forge:
+    """Right where the plant has just been and wrong elsewhere, for tanh layers on one pair.
+
+    The last hidden layer moves in the null space of the activations before it on the newest samples, by `size` of
+    its norm.
+    """
+
+    def forge(known: Known, rng: np.random.Generator) -> Layers:
+        *before, last = known.good
+        activation = known.points
+        for layer in before:
+            activation = np.tanh(_with_one(activation) @ layer)
+        _, strengths, directions = np.linalg.svd(_with_one(activation))
+        null = directions[int((strengths > 1e-3 * strengths.max(initial=0.0)).sum()) :]
+        moved = null.T @ rng.standard_normal((len(null), last.shape[1]))
+        return [*before, last + moved * (size * np.linalg.norm(last) / np.linalg.norm(moved))]
+
+    return forge
+
+
+def _with_one(rows: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.ones((len(rows), 1)), rows], axis=1)

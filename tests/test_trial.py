@@ -10,7 +10,7 @@ from science import compressor, describe
 
 from controller_node.build import describe_trial
 from controller_node.core import ControllerCore
-from experiments.attacks import Forge, crude, drift, follow_attacked, noise
+from experiments.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise
 from experiments.lockstep import simulate
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import OracleState
@@ -169,8 +169,14 @@ def calm() -> Summary:
 
 @pytest.mark.parametrize(
     ("forge", "every", "instead"),
-    [(crude, 1, False), (noise(0.1), 1, False), (noise(0.1), 1, True), (drift, 7, False)],
-    ids=["crude", "10 % noise", "10 % noise on every trained set", "drift"],
+    [
+        (crude, 1, False),
+        (noise(0.1), 1, False),
+        (noise(0.1), 1, True),
+        (drift, 7, False),
+        (elsewhere(1.0), 1, False),
+    ],
+    ids=["crude", "10 % noise", "10 % noise on every trained set", "drift", "right here and wrong elsewhere"],
 )
 def test_the_plant_does_not_notice_a_stolen_trainer(forge: Forge, every: int, instead: bool) -> None:
     summary = summarise(follow_attacked(load(None, ["seed=0"]), STEPS, forge, every, instead))
