@@ -103,6 +103,7 @@ class ControllerCore:
         self._dnn = oracle if isinstance(oracle, DnnOracle) else None
         self.description = self._dnn.description if self._dnn else None
         self._hidden_hash = self._hash_hidden()
+        self._resumed = ""
 
     def step(self, tick: m.Tick) -> Outputs:
         """One control step. Never raises for what a tick may hold."""
@@ -130,7 +131,9 @@ class ControllerCore:
         arrays = {
             name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in self.state.to_arrays().items()
         }
-        return m.Keyframe(run_id=self.run_id, seq=seq, arrays=arrays)
+        return m.Keyframe(
+            run_id=self.run_id, seq=seq, arrays=arrays, resumed=self._resumed if seq == -1 else ""
+        )
 
     def restore(self, keyframe: m.Keyframe) -> None:
         """Take over a keyframe's memory.
@@ -147,6 +150,44 @@ class ControllerCore:
                 )
         self.state = ControllerState.from_arrays(arrays)
         self._hidden_hash = self._hash_hidden()
+        self._resumed = keyframe.resumed
+
+    def lasting(self) -> dict[str, m.Array]:
+        """What of the memory outlives this process: all that was learned, nothing that was planned."""
+        arrays = self.keyframe(0).arrays
+        return {name: array for name, array in arrays.items() if _lasts(name)}
+
+    def go_on(self, lasting: dict[str, m.Array], run_id: str) -> None:
+        """Begin with what the run `run_id` left, and no plan; before the first tick.
+
+        Raises:
+            ValueError: it does not fit this configuration; the text names the array.
+        """
+        begin = self.keyframe(-1).arrays
+        expected = {name for name in begin if _lasts(name)}
+        for name in sorted(expected ^ lasting.keys()):
+            raise ValueError(f"array {name} is {'missing' if name in expected else 'not known'}")
+        for name in sorted(expected):
+            if (lasting[name].shape, lasting[name].dtype) != (begin[name].shape, begin[name].dtype):
+                raise ValueError(f"array {name} is {lasting[name].shape} there and {begin[name].shape} here")
+        arrays = {**begin, **lasting}
+        self.restore(m.Keyframe(run_id=self.run_id, seq=-1, arrays=arrays, resumed=run_id))
+
+    def belongs(self) -> dict[str, str]:
+        """Whose memory this is, in words: what must be equal for another process to go on with it."""
+        model = self.controller.model
+        numbers = b"".join(array.tobytes() for array in (model.A, model.B, self.plant.x_e, self.plant.u_e))
+        words = {
+            "plant": self.config.name,
+            "model": f"{self.plant.name} {hashlib.sha256(numbers).hexdigest()[:12]}",
+            "rate": f"{self.config.rate:g} Hz",
+            "oracle": self.config.controller.oracle,
+        }
+        if self.description is not None:
+            what = self.description
+            layers = "-".join(map(str, what.hidden))
+            words["network"] = f"{what.architecture} {layers} {what.sha256()[:12]}"
+        return words
 
     def hidden_snapshot(self, seq: int) -> m.HiddenSnapshot | None:
         """The hidden weights in force, for a trainer that joins late; None without a network."""
@@ -273,6 +314,11 @@ class ControllerCore:
 
     def _hash_hidden(self) -> str:
         return hash_layers(self._dnn.hidden(self.state.oracle)) if self._dnn else ""
+
+
+def _lasts(name: str) -> bool:
+    """Whether a new process can go on with this array. Not with a plan, or with a state whose successor it missed."""
+    return name == "delay" or name.startswith("oracle.")
 
 
 @lru_cache(maxsize=16)

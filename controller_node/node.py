@@ -6,8 +6,11 @@ import logging
 import os
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 
+from controller_node.checkpoint import CheckpointWriter, Memory, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
@@ -43,6 +46,8 @@ COUNTS = (
     "weights adopted",
     "weights refused",
     "weights rolled back",
+    "checkpoints written",
+    "checkpoints failed",
 )
 
 
@@ -63,8 +68,16 @@ class Latched:
 class ControllerNode:
     """One controller on the bus. `run` is its loop; the query thread only reads what the loop leaves."""
 
-    def __init__(self, core: ControllerCore, bus: Bus, health: HealthPublisher, counts: dict[str, int]):
-        """`counts`: this node's own figures, kept up to date here."""
+    def __init__(
+        self,
+        core: ControllerCore,
+        bus: Bus,
+        health: HealthPublisher,
+        counts: dict[str, int],
+        outbox: Outbox | None = None,
+        checkpoint: CheckpointWriter | None = None,
+    ):
+        """`counts`: this node's own figures, kept up to date here. `checkpoint`: None: the memory is not saved."""
         self._core = core
         self._bus = bus
         self._health = health
@@ -87,7 +100,8 @@ class ControllerNode:
         self._missing = 0
         self._keyframe_seq = -1
         self._weights: m.HiddenWeights | None = None
-        self._outbox = Outbox(core.run_id)
+        self._outbox = Outbox(core.run_id) if outbox is None else outbox
+        self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
         self._hidden: list[bytes] = []
         self._remember_hidden()
@@ -109,8 +123,12 @@ class ControllerNode:
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
+                if self._checkpoint is not None and self._checkpoint.wanted:
+                    self._save(self._checkpoint)
                 garbage.idle()
         self._send_samples()
+        if self._checkpoint is not None and self._seq >= 0:
+            self._save(self._checkpoint)
         if self._keyframe_seq < self._seq:
             self._bus.publish(topics.KEYFRAME, self._core.keyframe(self._seq))
 
@@ -251,6 +269,9 @@ class ControllerNode:
             self._bus.publish(topics.SAMPLES, batch)
         self._unsent = []
 
+    def _save(self, checkpoint: CheckpointWriter) -> None:
+        checkpoint.offer(Memory(self._seq, self._core.lasting(), dict(self._counts)))
+
     def _remember_hidden(self) -> None:
         snapshot = self._core.hidden_snapshot(self._seq)
         self._hidden = [] if snapshot is None else [codec.encode(snapshot)]
@@ -266,6 +287,11 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
             place = core_for(config, "controller", os.sched_getaffinity(0))
             core = ControllerCore(config, run_id)
             log.info("%s", guarantee(config, core.sets))
+            path = Path(config.controller.checkpoint) if config.controller.checkpoint else None
+            before = None if path is None else resume(core, path)
+            if before is not None:
+                counts |= {name: before.counters.get(name, 0) for name in counts}
+            outbox = Outbox(run_id, earlier=() if before is None else before.batches())
             with (
                 punctual(config.realtime.priority, keep_awake=config.awake) as note,
                 Bus(config, "controller", run_id, stopping) as bus,
@@ -276,8 +302,11 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                     "; ".join(filter(None, (note, said_of(place)))),
                 ) as health,
             ):
-                node = ControllerNode(core, bus, health, counts)
-                with on_core(place):
+                saving = None
+                if path is not None:
+                    saving = CheckpointWriter(path, core.belongs(), outbox, config.trainer.capacity, counts)
+                node = ControllerNode(core, bus, health, counts, outbox, saving)
+                with saving or nullcontext(), on_core(place):
                     node.run(stopping)
         except ConfigError as error:
             log.error("%s", error)

@@ -1,9 +1,10 @@
-"""The controller's last samples, kept for a trainer that joins late."""
+"""The controller's last samples, kept for a trainer that joins late; after a restart those of the runs before too."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Sequence
 
 from protocol import codec
 from protocol.messages import Sample, Samples
@@ -13,10 +14,14 @@ BATCH = 500
 
 
 class Outbox:
-    """The newest `capacity` samples of one controller run. Any thread may call."""
+    """The newest `capacity` samples of one controller run. Any thread may call.
 
-    def __init__(self, run_id: str, capacity: int = CAPACITY):
+    earlier: batches of the runs that this one goes on from, oldest first.
+    """
+
+    def __init__(self, run_id: str, capacity: int = CAPACITY, earlier: Sequence[Samples] = ()):
         self.run_id = run_id
+        self.earlier = tuple(earlier)
         self._samples: deque[Sample] = deque(maxlen=capacity)
         self._lock = threading.Lock()
 
@@ -45,6 +50,8 @@ class Outbox:
     def answer(self, parameters: dict[str, str]) -> list[bytes]:
         """Answer `?run=RUN;since=SEQ;last=K`: encoded `Samples`; [] for another run, or when there are none.
 
+        Who asks for all, from the beginning, gets those of earlier runs too, under the names of those runs.
+
         Raises:
             ValueError: a parameter that is unknown or not a number.
         """
@@ -54,7 +61,19 @@ class Outbox:
         if parameters.get("run", "") not in ("", self.run_id):
             return []
         since, last = _number(parameters, "since", -1), _number(parameters, "last", CAPACITY)
-        return [codec.encode(batch) for batch in self.batches(self.since(since, last))]
+        own = self.since(since, last)
+        earlier = self._earlier(last - len(own)) if since < 0 else []
+        return [codec.encode(batch) for batch in (*earlier, *self.batches(own))]
+
+    def _earlier(self, room: int) -> list[Samples]:
+        """The newest batches of earlier runs that have room."""
+        found: list[Samples] = []
+        for batch in reversed(self.earlier):
+            room -= len(batch.samples)
+            if room < 0:
+                break
+            found.append(batch)
+        return found[::-1]
 
 
 def _number(parameters: dict[str, str], name: str, default: int) -> int:

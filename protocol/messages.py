@@ -230,6 +230,8 @@ class Keyframe(Message, frozen=True):
     """The controller's whole memory after tick `seq` (-1: before the first)."""
 
     arrays: dict[str, Array]
+    resumed: str = ""
+    """Before the first tick: the run whose memory this one goes on from, out of a checkpoint; empty: it began afresh."""
 
 
 class CertifiedSets(Message, frozen=True):

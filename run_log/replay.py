@@ -208,14 +208,14 @@ def _begin(
 ) -> None:
     """Put the core where the log's keyframe says that the controller was."""
     entry = recorded.keyframes[start]
-    if start == -1:
+    if start == -1 and not entry.message.resumed:
         # The memory before the first tick follows from the configuration and the seed: that is compared too.
         comparison.compare(entry, core.keyframe(-1), "keyframe")
         comparison.keyframes += 1
     try:
         core.restore(entry.message)
     except ValueError as error:
-        if start == -1:
+        if start == -1 and not entry.message.resumed:
             return  # a difference, and already noted; a changed configuration begins with its own memory
         hint = (
             "; from the first tick on, the changed configuration begins with a memory of its own"
@@ -369,6 +369,8 @@ def _notes(run: Run, recorded: list[_Recorded], overrides: Sequence[str]) -> lis
     if strangers:
         notes.append(f"not replayed, since it never said what it is: {', '.join(sorted(strangers))}")
     for r in recorded:
+        if -1 in r.keyframes and (before := r.keyframes[-1].message.resumed):
+            notes.append(f"{r.run_id}: goes on from the memory of {before}, out of a checkpoint")
         if not r.complete:
             notes.append(
                 f"{r.run_id}: the log does not hold the run to its end; replayed up to tick {r.last}"
