@@ -177,11 +177,15 @@ class Controller(Configured):
 class Trainer(Configured):
     """The trainer: collects samples, trains the hidden layers, sends them. Needs torch, not CasADi."""
 
+    plants: str | None = None
+    """Train for all plants whose names match, e.g. 'jet*' (docs/fleet.md); by default the one named in the
+    configuration."""
+
     def run(self) -> int:
         config, _ = self.resolve()
         from tandem import commands
 
-        return commands.trainer(config, self.json)
+        return commands.trainer(config, self.plants, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)

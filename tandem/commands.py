@@ -38,14 +38,14 @@ def controller(config: Config, as_json: bool) -> int:
     return _node("controller", main, config, as_json)
 
 
-def trainer(config: Config, as_json: bool) -> int:
+def trainer(config: Config, plants: str | None, as_json: bool) -> int:
     try:
-        from trainer_node.node import main
+        from trainer_node.main import main
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
         raise Refused("the trainer needs torch: pip install 'tandem-control[trainer]'") from error
-    return _node("trainer", main, config, as_json)
+    return _node("trainer", lambda config: main(config, plants=plants), config, as_json)
 
 
 def plant(config: Config, as_json: bool) -> int:

@@ -36,7 +36,8 @@ from protocol.messages import (
 )
 from protocol.network import NetworkDescription, hash_layers, initial_hidden
 from trainer_node import node as trainer_module
-from trainer_node.node import NAMES, TrainerNode, main
+from trainer_node.main import main
+from trainer_node.node import NAMES, TrainerNode
 
 pytestmark = pytest.mark.live
 
@@ -360,7 +361,7 @@ def process(config: Config) -> subprocess.Popen[bytes]:
     code = (
         "import sys\n"
         "from node_runtime import config\n"
-        "from trainer_node.node import main\n"
+        "from trainer_node.main import main\n"
         "sys.exit(main(config.from_json(sys.argv[1])))"
     )
     return subprocess.Popen([sys.executable, "-c", code, configuration.to_json(config)])

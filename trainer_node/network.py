@@ -18,7 +18,7 @@ from protocol.architecture import Activation, get_architecture
 from protocol.network import NetworkDescription
 
 # torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
-_ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
+ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
     "tanh": torch.tanh,
     "sigmoid": torch.sigmoid,
     "softsign": torch.nn.functional.softsign,
@@ -27,7 +27,7 @@ _ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
 }
 
 # Each activation's way back, from the gradient g and its value s = psi(a) alone.
-_BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
     "tanh": torch.ops.aten.tanh_backward,
     "sigmoid": torch.ops.aten.sigmoid_backward,
     "softsign": lambda g, s: g * (1.0 - s.abs()).square_(),
@@ -43,7 +43,7 @@ class _Tensors:
         return torch.addmm(layer[0], a, layer[1])
 
     def activate(self, name: Activation, a: torch.Tensor) -> torch.Tensor:
-        return _ACTIVATIONS[name](a)
+        return ACTIVATIONS[name](a)
 
     def join(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
         return torch.cat(list(parts), dim=1)
@@ -199,7 +199,7 @@ class DenseLoss:
         self._back = (2.0 / self._samples) * self._weights.T.contiguous()
         self._gradient = torch.zeros_like(network.flat, requires_grad=False)
         self._layers = [
-            _Layer(W[0], W[1:], W[1:].T, dW[0], dW[1:], _ACTIVATIONS[activation], _BACKWARD[activation])
+            _Layer(W[0], W[1:], W[1:].T, dW[0], dW[1:], ACTIVATIONS[activation], BACKWARD[activation])
             for W, dW, activation in zip(
                 network.layers(network.flat.detach()),
                 network.layers(self._gradient),

@@ -1,4 +1,4 @@
-"""`tandem trainer`: the live shell around `Trainer`. Collect samples, train when due, publish.
+"""The live shell around one plant's `Trainer`: collect samples, train when due, publish.
 
 It may start before, with or long after the controller, and may be restarted at any time: one query to the
 controller gives the hidden layers in force, another one the samples that were missed.
@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
 import msgspec
 
 from node_runtime import clock
-from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.bus import Bus
+from node_runtime.config import Config, TrainerConfig
+from node_runtime.health import HealthPublisher
 from node_runtime.inbox import Inbox
-from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.realtime import quick_handover
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.network import NetworkDescription, hash_layers
 from protocol.topics import Topic
-from trainer_node.training import Trainer, TrainerError, pick_device, use_one_thread
+from trainer_node.descent import Descent, descend_together, shape_of
+from trainer_node.training import Draw, Trainer
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +42,8 @@ SHARE = 0.5
 """Of the time, at most, is spent training: a network that takes long to train is trained less often."""
 ADOPTION_PATIENCE = 2.0
 """Seconds that a controller may go on with other hidden layers than those it was sent."""
+ROUND = 16
+"""Plants trained in one round, at most: the others' samples wait for as long as it takes."""
 OUTBOX = 20_000
 """Samples to ask for when the buffer can make use of more than it holds."""
 
@@ -61,13 +64,26 @@ NAMES = (
     "samples of other runs",
 )
 WAITING = "waiting for a controller with a network"
+DISABLED = "trainer.enabled is false: hidden layers are not trained"
 
 
 class TrainerNode:
-    """One trainer on the bus. Everything happens in the thread that calls `run`."""
+    """One plant's trainer on the bus. All but waiting for answers happens in the thread that calls."""
 
-    def __init__(self, config: Config, bus: Bus, health: HealthPublisher, counts: dict[str, int]):
-        """`counts`: this node's own figures, kept up to date here; other threads may copy it."""
+    def __init__(
+        self,
+        config: Config,
+        bus: Bus,
+        health: HealthPublisher,
+        counts: dict[str, int],
+        askers: Executor | None = None,
+    ):
+        """`counts`: this node's own figures, kept up to date here; other threads may copy it.
+
+        askers: who waits for answers, so that a controller that gives none holds up nobody else.
+        """
+        self._askers = askers or ThreadPoolExecutor(1, "ask")
+        self._asked: tuple[Future[list[bytes]], Callable[[list[bytes]], None]] | None = None
         self._config = config
         self._bus = bus
         self._health = health
@@ -84,37 +100,73 @@ class TrainerNode:
         self._refill_at = 0.0
         self._unadopted_since: float | None = None
         self._train_at = 0.0
-        self._trained_for = 0.0
+        self._waits_since: float | None = None
+
+    @property
+    def settings(self) -> TrainerConfig:
+        """How it trains: the same for all nodes of a process."""
+        return self._config.trainer
 
     @property
     def trainer(self) -> Trainer | None:
         """None until a controller has answered."""
         return self._trainer
 
-    def run(self, stop: threading.Event) -> None:
-        """Until `stop` is set."""
-        self._health.set("ready", WAITING)
-        while not stop.wait(POLL):
-            self.turn(clock.now())
+    def start(self) -> None:
+        """Say that it is here."""
+        self._health.set("ready", WAITING if self._config.trainer.enabled else DISABLED)
 
-    def turn(self, now: float) -> None:
-        """Look at all that has arrived, and do what is due; `now` in seconds on the monotonic clock."""
+    def run(self, stop: threading.Event) -> None:
+        """This plant alone, until `stop` is set."""
+        self.start()
+        while not stop.wait(POLL):
+            now = clock.now()
+            self.listen(now)
+            train_round([self], now)
+            self.tell()
+
+    def listen(self, now: float) -> None:
+        """Look at all that has arrived, and ask for what is missing; `now` in seconds on the monotonic clock.
+
+        While a question is open, messages stay where they are: what is missing is known again after its answer.
+        """
+        if not self._config.trainer.enabled:
+            return
+        answered = False
+        if self._asked is not None:
+            future, then = self._asked
+            if not future.done():
+                return
+            self._asked, answered = None, True
+            then(future.result())
         received = self._outputs.take()
         if received is not None:
             self._follow(received.message, now)
-        if self._must_join() and now >= self._join_at:
+        if self._must_join() and now >= self._join_at and not answered:
             self._join_at = now + JOIN_EVERY
             self._join()
+            return
         for batch in self._samples.take_all():
             self._merge(batch.message)
         if self._gap is not None and now >= self._refill_at:
             self._refill_at = now + REFILL_EVERY
             self._refill(self._gap)
-        if now >= self._train_at and self._may_train():
-            self._train()
-            self._train_at = now + max(TRAIN_EVERY, self._trained_for / SHARE)
+        if self._waits_since is None and self._may_train():
+            self._waits_since = now
+
+    def tell(self) -> None:
+        """Bring the figures up to date."""
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))
+
+    def waits_since(self, now: float) -> float | None:
+        """Since when this plant could be trained, None when it cannot be now."""
+        return (
+            self._waits_since if now >= self._train_at and self._asked is None and self._may_train() else None
+        )
+
+    def _ask(self, name: str, parameters: dict[str, str], then: Callable[[list[bytes]], None]) -> None:
+        self._asked = self._askers.submit(self._bus.ask, name, parameters, ASK_TIMEOUT), then
 
     # -- which controller, which hidden layers ---------------------------------------------------------------
 
@@ -147,8 +199,11 @@ class TrainerNode:
 
     def _join(self) -> None:
         """Take over the hidden layers of the controller that sends K; before that, of any that answers."""
+        self._ask(topics.HIDDEN_QUERY, {}, self._joined)
+
+    def _joined(self, answers: list[bytes]) -> None:
         sender = None if self._output is None else self._output.run_id
-        for payload in self._bus.ask(topics.HIDDEN_QUERY, {}, ASK_TIMEOUT):
+        for payload in answers:
             snapshot = self._decode(HIDDEN_ANSWER, payload, m.HiddenSnapshot)
             if snapshot is not None and sender in (None, snapshot.run_id) and self._take_over(snapshot):
                 return
@@ -206,11 +261,17 @@ class TrainerNode:
         settings = self._config.trainer
         last = settings.capacity if settings.strategy == "fifo" else OUTBOX
         parameters = {"run": self._run, "since": str(since), "last": str(last)}
+        self._ask(topics.OUTBOX_QUERY, parameters, lambda answers: self._refilled(answers, since))
+
+    def _refilled(self, answers: list[bytes], since: int) -> None:
+        assert self._trainer is not None
         new = 0
-        for payload in self._bus.ask(topics.OUTBOX_QUERY, parameters, ASK_TIMEOUT):
+        for payload in answers:
             batch = self._decode(OUTBOX_ANSWER, payload, m.Samples)
-            if batch is not None and batch.run_id == self._run:
-                self._gap = None
+            if batch is not None:
+                if batch.run_id == self._run:
+                    self._gap = None
+                # A controller that was started again keeps samples of its earlier runs.
                 new += self._add(OUTBOX_ANSWER, batch)
         if new:
             self._count("gaps filled")
@@ -241,13 +302,22 @@ class TrainerNode:
             and trainer.due()
         )
 
-    def _train(self) -> None:
+    def begin(self) -> Draw | None:
+        """Begin a training, None when the hidden layers stay; only while `waits_since` gives a time."""
         assert self._trainer is not None
         assert self._output is not None
-        began = clock.now()
-        weights = self._trainer.train(self._output, self._run)
-        self._trained_for = clock.now() - began
-        self._counts["last training, ms"] = round(self._trained_for * 1e3)
+        self._waits_since = None
+        return self._trainer.begin(self._output, self._run)
+
+    def rest(self, now: float, took: float) -> None:
+        """Not to be trained again too soon after a round that began at `now` and took this long, in seconds."""
+        self._counts["last training, ms"] = round(took * 1e3)
+        self._train_at = now + max(TRAIN_EVERY, took / SHARE)
+
+    def finish(self, draw: Draw, descent: Descent) -> None:
+        """Publish what the training found, if it is any good."""
+        assert self._trainer is not None
+        weights = self._trainer.finish(draw, descent)
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)
@@ -268,27 +338,34 @@ class TrainerNode:
         self._counts[name] += 1
 
 
-def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem trainer`. 0 when told to stop, 2 when this machine cannot train as configured."""
-    try:
-        pick_device(config.trainer.device)
-    except TrainerError as error:
-        log.error("%s", error)
-        return 2
-    use_one_thread()
-    run_id = new_run_id("trainer")
-    counts = dict.fromkeys(NAMES, 0)
-    with stopped_by_signals(stop) as stopping, quick_handover():
-        try:
-            with (
-                Bus(config, "trainer", run_id, stopping) as bus,
-                HealthPublisher(bus, run_info(config, "trainer", run_id), counts.copy) as health,
-            ):
-                if config.trainer.enabled:
-                    TrainerNode(config, bus, health, counts).run(stopping)
-                else:
-                    health.set("ready", "trainer.enabled is false: hidden layers are not trained")
-                    stopping.wait()
-        except OpenInterrupted:
-            log.info("stopped before there was a router")
-    return 0
+def train_round(nodes: Sequence[TrainerNode], now: float) -> float:
+    """Train the plants that have waited longest, up to `ROUND` of one shape, in one descent.
+
+    Returns:
+        Seconds that it took.
+    """
+    waiting = sorted(
+        ((since, k) for k, node in enumerate(nodes) if (since := node.waits_since(now)) is not None)
+    )
+    began, shape = clock.now(), None
+    chosen: list[tuple[TrainerNode, Draw]] = []
+    for _, k in waiting:
+        trainer = nodes[k].trainer
+        assert trainer is not None
+        found = shape_of(trainer.description)
+        if len(chosen) == ROUND or (shape is not None and found != shape):
+            continue
+        draw = nodes[k].begin()
+        if draw is not None:
+            # Whoever has waited longest says which shape is trained.
+            shape = found
+            chosen.append((nodes[k], draw))
+    if not chosen:
+        return 0.0
+    settings = nodes[0].settings
+    descents = descend_together([draw.problem for _, draw in chosen], settings.steps, settings.learning_rate)
+    took = clock.now() - began
+    for (node, draw), descent in zip(chosen, descents, strict=True):
+        node.rest(now, took)
+        node.finish(draw, descent)
+    return clock.now() - began

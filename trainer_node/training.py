@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.optim.adam import adam
 
 from node_runtime.config import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
 from protocol.network import NetworkDescription, hash_layers, why_unacceptable
-from trainer_node.network import Loss, Network, build_loss
+from trainer_node.descent import Descent, Problem, descend
+from trainer_node.network import Network
 from trainer_node.replay_buffer import ReplayBuffer
 
 BASES = 8
@@ -46,6 +47,15 @@ def pick_device(wanted: str) -> torch.device:
 
 class _Kept(Exception):
     """A training that leaves the hidden layers as they are, and why."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A training that has begun: what to minimise, and the message it answers."""
+
+    problem: Problem
+    output: OutputWeights
+    for_run: str
 
 
 class Trainer:
@@ -149,15 +159,33 @@ class Trainer:
         Returns:
             The new hidden layers, or None when the old ones stay; `counters["kept: <reason>"]` says why.
         """
+        draw = self.begin(output, for_run)
+        if draw is None:
+            return None
+        return self.finish(draw, descend(draw.problem, self.config.steps, self.config.learning_rate))
+
+    def begin(self, output: OutputWeights, for_run: str) -> Draw | None:
+        """The first part of `train`, up to the Adam steps; None when the old hidden layers stay.
+
+        The problem holds this trainer's own network: one draw at a time.
+        """
         self._fresh = 0
         self.counters["trainings"] += 1
         try:
-            return self._train(output, for_run)
+            return self._draw(output, for_run)
         except _Kept as reason:
             self.counters[f"kept: {reason}"] += 1
             return None
 
-    def _train(self, output: OutputWeights, for_run: str) -> HiddenWeights:
+    def finish(self, draw: Draw, descent: Descent) -> HiddenWeights | None:
+        """The last part of `train`: judge what the Adam steps found, and take it over or leave it."""
+        try:
+            return self._judge(draw, descent)
+        except _Kept as reason:
+            self.counters[f"kept: {reason}"] += 1
+            return None
+
+    def _draw(self, output: OutputWeights, for_run: str) -> Draw:
         K = output.K.numpy()
         if K.shape != (self.description.features, self.description.states):
             raise _Kept("K has the wrong shape")
@@ -172,14 +200,16 @@ class Trainer:
             raise _Kept("no samples")
         xu, h = self.buffer.sample(self.config.batch, self._draws)
         self._network.load(base)
-        before, after = self._descend(build_loss(self._network, xu, h, K))
-        trained = self._network.hidden()
+        return Draw(Problem(self._network, xu, h, K), output, for_run)
+
+    def _judge(self, draw: Draw, descent: Descent) -> HiddenWeights:
+        output, trained = draw.output, descent.hidden
         why = why_unacceptable(self.description, trained)
         if why is not None:
             raise _Kept("norm bound" if "norm" in why else "not finite")
-        if not math.isfinite(after):
+        if not math.isfinite(descent.after):
             raise _Kept("not finite")
-        if not after < before:
+        if not descent.after < descent.before:
             raise _Kept("loss not lower")
         self._bases.move_to_end(output.hidden_sha256)
         self._take(trained)
@@ -188,44 +218,16 @@ class Trainer:
         return HiddenWeights(
             run_id=self.run_id,
             seq=self.version,
-            for_run=for_run,
+            for_run=draw.for_run,
             trained_on=output.seq,
             base_sha256=output.hidden_sha256,
-            samples=len(xu),
-            loss_before=before,
-            loss_after=after,
+            samples=len(draw.problem.window),
+            loss_before=descent.before,
+            loss_after=descent.after,
             network_sha256=self.description.sha256(),
             sha256=self._sha256,
             layers=[Array.of(layer, "<f4") for layer in trained],
         )
-
-    def _descend(self, loss: Loss) -> tuple[float, float]:
-        """Adam on the network's hidden layers. Returns the losses before and after."""
-        parameter = self._network.flat
-        before = loss.value()
-        with torch.no_grad():
-            moments, squares = torch.zeros_like(parameter), torch.zeros_like(parameter)
-            taken = torch.zeros((), device=parameter.device)
-            for _ in range(self.config.steps):
-                gradient = loss.gradient()
-                # What torch.optim.Adam calls. The class would import the rest of torch, over a second.
-                adam(
-                    [parameter],
-                    [gradient],
-                    [moments],
-                    [squares],
-                    [],
-                    [taken],
-                    fused=True,
-                    amsgrad=False,
-                    beta1=0.9,
-                    beta2=0.999,
-                    lr=self.config.learning_rate,
-                    weight_decay=0.0,
-                    eps=1e-8,
-                    maximize=False,
-                )
-        return before, loss.value()
 
     def _take(self, hidden: list[np.ndarray]) -> None:
         self._hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]

@@ -1,0 +1,127 @@
+"""One trainer for many plants: together as alone, garbage kept apart, plants that come, go and come back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from node_runtime.config import TrainerConfig
+from protocol.messages import Array, OutputWeights, Sample
+from protocol.network import NetworkDescription, initial_hidden
+from trainer_node import fleet
+from trainer_node.descent import Problem, descend_together
+from trainer_node.fleet import Heard, seed_of
+from trainer_node.training import Draw, Trainer, use_one_thread
+
+TRAINING = TrainerConfig(capacity=600, batch=128, steps=40, device="cpu")
+SAMPLES = (128, 40, 300, 77)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    before = torch.get_num_threads()
+    use_one_thread()
+    yield
+    torch.set_num_threads(before)
+
+
+def description(architecture: str = "mlp", window: int = 1) -> NetworkDescription:
+    return NetworkDescription(
+        states=2,
+        inputs=1,
+        hidden=[16, 16],
+        activations=["tanh", "tanh"],
+        input_scale=[0.5, 1.0, 1.0],
+        output_scale=[0.01, 0.02],
+        architecture=architecture,
+        window=window,
+        options={"kernel": 3} if architecture == "cnn" else {},
+    )
+
+
+class Pupil:
+    """A plant's trainer with samples of a plant of its own, and the K it trains under."""
+
+    def __init__(self, network: NetworkDescription, number: int, samples: int):
+        rng = np.random.default_rng([3, number])
+        self.hidden = initial_hidden(network, rng)
+        self.trainer = Trainer(network, TRAINING, number, "trainer", self.hidden)
+        K = rng.normal(size=(network.features, 2)) * 0.2
+        self.output = OutputWeights(
+            run_id="c", seq=40, hidden_version=0, hidden_sha256=self.trainer.sha256, K=Array.of(K)
+        )
+        pairs = rng.uniform(-1, 1, (samples + network.window, 3))
+        told = []
+        for k in range(samples):
+            past, (x, y, u) = pairs[k : k + network.window - 1], pairs[k + network.window - 1]
+            h = [0.01 * np.sin(3 * x + number) * u, 0.02 * np.tanh(x * y)]
+            told.append(Sample(k, [x, y], [u], h, past.tolist()))
+        self.trainer.add("c", told)
+
+    def draw(self) -> Draw:
+        draw = self.trainer.begin(self.output, "c")
+        assert draw is not None
+        return draw
+
+
+@pytest.mark.parametrize(("architecture", "window"), [("mlp", 1), ("rnn", 3), ("cnn", 4)])
+def test_together_as_alone(architecture: str, window: int) -> None:
+    network = description(architecture, window)
+    alone = [Pupil(network, k, count) for k, count in enumerate(SAMPLES)]
+    found = [pupil.trainer.train(pupil.output, "c") for pupil in alone]
+    together = [Pupil(network, k, count) for k, count in enumerate(SAMPLES)]
+    draws = [pupil.draw() for pupil in together]
+    descents = descend_together([draw.problem for draw in draws], TRAINING.steps, TRAINING.learning_rate)
+    for pupil, one, draw, many in zip(together, found, draws, descents, strict=True):
+        assert one is not None
+        assert many.after < many.before
+        assert many.before == pytest.approx(one.loss_before, rel=1e-5)
+        assert many.after == pytest.approx(one.loss_after, rel=1e-3)
+        sent = [layer.numpy() for layer in one.layers]
+        moved = max(np.abs(a - b).max() for a, b in zip(sent, pupil.hidden, strict=True))
+        apart = max(np.abs(a - b).max() for a, b in zip(sent, many.hidden, strict=True))
+        # float32, 40 steps: the order of the sums is all that differs.
+        assert apart < 1e-3 * moved
+        assert pupil.trainer.finish(draw, many) is not None
+
+
+def test_a_plant_that_diverges_changes_no_bit_of_the_others() -> None:
+    healthy = [Pupil(description(), k, 100) for k in range(3)]
+    draws = [pupil.draw() for pupil in healthy]
+    problems = [draw.problem for draw in draws]
+    before = descend_together(problems, TRAINING.steps, TRAINING.learning_rate)
+    one = problems[1]
+    problems[1] = Problem(one.network, one.window, one.h * 1e30, one.K * 1e38)
+    for pupil in healthy:
+        pupil.draw()
+    after = descend_together(problems, TRAINING.steps, TRAINING.learning_rate)
+    assert not np.isfinite(after[1].after)
+    assert healthy[1].trainer.finish(draws[1], after[1]) is None
+    for k in (0, 2):
+        assert after[k].after == before[k].after
+        for a, b in zip(after[k].hidden, before[k].hidden, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
+    heard = Heard("jet*")
+    heard.note("tandem/jet1/controller/samples", 0.0)
+    heard.note("tandem/pump/controller/samples", 0.0)
+    assert heard.present(1.0) == ["jet1"]
+    assert heard.present(1.0 + fleet.SILENT) == []
+    heard.note("tandem/jet1/controller/samples", 20.0)
+    assert heard.present(20.0) == ["jet1"]
+
+
+def test_a_stranger_who_invents_names_fills_no_memory() -> None:
+    heard = Heard("*")
+    for k in range(fleet.MOST + 100):
+        heard.note(f"tandem/x{k}/controller/samples", 0.0)
+    assert len(heard.present(0.0)) == fleet.MOST
+
+
+def test_the_seed_is_the_name_and_not_the_order() -> None:
+    assert seed_of(0, "jet1") == seed_of(0, "jet1") != seed_of(0, "jet2") != seed_of(1, "jet2")

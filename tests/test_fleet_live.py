@@ -1,0 +1,52 @@
+"""The trainer of a fleet on a real bus: plants are found by what they say, and each gets its own weights."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+from test_trainer_node import Controller, config  # noqa: F401
+
+from node_runtime.config import Config
+from trainer_node.main import main
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture
+def fleet(config: Config) -> Iterator[Config]:  # noqa: F811
+    """A trainer of all jets in a thread."""
+    stop = threading.Event()
+    thread = threading.Thread(target=main, args=[config, stop, "jet*"])
+    thread.start()
+    yield config
+    stop.set()
+    thread.join(20.0)
+    assert not thread.is_alive()
+
+
+def named(config: Config, name: str) -> Config:  # noqa: F811
+    return msgspec.structs.replace(config, name=name)
+
+
+def test_two_plants_get_weights_each_and_a_stranger_gets_none(
+    fleet: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    with (
+        Controller(named(fleet, "jet1"), "one") as one,
+        Controller(named(fleet, "jet2"), "two", seed=1) as two,
+        Controller(named(fleet, "pump"), "three") as pump,
+    ):
+        for controller in (one, two):
+            for other in (one, two, pump):
+                other.tick(20)
+            controller.until(lambda h: h.counters.get("adopted", 0) >= 1, tick=True)
+        assert {weights.for_run for weights in one.adopted} == {"one"}
+        assert {weights.for_run for weights in two.adopted} == {"two"}
+        pump.tick()
+        assert not pump.adopted
+    assert "no plant matches 'jet*' yet" in caplog.text

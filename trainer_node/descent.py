@@ -1,0 +1,245 @@
+"""Adam on the hidden layers: of one network, or of many of one shape in one step.
+
+Many: their layers, samples and output weights are stacked, and every operation of a step is called once for all of
+them. Nothing is summed across plants, so a plant's numbers never enter another's. To rounding the result is
+that of `descend` alone; a stack sums in another order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch.optim.adam import adam
+
+from protocol.network import NetworkDescription
+from trainer_node.network import ACTIVATIONS, BACKWARD, Network, build_loss
+
+CACHED_ROWS = 2048
+"""Samples of a stack on a CPU: with more at once every step goes to memory, and is slower than one by one."""
+LANES = 256
+"""Plants of a stack on a GPU."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One plant's training."""
+
+    network: Network
+    """Holds the hidden layers to start from."""
+    window: np.ndarray
+    """(M, k (d + m)), plant units."""
+    h: np.ndarray
+    """(M, d)."""
+    K: np.ndarray
+    """(1 + n_L, d), fixed."""
+
+
+class Descent(NamedTuple):
+    """What became of one plant's hidden layers."""
+
+    hidden: list[np.ndarray]
+    """W_1..W_{L-1}, (1 + n_{i-1}, n_i) each; not finite where the samples or K lead there."""
+    before: float
+    after: float
+    """The losses."""
+
+
+class _Loss(Protocol):
+    def values(self) -> torch.Tensor:
+        """The loss of each plant, (P,)."""
+
+    def gradient(self) -> torch.Tensor:
+        """(P, N), one row a plant; the next call may overwrite it."""
+
+
+def shape_of(description: NetworkDescription) -> Hashable:
+    """Equal for networks that can be trained in one stack: all but the scales, which are data."""
+    d = description
+    return (
+        d.states,
+        d.inputs,
+        tuple(d.hidden),
+        tuple(d.activations),
+        d.architecture,
+        d.window,
+        tuple(sorted(d.options.items())),
+    )
+
+
+def descend(problem: Problem, steps: int, learning_rate: float) -> Descent:
+    """`steps` of Adam on one network."""
+    network = problem.network
+    loss = build_loss(network, problem.window, problem.h, problem.K)
+    before = loss.value()
+    _adam(network.flat, loss.gradient, steps, learning_rate)
+    return Descent(network.hidden(), before, loss.value())
+
+
+def descend_together(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
+    """`descend` for networks of one shape on one device, in one stack.
+
+    Raises:
+        ValueError: the networks have different shapes.
+    """
+    if len({shape_of(problem.network.description) for problem in problems}) > 1:
+        raise ValueError("networks of different shapes cannot be stacked; group them by shape_of")
+    rows = max((len(problem.window) for problem in problems), default=1)
+    on_gpu = bool(problems) and problems[0].network.device.type == "cuda"
+    lanes = LANES if on_gpu else max(1, CACHED_ROWS // rows)
+    found: list[Descent] = []
+    for first in range(0, len(problems), lanes):
+        found += _descend(problems[first : first + lanes], steps, learning_rate)
+    return found
+
+
+def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
+    if len(problems) == 1:
+        return [descend(problems[0], steps, learning_rate)]
+    stack = _Stack(problems)
+    dense = problems[0].network.description.architecture == "mlp"
+    loss: _Loss = _Dense(stack) if dense else _Mapped(stack)
+    before = loss.values().tolist()
+    _adam(stack.flat, loss.gradient, steps, learning_rate)
+    after = loss.values().tolist()
+    # One copy from the device, not one for each layer of each plant.
+    rows = stack.flat.cpu()
+    hidden = [[W.numpy().astype(np.float64) for W in stack.network.layers(row)] for row in rows]
+    return [Descent(*parts) for parts in zip(hidden, before, after, strict=True)]
+
+
+def _adam(
+    parameter: torch.Tensor, gradient: Callable[[], torch.Tensor], steps: int, learning_rate: float
+) -> None:
+    with torch.no_grad():
+        moments, squares = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        taken = torch.zeros((), device=parameter.device)
+        for _ in range(steps):
+            slope = gradient()
+            # What torch.optim.Adam calls. The class would import the rest of torch, over a second.
+            adam(
+                [parameter],
+                [slope],
+                [moments],
+                [squares],
+                [],
+                [taken],
+                fused=True,
+                amsgrad=False,
+                beta1=0.9,
+                beta2=0.999,
+                lr=learning_rate,
+                weight_decay=0.0,
+                eps=1e-8,
+                maximize=False,
+            )
+
+
+class _Stack:
+    """P problems as tensors. A plant with fewer than M samples is filled up with rows of weight 0."""
+
+    def __init__(self, problems: Sequence[Problem]):
+        self.network = problems[0].network
+        tensor, most = self.network.tensor, max(len(problem.window) for problem in problems)
+        self.flat = torch.stack([problem.network.flat.detach() for problem in problems])
+
+        def stacked(parts: list[torch.Tensor]) -> torch.Tensor:
+            whole = torch.zeros(
+                (len(parts), most, parts[0].shape[1]), dtype=self.flat.dtype, device=self.flat.device
+            )
+            for lane, part in zip(whole, parts, strict=True):
+                lane[: len(part)] = part
+            return whole
+
+        networks = [problem.network for problem in problems]
+        self.inputs = stacked([n.scaled(n.tensor(p.window)) for n, p in zip(networks, problems, strict=True)])
+        K = torch.stack([tensor(problem.K) for problem in problems])
+        self.offset = stacked(
+            [
+                output[0] - n.scaled_targets(n.tensor(p.h))
+                for n, p, output in zip(networks, problems, K, strict=True)
+            ]
+        )
+        self.weights = K[:, 1:].contiguous()
+        """(P, n_L, d)"""
+        self.share = stacked([tensor([[1.0 / len(p.window)]] * len(p.window)) for p in problems])
+        """(P, M, 1): what a row counts in its plant's mean."""
+
+
+class _Mapped:
+    """Any architecture: its loss mapped over the plants."""
+
+    def __init__(self, stack: _Stack):
+        # Only here: it takes a while to import, and a single plant does without.
+        from torch.func import grad, vmap
+
+        network = stack.network
+
+        def loss(
+            flat: torch.Tensor,
+            inputs: torch.Tensor,
+            offset: torch.Tensor,
+            weights: torch.Tensor,
+            share: torch.Tensor,
+        ) -> torch.Tensor:
+            layers = [(W[0], W[1:]) for W in network.layers(flat)]
+            residual = offset + network.activations(inputs, layers) @ weights
+            return (residual.square() * share).sum()
+
+        self._stack = stack
+        self._values, self._gradient = vmap(loss), vmap(grad(loss))
+
+    def _data(self) -> tuple[torch.Tensor, ...]:
+        s = self._stack
+        return s.flat, s.inputs, s.offset, s.weights, s.share
+
+    @torch.no_grad()
+    def values(self) -> torch.Tensor:
+        return self._values(*self._data())
+
+    def gradient(self) -> torch.Tensor:
+        with torch.enable_grad():
+            return self._gradient(*self._data()).detach()
+
+
+class _Dense:
+    """Dense layers, their gradient by hand, as `DenseLoss` with one more dimension in front."""
+
+    def __init__(self, stack: _Stack):
+        self._stack, description = stack, stack.network.description
+        self._slope = torch.zeros_like(stack.flat)
+        self._back, self._double = stack.weights.transpose(1, 2).contiguous(), 2.0 * stack.share
+        self._W, self._dW, start = [], [], 0
+        for rows, columns in description.layer_shapes:
+            part = slice(start, start + rows * columns)
+            self._W.append(stack.flat[:, part].view(-1, rows, columns))
+            self._dW.append(self._slope[:, part].view(-1, rows, columns))
+            start += rows * columns
+        self._forth = [ACTIVATIONS[name] for name in description.activations]
+        self._backward = [BACKWARD[name] for name in description.activations]
+
+    def _forward(self) -> tuple[list[torch.Tensor], torch.Tensor]:
+        values = [self._stack.inputs]
+        for W, psi in zip(self._W, self._forth, strict=True):
+            values.append(psi(torch.baddbmm(W[:, :1], values[-1], W[:, 1:])))
+        return values, torch.baddbmm(self._stack.offset, values[-1], self._stack.weights)
+
+    @torch.no_grad()
+    def values(self) -> torch.Tensor:
+        _, residual = self._forward()
+        return (residual.square() * self._stack.share).sum(dim=(1, 2))
+
+    @torch.no_grad()
+    def gradient(self) -> torch.Tensor:
+        values, residual = self._forward()
+        towards = (residual * self._double) @ self._back
+        for i in reversed(range(len(self._W))):
+            delta = self._backward[i](towards, values[i + 1])
+            self._dW[i][:, 0] = delta.sum(1)
+            self._dW[i][:, 1:] = values[i].transpose(1, 2) @ delta
+            if i:
+                towards = delta @ self._W[i][:, 1:].transpose(1, 2)
+        return self._slope

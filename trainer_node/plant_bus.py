@@ -1,0 +1,75 @@
+"""One trainer's place on many plants' buses: each has its keys and its counters, all share two sessions."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from types import TracebackType
+
+import zenoh
+
+from node_runtime.bus import Bus
+from node_runtime.config import Config
+from node_runtime.session import connect
+from protocol import topics
+
+
+class Sessions:
+    """The two sessions of a process, control and bulk. A context manager; entering waits for the router.
+
+    Raises on entering:
+        OpenInterrupted: `stop` was set first.
+        ConfigError: the endpoint is none.
+    """
+
+    def __init__(self, config: Config, process: str, stop: threading.Event):
+        self._config, self._process, self.stop = config, process, stop
+        self._leaving = contextlib.ExitStack()
+
+    def __enter__(self) -> Sessions:
+        with contextlib.ExitStack() as opened:
+            self.control = connect(self._config, self.stop, self._process)
+            opened.callback(self.control.close)
+            self.bulk = connect(self._config, self.stop, self._process)
+            opened.callback(self.bulk.close)
+            self._leaving = opened.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # Leaving a link that is full and dead could take long, and the process must end nevertheless.
+        leaving = threading.Thread(target=self._leaving.close, name="leave", daemon=True)
+        leaving.start()
+        leaving.join(2.0)
+
+
+class PlantBus(Bus):
+    """`Bus` of the plant `config.name` on sessions that others use too; closing it leaves them open."""
+
+    def __init__(self, config: Config, process: str, run_id: str, sessions: Sessions):
+        super().__init__(config, process, run_id, sessions.stop)
+        self._shared = sessions
+
+    def open(self) -> None:
+        """Declare what this process publishes for this plant."""
+        self._control, self._bulk = self._shared.control, self._shared.bulk
+        for topic in topics.ALL:
+            if topic.writer == self.process:
+                self._publisher(topic)
+        self._start(self._send_bulk, f"bulk {self.config.name}")
+
+    def close(self, drain_s: float = 2.0) -> None:
+        """Send what is left, and take back all that was declared."""
+        if self._closed or self._bulk is None:
+            return
+        self.flush(drain_s)
+        with self._lock:
+            self._closed = True
+        self._outgoing.put(None)
+        for thread in self._threads:
+            thread.join(0.5)
+        for declared in (*self._entities, *self._publishers.values()):
+            # The session may be gone already.
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
