@@ -20,6 +20,9 @@ Layers = list[np.ndarray]
 KNOWN = 80
 """Newest samples that the attacker has heard."""
 
+PATIENCE = 2.0
+"""Seconds, as in `trainer_node.node`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Known:
@@ -54,6 +57,7 @@ class _Attacked(_LockStep):
     def __init__(self, config: Config, forge: Forge, every: int, instead: bool):
         super().__init__(config, Faults())
         self.forge, self.every, self.instead = forge, every, instead
+        self.strange = 0
         self.points: list[list[float]] = []
         self.rng = np.random.default_rng([config.seed, 0xBAD])
 
@@ -70,7 +74,20 @@ class _Attacked(_LockStep):
     def _learn(self, seq: int, outputs: Outputs) -> None:
         if outputs.sample is not None:
             self.points = [*self.points, [*outputs.sample.x, *outputs.sample.u]][-KNOWN:]
+        self._rejoin(outputs)
         super()._learn(seq, outputs)
+
+    def _rejoin(self, outputs: Outputs) -> None:
+        """As the live trainer: when others' layers have been in use for long enough, it goes on from those."""
+        output = outputs.output_weights
+        if self.trainer is None or output is None or output.hidden_sha256 == self.trainer.sha256:
+            self.strange = 0
+            return
+        self.strange += 1
+        if self.strange * self.config.period > PATIENCE:
+            snapshot = self.core.hidden_snapshot(output.seq)
+            assert snapshot is not None
+            self.trainer.resume(_numbers(snapshot.layers), snapshot.hidden_version)
 
     def _forged(self, seq: int, good: Layers, version: int) -> m.HiddenWeights:
         assert self.core.description is not None
