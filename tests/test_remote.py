@@ -207,11 +207,10 @@ def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
     context.load_verify_locations(mine.authority)
     host, _, port = site.remote.removeprefix("tls/").rpartition(":")
     with (
-        socket.create_connection((host, int(port))) as plain,
+        socket.create_connection((host, int(port)), 5.0) as plain,
         pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"),
         context.wrap_socket(plain, server_hostname=host) as link,
     ):
-        link.settimeout(5.0)
         link.recv(1)
     site.router.heard("bad TLS link: refused, it has no certificate")
 
