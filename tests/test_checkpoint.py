@@ -340,12 +340,17 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
         other = ControllerCore(override(live, ['name="jet2"', "network.hidden=[9, 8]"]), "controller-z")
         with CheckpointWriter(path, other.belongs(), Outbox("controller-z"), 10, counts()) as writer:
             writer.offer(Memory(5, other.lasting(), {"ticks": 1000}))
-    with Router(live), Bus(live, "recorder", "recorder-a") as bus, Process("plant_sim.node", live):
+    states: list[m.PlantState] = simulate(live, 3).plant_states
+    with (
+        Router(live),
+        Bus(live, "recorder", "recorder-a") as bus,
+        Bus(live, "plant", "plant-simulated") as plant,
+    ):
         ear = Ear(bus)
         with Process("controller_node.node", live) as process:
-            ear.until(
-                lambda message: isinstance(message, m.TickResult) and message.prediction_error is not None
-            )
+            ear.until(health_of("controller", note="no plant: waiting for its states"), 60.0)
+            play(plant, states, live.period)
+            ear.until(lambda message: isinstance(message, m.Tick))
             process.signal(signal.SIGTERM)
             assert process.end() == 0
     assert "starting afresh" in process.said

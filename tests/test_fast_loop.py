@@ -101,7 +101,7 @@ def test_at_twenty_hertz_every_tick_says_everything() -> None:
 
 
 def test_the_trainer_hears_of_an_adoption_at_once() -> None:
-    loop = Loop("rate=1000")
+    loop = Loop("rate=1000", "adaptation.trial.enabled=false")
     loop.tick(5)
     description = loop.core.description
     assert description is not None
