@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import logging
+import os
 import threading
 
 import zenoh
@@ -24,6 +25,11 @@ from node_runtime.session import lease_ms, secure, session_config
 from protocol import topics
 
 log = logging.getLogger(__name__)
+
+RECEIVING_THREADS = 32
+"""Of Zenoh, for all links together. It closes the link of a client that has vanished with SO_LINGER, and the thread
+that does waits in it for up to 10 s (eclipse-zenoh/zenoh #1101, #2718). A client has two links and Zenoh two threads:
+a trainer whose link was cut stopped every state and command for that long, as soon as its lease was over."""
 
 
 class RouterError(RuntimeError):
@@ -101,6 +107,8 @@ def open_to_all(endpoint: str) -> bool:
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it cannot be used."""
+    # Read when the first session opens, and nowhere else to be said.
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
     bad = BadMessages()
     if open_to_all(config.bus.endpoint) and not config.bus.insecure:
         log.warning(

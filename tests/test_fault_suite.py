@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from faults import facts as measured
 from faults import holds, link, suite, table
@@ -19,10 +20,14 @@ from faults.faults import ALL, BY_NAME, Fault, Stage
 from faults.rig import Rig
 from faults.suite import Outcome, Results
 from faults.traced_plant import Sampled
+from live import Process, live_config, wait_for
 
 from benchmarks import stalls
 from node_runtime import clock
+from node_runtime.bus import Bus
+from node_runtime.config import override, to_json
 from protocol import messages as m
+from protocol import topics
 
 ROOT = Path(__file__).resolve().parent.parent
 CALM = Facts(
@@ -259,6 +264,56 @@ def test_a_wire_delays_drops_and_cuts() -> None:
                 assert len(answered(5, 2.0)) == 5
             finally:
                 echo.kill()
+
+
+FAR = """
+import sys, threading
+from node_runtime.bus import Bus
+from node_runtime.config import from_json
+from protocol import topics
+with Bus(from_json(sys.argv[1]), "plant", "plant-far") as bus:
+    kept = [bus.queue(topics.OUTPUT_WEIGHTS), bus.queue(topics.COMMAND)]
+    print("ready", flush=True)
+    threading.Event().wait()
+"""
+
+
+@pytest.mark.live
+@pytest.mark.skipif(not link.available(), reason="links to network namespaces need root")
+def test_a_client_that_vanishes_does_not_stop_the_router() -> None:
+    """Zenoh closed its two links in its only two receiving threads, which waited up to 10 s in that."""
+    local = live_config("bus.lease_ms=400")
+    port = local.bus.endpoint.rpartition(":")[2]
+    listening = override(local, [f'bus.endpoint="tcp/0.0.0.0:{port}"', "bus.insecure=true"])
+    with (
+        link.link("wire", 51) as wire,
+        Process("node_runtime.router", listening),
+        Bus(local, "controller", "controller-1") as controller,
+        Bus(local, "plant", "plant-1") as plant,
+    ):
+        heard = controller.queue(topics.PLANT_STATE)
+        far = to_json(override(local, [f'bus.endpoint="tcp/{wire.here}:{port}"']))
+        with subprocess.Popen(
+            [*wire.prefix, sys.executable, "-c", FAR, far], stdout=subprocess.PIPE
+        ) as client:
+            try:
+                assert client.stdout is not None
+                assert client.stdout.readline()
+                wait_for(
+                    lambda: controller.matched(topics.OUTPUT_WEIGHTS) and plant.matched(topics.PLANT_STATE)
+                )
+                wire.shape(link.Shape(cut=True))
+                K = m.Array.of(np.zeros((65, 4)))
+                for seq in range(80):
+                    weights = m.OutputWeights(
+                        run_id="controller-1", seq=seq, hidden_version=0, hidden_sha256="", K=K
+                    )
+                    controller.publish(topics.OUTPUT_WEIGHTS, weights)
+                    plant.publish(topics.PLANT_STATE, sampled("hold", 0.05 * seq).state)
+                    clock.sleep_until(clock.now() + 0.05)
+                wait_for(lambda: len(heard) == 80, 0.5)
+            finally:
+                client.kill()
 
 
 WALL_CLOCK = {"time", "time_ns", "localtime", "gmtime", "ctime", "now", "today", "utcnow"}
