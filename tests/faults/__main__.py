@@ -24,7 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from benchmarks import machine
+from node_runtime import machine
 from node_runtime.config import RealtimeConfig
 from node_runtime.realtime import READER_PRIORITY, punctual
 

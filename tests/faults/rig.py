@@ -124,7 +124,12 @@ class Rig:
         self._seed, self._around = seed, around or Surroundings()
         port = _free_port()
         self.config = override(
-            config, [f'bus.endpoint="tcp/127.0.0.1:{port}"', f'log.path="{folder / "disk" / "run.mcap"}"']
+            config,
+            [
+                f'bus.endpoint="tcp/127.0.0.1:{port}"',
+                f'log.path="{folder / "disk" / "run.mcap"}"',
+                f'controller.checkpoint="{folder / "controller.checkpoint"}"',
+            ],
         )
         self.log = folder / "disk" / "run.mcap"
         self.trace = folder / "trace.jsonl"
