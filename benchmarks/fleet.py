@@ -24,7 +24,7 @@ import tyro
 import zenoh
 from rich.console import Console
 
-from benchmarks import machine
+from node_runtime import machine
 from node_runtime.config import Config, TrainerConfig, override, to_toml
 from node_runtime.router import Router
 from node_runtime.session import session_config

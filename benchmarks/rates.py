@@ -22,7 +22,7 @@ from typing import Any
 
 import tyro
 
-from benchmarks import machine
+from node_runtime import machine
 from node_runtime.choices import SolverMode
 from node_runtime.config import Config
 from run_log.errors import LogError

@@ -27,7 +27,8 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from benchmarks import machine, stalls
+from benchmarks import stalls
+from node_runtime import machine
 from node_runtime.config import Config
 from protocol import codec, topics
 from protocol import messages as m

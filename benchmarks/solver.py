@@ -12,12 +12,13 @@ import casadi as ca
 import msgspec
 import numpy as np
 
-from benchmarks import machine, memory, rivals
+from benchmarks import memory, rivals
 from benchmarks.candidates import Build, Candidate, Converged, Other, Part, RealTime, WholeTick
 from benchmarks.recording import SEED, Case, Recording, build_case, record
 from controller_node.build import Realise
 from controller_node.compile import Compiler
 from lbmpc.solver import Solver
+from node_runtime import machine
 from node_runtime.choices import OracleName
 from node_runtime.realtime import GarbageCollection, punctual
 

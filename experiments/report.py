@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from benchmarks import machine
 from experiments import findings, pictures, style
 from experiments.declaration import Declaration, Group
 from experiments.results import CaseResult, spread
 from lbmpc.plants import Plant
+from node_runtime import machine
 from node_runtime.config import Config, to_toml
 
 

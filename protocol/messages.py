@@ -231,7 +231,7 @@ class Keyframe(Message, frozen=True):
 
     arrays: dict[str, Array]
     resumed: str = ""
-    """Before the first tick: the run whose memory this one goes on from, out of a checkpoint; empty: it began afresh."""
+    """Before the first tick: the run whose memory this one goes on from, from a checkpoint; empty: it began afresh."""
 
 
 class CertifiedSets(Message, frozen=True):

@@ -20,8 +20,8 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from benchmarks import machine
 from benchmarks.fuzz.work import Finding, Report, Work, merge
+from node_runtime import machine
 
 BEGIN, END = "<!-- fuzz: begin, written by `make fuzz` -->", "<!-- fuzz: end -->"
 GROWTH_KB = 8 * 1024
