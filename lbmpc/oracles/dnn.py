@@ -216,14 +216,15 @@ class DnnOracle:
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
         if self.refit is not None or self.trial is not None:
-            row = np.concatenate([self.past(state).ravel(), x, u, h / self.output_scale])
+            before = (state["past"].ravel(),) if self.pairs > 1 else ()
+            parts = (*before, x, u, h / self.output_scale)
             if self.refit is not None:
                 number = int(state["sampled"][0])
                 learned["samples"] = state["samples"].copy()
-                learned["samples"][number % self.refit.window] = row
+                learned["samples"][number % self.refit.window] = np.concatenate(parts)
                 learned["sampled"] = np.array([number + 1], dtype=np.int64)
             if self.trial is not None:
-                learned |= remember(self.trial, state, row)
+                learned |= remember(self.trial, state, *parts)
         return learned
 
     def adopt(

@@ -73,13 +73,15 @@ def empty(trial: Trial, row: int) -> State:
     return {"recent": np.zeros((trial.capacity, row)), "seen": np.zeros(1, dtype=np.int64)}
 
 
-def remember(trial: Trial, state: State, row: np.ndarray) -> State:
-    """What one more sample changes."""
-    number = int(state["seen"][0])
-    changed = {"seen": np.array([number + 1], dtype=np.int64)}
+def remember(trial: Trial, state: State, *parts: np.ndarray) -> State:
+    """What one more sample changes; `parts`: its row, piece by piece."""
+    seen = state["seen"]
+    number = int(seen[0])
+    changed = {"seen": seen + 1}
     if number % trial.stride == 0:
+        # Put together only here: most samples of a fast loop are not kept.
         recent = state["recent"].copy()
-        recent[number // trial.stride % trial.capacity] = row
+        np.concatenate(parts, out=recent[number // trial.stride % trial.capacity])
         changed["recent"] = recent
     return changed
 

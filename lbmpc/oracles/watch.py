@@ -44,11 +44,11 @@ def adopted(trial: Trial, state: State, hidden: list[np.ndarray], K: np.ndarray)
 
 def due(trial: Trial, state: State) -> bool:
     """Whether it is time to judge the set in use."""
-    watched = state["watch"]
+    watched = state["watch"].tolist()
     if not watched[ON]:
         return False
     seen = int(state["seen"][0])
-    return (seen - int(watched[ADOPTED])) % trial.check_every == 0 or seen >= watched[UNTIL]
+    return (seen - watched[ADOPTED]) % trial.check_every == 0 or seen >= watched[UNTIL]
 
 
 def ends(state: State) -> bool:
