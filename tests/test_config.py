@@ -79,7 +79,10 @@ def test_commented_values_of_the_shipped_file_are_valid():
         ("plant=3", "plant = 3 is a table: write [plant] and its keys below"),
         ("controler.oracle=dnn", "unknown key 'controler'; did you mean 'controller'?"),
         ("network.hiden=[3]", "unknown key 'network.hiden'; did you mean 'network.hidden'?"),
-        ("bus.zzz=3", "unknown key 'bus.zzz'; known: endpoint, remote, insecure, tls, lease_ms, follow_silence"),
+        (
+            "bus.zzz=3",
+            "unknown key 'bus.zzz'; known: endpoint, remote, insecure, tls, lease_ms, follow_silence",
+        ),
         ("network.activation=relu", "network.activation = 'relu' is unbounded"),
         ("trainer.min_samples=5000", "trainer.min_samples = 5000 exceeds trainer.capacity = 2000"),
         ("name=a/b", "name = 'a/b' is not a string matching"),

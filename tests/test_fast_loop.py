@@ -140,10 +140,12 @@ def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
     node = TrainerNode(config, bus, cast(HealthPublisher, None), counts)
     began: list[float] = []
     monkeypatch.setattr(node, "_may_train", lambda: True)
-    times = [10.0 + 0.02 * k for k in range(100)]
-    for now in times:
-        monkeypatch.setattr(node, "_train", lambda now=now: began.append(now))
-        node.turn(now)
+    monkeypatch.setattr(node, "_must_join", lambda: False)
+    for now in (10.0 + 0.02 * k for k in range(100)):
+        node.listen(now)
+        if node.waits_since(now) is not None:
+            began.append(now)
+            node.rest(now, took=0.01)
     assert len(began) == pytest.approx(2.0 / TRAIN_EVERY, abs=1)
     assert min(np.diff(began)) >= TRAIN_EVERY - 1e-9
     # At 20 Hz, ten samples take longer than that: nothing is held back there.

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+import itertools
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
-from node_runtime.config import TrainerConfig
+from node_runtime.bad_messages import BadMessages
+from node_runtime.bus import Bus
+from node_runtime.config import Config, TrainerConfig
+from node_runtime.health import HealthPublisher
+from node_runtime.mailbox import Mailbox
 from protocol.messages import Array, OutputWeights, Sample
 from protocol.network import NetworkDescription, initial_hidden
+from protocol.topics import Topic
 from trainer_node import fleet
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import Heard, seed_of
+from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
 from trainer_node.training import Draw, Trainer, use_one_thread
 
 TRAINING = TrainerConfig(capacity=600, batch=128, steps=40, device="cpu")
@@ -125,3 +132,47 @@ def test_a_stranger_who_invents_names_fills_no_memory() -> None:
 
 def test_the_seed_is_the_name_and_not_the_order() -> None:
     assert seed_of(0, "jet1") == seed_of(0, "jet1") != seed_of(0, "jet2") != seed_of(1, "jet2")
+
+
+class Silent:
+    """In place of a bus and of a health: what is published is counted."""
+
+    def __init__(self, config: Config):
+        self.config, self.bad, self.run_id, self.published = config, BadMessages(), "trainer", 0
+
+    def queue(self, topic: Topic, capacity: int) -> Mailbox:
+        return Mailbox(topic.name, capacity)
+
+    def publish(self, _topic: Topic, _message: object) -> None:
+        self.published += 1
+
+    def set(self, _status: str, _note: str = "") -> None:
+        pass
+
+
+def waiting(network: NetworkDescription, number: int, since: float) -> tuple[TrainerNode, Silent]:
+    """A plant that has waited for its training since then."""
+    pupil, bus = Pupil(network, number, 40), Silent(Config(trainer=TRAINING))
+    node = TrainerNode(bus.config, cast(Bus, bus), cast(HealthPublisher, bus), dict.fromkeys(NAMES, 0))
+    node._trainer, node._output, node._run = pupil.trainer, pupil.output, "c"
+    node._waits_since = since
+    return node, bus
+
+
+def test_who_has_waited_longest_comes_first_and_nobody_is_left_behind() -> None:
+    wide = description("rnn", 3)
+    since = np.random.default_rng(0).permutation(40)
+    fleet_of = [waiting(wide if k % 4 == 0 else description(), k, float(since[k])) for k in range(40)]
+    nodes, trained = [node for node, _ in fleet_of], []
+    for turn in range(5):
+        before = [bus.published for _, bus in fleet_of]
+        train_round(nodes, 100.0 + turn)
+        trained.append([k for k, (_, bus) in enumerate(fleet_of) if bus.published > before[k]])
+    trained = [round_ for round_ in trained if round_]
+    assert len(trained) == 3
+    assert all(len(round_) <= ROUND for round_ in trained)
+    assert sorted(k for round_ in trained for k in round_) == list(range(40))
+    for round_, later in itertools.pairwise(trained):
+        # The first of a round has waited longer than everybody who comes later.
+        assert min(since[round_]) < min(since[later])
+    assert all(len({k % 4 == 0 for k in round_}) == 1 for round_ in trained)
