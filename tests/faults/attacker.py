@@ -181,7 +181,7 @@ def forged(
         layers = [layer.numpy().astype(np.float64) for layer in oldest.layers]
         base, trained_on = oldest.base_sha256, oldest.trained_on
     elif kind == "subtly worse":
-        layers = [layer + 0.02 * rng.standard_normal(layer.shape) * np.abs(layer).mean() for layer in layers]
+        layers = [layer + 0.3 * rng.standard_normal(layer.shape) * np.abs(layer).mean() for layer in layers]
     packed = [m.Array.of(layer, "<f4") for layer in layers]
     digest = hash_layers([array.numpy() for array in packed])
     return m.HiddenWeights(
