@@ -49,13 +49,14 @@ def during(stalls: Sequence[Stall], begin: float, end: float) -> bool:
 
 
 def main(path: str, core: int, priority: int) -> None:
-    """Until killed."""
+    """Until killed, or left alone."""
+    parent = os.getppid()
     os.sched_setaffinity(0, {core})
     if priority:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     with open(path, "a", buffering=1) as file:
         due = time.monotonic()
-        while True:
+        while os.getppid() == parent:
             due += PERIOD
             time.sleep(max(0.0, due - time.monotonic()))
             late = time.monotonic() - due
