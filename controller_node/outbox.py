@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections import deque
 from collections.abc import Sequence
+
+import numpy as np
 
 from protocol import codec
 from protocol.messages import Sample, Samples
@@ -16,30 +18,50 @@ BATCH = 500
 class Outbox:
     """The newest `capacity` samples of one controller run. Any thread may call.
 
+    They are numbers in a ring that has its full size from the first sample on: a controller that has run for hours
+    needs no more memory than after its first minute.
+
     earlier: batches of the runs that this one goes on from, oldest first.
     """
 
     def __init__(self, run_id: str, capacity: int = CAPACITY, earlier: Sequence[Samples] = ()):
         self.run_id = run_id
         self.earlier = tuple(earlier)
-        self._samples: deque[Sample] = deque(maxlen=capacity)
+        self._capacity = capacity
+        self._count = 0
+        self._seqs = np.full(capacity, -1, dtype=np.int64)
+        self._rows: np.ndarray | None = None
+        self._sizes = (0, 0, 0)
         self._lock = threading.Lock()
 
     def add(self, sample: Sample) -> None:
-        """Samples come in ascending order of `seq`; the oldest makes room."""
+        """Samples come in ascending order of `seq`, all of one plant; the oldest makes room."""
+        row = [*sample.x, *sample.u, *sample.h, *itertools.chain.from_iterable(sample.past)]
         with self._lock:
-            self._samples.append(sample)
+            if self._rows is None:
+                # Written to, so that the memory is really there.
+                self._rows = np.full((self._capacity, len(row)), np.nan)
+                self._sizes = (len(sample.x), len(sample.u), len(sample.h))
+            slot = self._count % self._capacity
+            self._seqs[slot], self._rows[slot] = sample.seq, row
+            self._count += 1
 
     def since(self, seq: int, last: int = CAPACITY) -> list[Sample]:
         """Samples after `seq`, ascending; of those, the newest `last`."""
-        found: list[Sample] = []
         with self._lock:
-            for sample in reversed(self._samples):
-                if sample.seq <= seq or len(found) >= last:
-                    break
-                found.append(sample)
-        found.reverse()
-        return found
+            if self._rows is None:
+                return []
+            kept = np.arange(max(0, self._count - self._capacity), self._count) % self._capacity
+            kept = kept[self._seqs[kept] > seq]
+            kept = kept[max(0, len(kept) - max(0, last)) :]
+            seqs, rows = self._seqs[kept].tolist(), self._rows[kept].tolist()
+        return [self._sample(number, row) for number, row in zip(seqs, rows, strict=True)]
+
+    def _sample(self, seq: int, row: list[float]) -> Sample:
+        d, m, h = self._sizes
+        past = row[d + m + h :]
+        pairs = [past[k : k + d + m] for k in range(0, len(past), d + m)]
+        return Sample(seq, row[:d], row[d : d + m], row[d + m : d + m + h], pairs)
 
     def batches(self, samples: list[Sample]) -> list[Samples]:
         """The same samples as messages of at most `BATCH` pairs each, those of their past included."""
