@@ -225,7 +225,14 @@ def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "tandem", "experiment", str(small), "--out", str(out), "--jobs", "1"]
     command += ["--only", "comparison"]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    # Who runs the tests in the background of a shell runs them with SIGINT ignored, and that is inherited.
+    started = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     runs = out / "runs"
     while not list(runs.glob("*.json")):
         with contextlib.suppress(subprocess.TimeoutExpired):
