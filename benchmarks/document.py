@@ -5,19 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.figures import COLUMNS, TEXT, ratios
+from benchmarks.marks import Marks
 from benchmarks.picture import draw
 from benchmarks.solver import CENTRE, Report
 
-BEGIN, END = "<!-- bench: begin, written by `make bench` -->", "<!-- bench: end -->"
-
-
-class DocumentError(Exception):
-    """The document cannot take the figures; the text says why and what to do."""
-
-
-def check(path: Path) -> None:
-    """Raises `DocumentError` unless `path` is a text with both marks, in order."""
-    _around(path)
+MARKS = Marks.of("bench", "make bench")
 
 
 def write(report: Report, path: Path, command: str) -> Path:
@@ -26,25 +18,11 @@ def write(report: Report, path: Path, command: str) -> Path:
     Raises:
         DocumentError: no such file, or it lacks the marks.
     """
-    before, after = _around(path)
+    MARKS.check(path)
     picture = path.with_suffix(".png")
     draw(report, picture)
-    path.write_text(
-        f"{before}{BEGIN}\n\n{_text(report, command, picture.name)}\n{END}{after}", encoding="utf-8"
-    )
+    MARKS.put(path, _text(report, command, picture.name))
     return picture
-
-
-def _around(path: Path) -> tuple[str, str]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DocumentError(f"{path}: cannot be read: {error.strerror}") from error
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise DocumentError(f"{path}: the figures go between two lines that it lacks: {BEGIN} and {END}")
-    return before, after
 
 
 def _text(report: Report, command: str, picture: str) -> str:
@@ -66,7 +44,7 @@ def _text(report: Report, command: str, picture: str) -> str:
         lines += ["", "Peak memory of a process that holds one solver, N = 60, 5-32-32-4:", ""]
         lines += _rows(["process", "MB"], used, 1)
     cells = [[text(row) for _, text in COLUMNS] for row in report.rows]
-    lines += ["", "All figures:", "", *_rows([name for name, _ in COLUMNS], cells, TEXT), ""]
+    lines += ["", "All figures:", "", *_rows([name for name, _ in COLUMNS], cells, TEXT)]
     return "\n".join(lines)
 
 

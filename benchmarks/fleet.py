@@ -24,6 +24,7 @@ import tyro
 import zenoh
 from rich.console import Console
 
+from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 from node_runtime.config import Config, TrainerConfig, override, to_toml
 from node_runtime.router import Router
@@ -32,7 +33,7 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.network import NetworkDescription, hash_layers, initial_hidden
 
-BEGIN, END = "<!-- fleet: begin, written by `python -m benchmarks.fleet` -->", "<!-- fleet: end -->"
+MARKS = Marks.of("fleet", "python -m benchmarks.fleet")
 NETWORK = NetworkDescription(
     states=4,
     inputs=1,
@@ -138,6 +139,11 @@ class Row:
 def main() -> int:
     settings = tyro.cli(Fleet, description=__doc__)
     console = Console(highlight=False)
+    try:
+        MARKS.check(settings.document)
+    except DocumentError as error:
+        console.print(str(error), markup=False)
+        return 2
     rows, text = [], [_command(settings)]
     text += _ratios(settings, console)
     for batch in settings.batch:
@@ -146,11 +152,7 @@ def main() -> int:
             rows.append(row)
             console.print(_line(row))
     text += ["", *_table(rows, settings), "", f"Load of the machine at the end: {machine.load():.1f}."]
-    if settings.document is not None:
-        before, rest = settings.document.read_text().split(BEGIN)
-        settings.document.write_text(
-            f"{before}{BEGIN}\n\n" + "\n".join(text) + f"\n\n{END}{rest.split(END)[1]}"
-        )
+    MARKS.put(settings.document, "\n".join(text))
     console.print("\n".join(text))
     return 0
 

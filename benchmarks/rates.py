@@ -22,6 +22,7 @@ from typing import Any
 
 import tyro
 
+from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 from node_runtime.choices import SolverMode
 from node_runtime.config import Config
@@ -29,7 +30,7 @@ from run_log.errors import LogError
 from run_log.reader import read_run
 from run_log.summary import Spread, summarise
 
-BEGIN, END = "<!-- rates: begin, written by `python -m benchmarks.rates` -->", "<!-- rates: end -->"
+MARKS = Marks.of("rates", "python -m benchmarks.rates")
 COLUMNS = (
     "rate, Hz",
     "solver",
@@ -62,17 +63,12 @@ class Rates:
 
 def main(settings: Rates) -> int:
     """Measure, print a Markdown table, and put it into the document where one is given."""
-    text = "" if settings.document is None else settings.document.read_text(encoding="utf-8")
-    if settings.document is not None and not (BEGIN in text and END in text):
-        sys.stderr.write(
-            f"{settings.document}: the table goes between two lines that it lacks: {BEGIN} and {END}\n"
-        )
+    try:
+        MARKS.check(settings.document)
+    except DocumentError as error:
+        sys.stderr.write(f"{error}\n")
         return 2
-    table = "\n".join(_table(settings))
-    if settings.document is not None:
-        before, rest = text.split(BEGIN, 1)
-        after = rest.split(END, 1)[1]
-        settings.document.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{after}", encoding="utf-8")
+    MARKS.put(settings.document, "\n".join(_table(settings)))
     return 0
 
 

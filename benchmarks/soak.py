@@ -28,6 +28,7 @@ from rich.progress import Progress
 from scipy import stats
 
 from benchmarks import stalls
+from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 from node_runtime.config import Config
 from protocol import codec, topics
@@ -35,7 +36,7 @@ from protocol import messages as m
 from run_log.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
 from run_log.scan import Scan
 
-BEGIN, END = "<!-- soak: begin, written by `make soak` -->", "<!-- soak: end -->"
+MARKS = Marks.of("soak", "make soak")
 LOOKS = {
     "supervisor": (GREY, ":"),
     "router": (BLACK, "--"),
@@ -97,11 +98,10 @@ class Lateness(msgspec.Struct, frozen=True):
 def main(settings: Soak) -> int:
     """0; 1 when the run failed; 2 when the document lacks the marks."""
     console = Console(stderr=True)
-    text = "" if settings.document is None else settings.document.read_text(encoding="utf-8")
-    if settings.document is not None and not (BEGIN in text and END in text):
-        console.print(
-            f"{settings.document}: the table goes between two lines that it lacks: {BEGIN} and {END}"
-        )
+    try:
+        MARKS.check(settings.document)
+    except DocumentError as error:
+        console.print(str(error), markup=False)
         return 2
     settings.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=settings.out) as folder:
@@ -118,9 +118,7 @@ def main(settings: Soak) -> int:
     (settings.out / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(results)))
     body = "\n".join(_table(memory, lateness, figures, picture.name))
     sys.stdout.write(body + "\n")
-    if settings.document is not None:
-        before, after = text.split(BEGIN, 1)[0], text.split(END, 1)[1]
-        settings.document.write_text(f"{before}{BEGIN}\n\n{body}\n\n{END}{after}", encoding="utf-8")
+    MARKS.put(settings.document, body)
     return 0
 
 

@@ -18,6 +18,7 @@ def solver(quick: bool, document: Path | None, as_json: bool) -> int:
     try:
         from benchmarks import document as documents
         from benchmarks import figures
+        from benchmarks.marks import DocumentError
         from benchmarks.solver import QUICK, Plan, measure
     except ModuleNotFoundError as error:
         if error.name not in ("matplotlib", "mcap", "zstandard"):
@@ -27,9 +28,7 @@ def solver(quick: bool, document: Path | None, as_json: bool) -> int:
 
     console = terminal.console(as_json)
     try:
-        if document is not None:
-            # Before the minutes of measuring, not behind them.
-            documents.check(document)
+        documents.MARKS.check(document)
         with progress_bar(console) as bar:
             task = bar.add_task("starting", total=None)
             report = measure(
@@ -49,7 +48,7 @@ def solver(quick: bool, document: Path | None, as_json: bool) -> int:
             words = ["tandem", "bench", "solver", *(["--quick"] if quick else [])]
             picture = documents.write(report, document, " ".join(words))
             console.print(f"written {document} and {picture}", markup=False, soft_wrap=True)
-    except documents.DocumentError as error:
+    except DocumentError as error:
         raise Refused(str(error)) from error
     if as_json:
         terminal.emit({**msgspec.to_builtins(report), "ratios": figures.ratios(report)})

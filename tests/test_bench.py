@@ -100,7 +100,7 @@ def test_ratios_are_of_medians(report: Report) -> None:
 
 def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Path) -> None:
     path = tmp_path / "performance.md"
-    path.write_text(f"before\n{document.BEGIN}\nlast year's\n{document.END}\nafter\n")
+    path.write_text(f"before\n{document.MARKS.begin}\nlast year's\n{document.MARKS.end}\nafter\n")
     for _ in range(2):
         picture = document.write(report, path, "tandem bench solver")
     text = path.read_text()

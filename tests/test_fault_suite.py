@@ -23,6 +23,7 @@ from faults.traced_plant import Sampled
 from live import Process, live_config, wait_for
 
 from benchmarks import stalls
+from benchmarks.marks import DocumentError
 from node_runtime import clock
 from node_runtime.bus import Bus
 from node_runtime.config import override, to_json
@@ -219,14 +220,14 @@ def test_the_table_names_what_did_not_hold(tmp_path: Path) -> None:
     assert "run 1 at 1.00 s: 2 samples outside, 0 without the fault" in text
     assert "run 2 at 1.00 s: no first command" in text
     document = tmp_path / "faults.md"
-    document.write_text(f"before\n{table.BEGIN}\nold\n{table.END}\nbehind\n")
-    table.put(document, text)
-    assert document.read_text().startswith(f"before\n{table.BEGIN}\n\nhead\n")
-    assert document.read_text().endswith(f"{table.END}\nbehind\n")
+    document.write_text(f"before\n{table.MARKS.begin}\nold\n{table.MARKS.end}\nbehind\n")
+    table.MARKS.put(document, text)
+    assert document.read_text().startswith(f"before\n{table.MARKS.begin}\n\nhead\n")
+    assert document.read_text().endswith(f"{table.MARKS.end}\nbehind\n")
     assert "\nold\n" not in document.read_text()
     document.write_text("no marks")
-    with pytest.raises(table.DocumentError, match="lacks"):
-        table.put(document, text)
+    with pytest.raises(DocumentError, match="lacks"):
+        table.MARKS.put(document, text)
 
 
 ECHO = """

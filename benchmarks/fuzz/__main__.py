@@ -21,9 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from benchmarks.fuzz.work import Finding, Report, Work, merge
+from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 
-BEGIN, END = "<!-- fuzz: begin, written by `make fuzz` -->", "<!-- fuzz: end -->"
+MARKS = Marks.of("fuzz", "make fuzz")
 GROWTH_KB = 8 * 1024
 """What a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
 
@@ -46,11 +47,10 @@ class Fuzz:
 def main(settings: Fuzz) -> int:
     """0 when nothing crashed, hung or grew; 1 when something did; 2 when the document lacks the marks."""
     console = Console(stderr=True)
-    text = "" if settings.document is None else settings.document.read_text(encoding="utf-8")
-    if settings.document is not None and not (BEGIN in text and END in text):
-        console.print(
-            f"{settings.document}: the table goes between two lines that it lacks: {BEGIN} and {END}"
-        )
+    try:
+        MARKS.check(settings.document)
+    except DocumentError as error:
+        console.print(str(error), markup=False)
         return 2
     settings.out.mkdir(parents=True, exist_ok=True)
     reports = measure(settings, console)
@@ -59,10 +59,7 @@ def main(settings: Fuzz) -> int:
         _keep(finding, settings.out, console)
     lines = table(reports, settings)
     sys.stdout.write("\n".join(lines) + "\n")
-    if settings.document is not None:
-        before, after = text.split(BEGIN, 1)[0], text.split(END, 1)[1]
-        body = "\n".join(lines)
-        settings.document.write_text(f"{before}{BEGIN}\n\n{body}\n\n{END}{after}", encoding="utf-8")
+    MARKS.put(settings.document, "\n".join(lines))
     grown = any(growth(report) > GROWTH_KB for report in reports)
     return int(grown or any(report.findings or not report.ended for report in reports))
 

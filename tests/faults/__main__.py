@@ -24,6 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from benchmarks.marks import DocumentError
 from node_runtime import machine
 from node_runtime.config import RealtimeConfig
 from node_runtime.realtime import READER_PRIORITY, punctual
@@ -31,7 +32,7 @@ from node_runtime.realtime import READER_PRIORITY, punctual
 from . import link, table
 from .faults import ALL, Fault, Stage
 from .suite import Outcome, Results, ResultsError, judged, run
-from .table import DocumentError, Pair
+from .table import Pair
 
 START_AND_STOP_S = 8.0
 """Of a run, beside its seconds: processes start and stop, the log is replayed."""
@@ -83,8 +84,7 @@ def main(settings: Suite) -> int:
         console.print("links to network namespaces need root; without it no fault can be inflicted on a link")
         return 2
     try:
-        if settings.document is not None:
-            table.around(settings.document)
+        table.MARKS.check(settings.document)
         if settings.fresh:
             shutil.rmtree(settings.out, ignore_errors=True)
         results = Results(settings.out / "results.jsonl")
@@ -94,8 +94,7 @@ def main(settings: Suite) -> int:
             pairs = _measure(settings, chosen, results, console)
         text = table.markdown(pairs, chosen, _head(settings))
         sys.stdout.write(text + "\n")
-        if settings.document is not None:
-            table.put(settings.document, text)
+        table.MARKS.put(settings.document, text)
     except (DocumentError, ResultsError) as error:
         console.print(str(error), markup=False)
         return 2

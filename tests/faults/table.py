@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import msgspec
+
+from benchmarks.marks import Marks
 
 from . import holds
 from .facts import Facts
 from .faults import Fault
 from .suite import Outcome
 
-BEGIN, END = "<!-- faults: begin, written by `make faults` -->", "<!-- faults: end -->"
+MARKS = Marks.of("faults", "make faults")
 COLUMNS = (
     "fault",
     "runs",
@@ -29,10 +30,6 @@ COLUMNS = (
     "unreadable, s",
     "replay",
 )
-
-
-class DocumentError(Exception):
-    """The document cannot take the table; the text says why."""
 
 
 class Pair(msgspec.Struct, frozen=True):
@@ -109,22 +106,3 @@ def markdown(pairs: dict[str, list[Pair]], faults: Sequence[Fault], head: list[s
     failed = list(reasons(pairs))
     lines += ["", "What did not hold:" if failed else "Everything held.", *([""] if failed else []), *failed]
     return "\n".join(lines)
-
-
-def put(document: Path, text: str, begin: str = BEGIN, end: str = END) -> None:
-    """Replace what stands between the marks. Raises `DocumentError`."""
-    before, after = around(document, begin, end)
-    document.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}", encoding="utf-8")
-
-
-def around(document: Path, begin: str = BEGIN, end: str = END) -> tuple[str, str]:
-    """What stands before and behind the marks. Raises `DocumentError` when there are none."""
-    try:
-        text = document.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DocumentError(f"{document}: cannot be read: {error.strerror}") from error
-    before, found, rest = text.partition(begin)
-    _, closed, after = rest.partition(end)
-    if not found or not closed:
-        raise DocumentError(f"{document}: the table goes between two lines that it lacks: {begin} and {end}")
-    return before, after
