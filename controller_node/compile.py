@@ -21,7 +21,16 @@ from controller_node.quicken import quicken
 
 log = logging.getLogger(__name__)
 
-FLAGS = ("-shared", "-fPIC", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-lm")
+FLAGS = (
+    "-shared",
+    "-fPIC",
+    "-O3",
+    "-march=native",
+    "-fno-semantic-interposition",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-lm",
+)
 TIMEOUT = 300.0
 COST = "solves in CasADi's virtual machine instead, about 4 times slower"
 

@@ -40,9 +40,10 @@ def evaluate(f: ca.Function, a: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
 def test_products_and_tanh_agree_with_the_virtual_machine(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     compiler = Compiler(tmp_path)
-    for rows, inner, columns in [(1, 1, 1), (4, 4, 1), (8, 3, 4), (9, 5, 13), (32, 32, 300), (17, 2, 8)]:
+    shapes = [(1, 1, 1), (4, 4, 1), (8, 3, 4), (9, 5, 13), (32, 32, 300), (47, 7, 19), (47, 6, 1), (17, 2, 8)]
+    for rows, inner, columns in shapes:
         a, x = ca.MX.sym("a", rows, inner), ca.MX.sym("x", inner, columns)
-        f = ca.Function(f"p{rows}", [a, x], [a @ x, ca.tanh(a @ x)])
+        f = ca.Function(f"p{rows}_{columns}", [a, x], [a @ x, ca.tanh(a @ x)])
         g = compiler(f)
         assert is_compiled(g)
         for size in (1e-3, 1.0, 30.0, 1e6):
