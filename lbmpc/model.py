@@ -12,9 +12,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
-from scipy.signal import place_poles
 
 from lbmpc.plants.base import Plant
+from lbmpc.pole_placement import place
 
 Pieces = tuple[tuple[float, np.ndarray], ...]
 """Stretches of time under one input each: (seconds, u (m,))."""
@@ -145,7 +145,7 @@ def build_model(
     r = np.diag(_weights("R", R, plant.m))
     try:
         if plant.poles is not None:
-            k = -place_poles(a, b, [_real(np.exp(p * period)) for p in plant.poles]).gain_matrix
+            k = place(a, b, [_real(np.exp(p * period)) for p in plant.poles])
         else:
             s = solve_discrete_are(a, b, q, r)
             k = -np.linalg.solve(r + b.T @ s @ b, b.T @ s @ a)

@@ -1,13 +1,18 @@
-"""What a person reads (rich) and what a program reads (one JSON object on standard output)."""
+"""What a person reads (rich) and what a program reads (one JSON object on standard output).
+
+rich is imported when something is shown: every process comes by here, and most show nothing.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-from rich.console import Console
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class Refused(Exception):
@@ -16,6 +21,8 @@ class Refused(Exception):
 
 def console(as_json: bool) -> Console:
     """Where to write for a person: standard output, or standard error when a program reads the former."""
+    from rich.console import Console
+
     return Console(stderr=as_json, highlight=False, soft_wrap=False)
 
 
@@ -27,6 +34,8 @@ def emit(result: Mapping[str, Any]) -> None:
 
 def complain(text: str, as_json: bool) -> None:
     """A message for a person on standard error; for a program too, `{"error": ...}` on standard output."""
+    from rich.console import Console
+
     Console(stderr=True, highlight=False).print(f"tandem: {text}", style="red", markup=False, soft_wrap=True)
     if as_json:
         emit({"error": text})

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import DOP853
 
 from lbmpc.bound import Bound
 
@@ -57,11 +56,14 @@ class Plant:
     """Half-widths of the disturbance box used for tightening by default, per second of sampling period."""
     x0: np.ndarray
     safe_input: np.ndarray
-    """What the plant's own hardware applies when nobody commands it."""
+    """What the plant's own hardware applies when nobody commands it, at x_e where there is a `safe_gain`."""
     performance: tuple[int, ...]
     """States that make up the reported cost; the first is the one whose overshoot is reported."""
     kernel: tuple[str, ...]
     """States and inputs that the L2NW kernel sees."""
+    safe_gain: np.ndarray | None = None
+    """(m, d): then that is safe_input + safe_gain (x - x_e), renewed every period; for a plant that no constant input
+    holds at x_e. None: safe_input."""
     poles: tuple[complex, ...] | None = None
     """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
     positive: tuple[Domain, ...] = ()
@@ -138,7 +140,7 @@ class Truth:
 
     def _in_many(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         self._f.inputs["u"][:, 0] = u
-        solver = DOP853(
+        solver = _method()(
             self._rhs,
             0.0,
             np.asarray(x, dtype=float),
@@ -179,6 +181,13 @@ class Truth:
             raise PlantError(f"{self.plant.name}: the state is not finite: {np.asarray(x).tolist()}")
 
 
+def _method() -> Any:
+    """DOP853. Imported where it is used: that takes half a second, and a controller that died integrates nothing."""
+    from scipy.integrate import DOP853
+
+    return DOP853
+
+
 class Stepped(NamedTuple):
     """One step of DOP853: x(dt) and the slopes at its stages."""
 
@@ -188,10 +197,10 @@ class Stepped(NamedTuple):
 
 def dop853(f: ca.Function, x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
     """A single step of DOP853 along dx/dt = f(x, u), as one expression."""
-    slopes = [f(x, u)]
-    for weights in DOP853.A[1 : DOP853.n_stages]:
+    method, slopes = _method(), [f(x, u)]
+    for weights in method.A[1 : method.n_stages]:
         slopes.append(f(x + dt * _weighted(weights, slopes), u))
-    return Stepped(x + dt * _weighted(DOP853.B, slopes), slopes)
+    return Stepped(x + dt * _weighted(method.B, slopes), slopes)
 
 
 def _whole_step(plant: Plant) -> ca.Function:
@@ -199,12 +208,12 @@ def _whole_step(plant: Plant) -> ca.Function:
 
     The same stages and the same estimate as scipy's, as one expression instead of hundreds of small numpy calls.
     """
-    f = plant.function()
+    f, method = plant.function(), _method()
     x, u, dt = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m), ca.SX.sym("dt")
     after, slopes = dop853(f, x, u, dt)
     slopes = [*slopes, f(after, u)]
     scale = INTEGRATION_TOLERANCE * (1 + ca.fmax(ca.fabs(x), ca.fabs(after)))
-    fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (DOP853.E5, DOP853.E3))
+    fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (method.E5, method.E3))
     bound = plant.d * (fifth + 0.01 * third)
     # Both estimates are exactly zero where nothing moves.
     error = ca.if_else(bound > 0, dt * fifth / ca.sqrt(bound), bound)

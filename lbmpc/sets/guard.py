@@ -13,9 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
 
 from lbmpc.sets.certificate import Certificate
+from lbmpc.sets.linear_program import linprog, load
 
 # Rounding of a row's value must not put a state outside that was steered onto its facet. Scaled lengths.
 HAIR = 1e-10
@@ -58,6 +58,8 @@ class _Step:
             self._up, self._down = slope > 0, slope < 0
             self._per_up, self._per_down = 1 / slope[self._up], 1 / slope[self._down]
             self._none = slope == 0
+        else:
+            load()
 
     def bounds(self, x: np.ndarray, reserves: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         """Of v_0, (m,) each, with the first of the reserves that can be had, or none; None when there are no bounds."""

@@ -7,9 +7,9 @@ the first k whose rows are all redundant.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linprog
 
 from lbmpc.model import Model
+from lbmpc.sets.linear_program import linprog
 from lbmpc.sets.polytope import EmptySetError, Polytope
 
 

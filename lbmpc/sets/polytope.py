@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linprog
+
+from lbmpc.sets.linear_program import linprog
 
 
 class SetError(ValueError):
