@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-# Vectors of eight and four in the notation that gcc and clang share; the compiler maps them to whatever the machine has.
+# Vectors of eight and of four in a notation that gcc and clang share; the compiler maps them to what the machine has.
 VECTORS = """\
 #include <string.h>
 typedef double tandem_v8 __attribute__((vector_size(64)));
