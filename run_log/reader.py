@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -109,10 +110,19 @@ class Run:
 
     @property
     def controllers(self) -> list[str]:
-        """Runs with ticks, in order. One that said nothing of itself (no info, health or keyframe) is a stranger."""
+        """Runs with ticks, in order, without strangers.
+
+        A stranger said nothing of itself (no info, health or keyframe), or has no tick that one of its own results is
+        of, by the checksum in the result. Where that is so of all, nobody is one.
+        """
         spoke = {x.run_id for x in (*self.run_infos, *self.health, *self.keyframes)}
-        ticked = list(dict.fromkeys(tick.run_id for tick in self.ticks))
-        return [run_id for run_id in ticked if run_id in spoke] or ticked
+        sums: dict[tuple[str, int], set[int]] = {}
+        for entry in self.entries(topics.TICK):
+            sums.setdefault((entry.message.run_id, entry.message.seq), set()).add(zlib.crc32(entry.payload))
+        answered = {r.run_id for r in self.results if r.tick_crc32 in sums.get((r.run_id, r.seq), ())}
+        ticked = list(dict.fromkeys(run_id for run_id, _seq in sums))
+        known = [run_id for run_id in ticked if run_id in spoke]
+        return [run_id for run_id in known if run_id in answered] or known or ticked
 
     @property
     def versions(self) -> dict[str, str]:

@@ -361,6 +361,24 @@ def test_a_stranger_does_not_spoil_the_log(run: Run) -> None:
     assert any("stranger" in note for note in found.notes)
 
 
+def test_a_stranger_who_repeats_everything_under_his_own_name_is_named_and_left_out(run: Run) -> None:
+    """On a plain endpoint anybody can publish: here all that the run said again, shifted, keyframes too."""
+    for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME, topics.RUN_INFO["controller"]):
+        for entry in run.entries(topic)[1::2]:
+            shifted = {"run_id": "stranger", "seq": entry.message.seq // 2 + 40}
+            strange = msgspec.structs.replace(entry.message, **shifted)
+            run.streams[topic.name].append(Entry(entry.log_time, codec.encode(strange), strange))
+    assert {tick.run_id for tick in run.ticks} & {frame.run_id for frame in run.keyframes} == {
+        RUN,
+        "stranger",
+    }
+    found = replay(run)
+    assert found.equal
+    assert found.run_ids == [RUN]
+    assert found.ticks == STEPS
+    assert any("not replayed" in note and "stranger" in note for note in found.notes)
+
+
 def test_asking_for_a_tick_that_is_not_there(run: Run) -> None:
     for tick in (-1, STEPS):
         with pytest.raises(LogError, match=f"no tick {tick}; the log has 0 to 89"):
