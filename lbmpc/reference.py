@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from lbmpc.least_distance import violation
 from lbmpc.oracles.base import follow_symbols, remembered
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
@@ -87,7 +88,9 @@ class ReferenceSolver:
         zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)[: self.problem.model.d]
         for i in range(n):
             state = zbar[i] = self.problem.model.A @ state + self.problem.model.B @ v[i]
-        slack, row = self._rows.slack(self._rows.values(v.T, zbar.T))
+        slack, row = self._rows.slack(
+            violation(self._rows.values(v.T, zbar.T), self._rows.lower, self._rows.upper)
+        )
         stats = self._solver.stats()
         status = Status.CONVERGED if stats["success"] else Status.NUMERICAL
         return Solution(status, v, zbar, float(result["f"]), int(stats["iter_count"]), slack, row)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import casadi as ca
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from lbmpc.bound import Bound
 from lbmpc.kernels import build_rows, build_sweep, build_tangent
 from lbmpc.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
+from lbmpc.nominal import build_nominal
 from lbmpc.oracles.base import LinearOracle, Oracle, remembered
 from lbmpc.problem import Problem
 from lbmpc.rows import Box, Rows
@@ -92,7 +94,7 @@ class Solver:
         self._sweep = self._bind(problem.oracle)
         nominal = LinearOracle(problem.model.d, problem.model.m, problem.oracle.pairs)
         self._nominal_sweep = self._sweep if problem.oracle.name == nominal.name else self._bind(nominal)
-        self._free, self._forced = _prediction(problem)
+        self._follow = Bound(realise(build_nominal(problem)))
         self._shape = (problem.horizon, problem.model.m)
         # Built at the first preparation: a controller that converges every tick does not need it.
         self._tangent: Bound | None = None
@@ -143,16 +145,16 @@ class Solver:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
         self._rows.bound_first(None)
-        tangent, rows, v = self._tangent, self._rows, self._rows.clip(_numbers(warm_start))
+        tangent, rows = self._tangent, self._rows
         with np.errstate(all="ignore"):
-            status = Status.NUMERICAL
+            v, status = rows.clip(_numbers(warm_start)), Status.NUMERICAL
             for sweep, theta, trusted in (
                 (self._sweep, oracle_parameters, Status.REAL_TIME),
                 (self._nominal_sweep, np.zeros(0), Status.ORACLE_REFUSED),
             ):
                 self._load(sweep, x, theta, None, None)
                 cost = self._linearise(sweep, v)
-                if np.isfinite(cost) and np.isfinite(sweep.outputs["zs"]).all():
+                if isfinite(cost) and _finite(sweep.outputs["zs"]):
                     status = trusted
                     break
             for name in "ABKL":
@@ -194,9 +196,9 @@ class Solver:
         rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
         rows.bound_first(first)
         with np.errstate(all="ignore"):
-            values = ready.values + ready.follow @ change
-            v, status = ready.free + (ready.follow_v @ change).reshape(self._shape), ready.status
-            if status is Status.NUMERICAL or not np.isfinite(values).all():
+            values = ready.values + ready.follow.dot(change)
+            v, status = ready.free + ready.follow_v.dot(change).reshape(self._shape), ready.status
+            if status is Status.NUMERICAL or not _finite(values):
                 return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
             if not self._inside(values):
                 shown, hint = ready.shown, NO_ROWS
@@ -224,7 +226,7 @@ class Solver:
         self._load(sweep, x, theta, xr, ur)
         v, merit = self._rows.clip(_numbers(warm_start)), np.inf
         self._linearise(sweep, v)
-        status, values, seen = Status.ITERATION_LIMIT, self._values(x, v), NO_ROWS
+        status, values, seen = Status.ITERATION_LIMIT, self._nominal(x, v)["values"][:, 0].copy(), NO_ROWS
         iterations, size = 0, 0.0
         while iterations < self.max_iterations:
             iterations += 1
@@ -295,7 +297,7 @@ class Solver:
         rows, outputs = self._rows, sweep.outputs
         free = outputs["vs"]
         values = rows.values(free, outputs["zs"])
-        if not np.isfinite(values).all():
+        if not _finite(values):
             return None
         if self._inside(values):
             return Target(free.T.copy(), values, True, hint)
@@ -323,39 +325,30 @@ class Solver:
     def _inside(self, values: np.ndarray) -> bool:
         return bool(((values <= self._rows.upper) & (values >= self._rows.lower)).all())
 
-    def _values(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Row values, (rows,), of inputs v, (N, m)."""
-        return self._rows.values(v.T, self._nominal(x, v))
-
-    def _nominal(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """zbar_1..zbar_N under inputs v, (d, N)."""
-        return (self._free @ x[: self._free.shape[1]] + self._forced @ v.ravel()).reshape(len(v), -1).T
+    def _nominal(self, x: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+        """What `lbmpc.nominal` says of inputs v, (N, m), from x or s; valid until the next call."""
+        inputs, rows = self._follow.inputs, self._rows
+        inputs["x"][:, 0], inputs["v"][:] = x[: self.problem.model.d], v.T
+        inputs["lower"][:, 0], inputs["upper"][:, 0] = rows.lower, rows.upper
+        self._follow()
+        return self._follow.outputs
 
     def _finish(
         self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int
     ) -> Solution:
-        zbar = self._nominal(x, v)
-        values = self._rows.values(v.T, zbar)
-        slack, slack_row = self._rows.slack(values)
+        found = self._nominal(x, v)
+        slack, slack_row = self._rows.slack(found["outside"][:, 0])
         hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > HARD_TOLERANCE
-        if not np.isfinite(merit) or not np.isfinite(values).all() or hard_broken:
+        if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
             status = Status.NUMERICAL
-        return Solution(status, v, zbar.T.copy(), merit, iterations, slack, slack_row)
-
-
-def _prediction(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """zbar_1..zbar_N, step by step, as matrices of x (d N, d) and of v (d N, m N)."""
-    model, n = problem.model, problem.horizon
-    d, m = model.d, model.m
-    free, forced = np.zeros((n, d, d)), np.zeros((n, d, m * n))
-    power, response = np.eye(d), np.zeros((d, m * n))
-    for i in range(n):
-        power, response = model.A @ power, model.A @ response
-        response[:, m * i : m * (i + 1)] += model.B
-        free[i], forced[i] = power, response
-    return free.reshape(n * d, d), forced.reshape(n * d, m * n)
+        return Solution(status, v, found["zbar"].T.copy(), merit, iterations, slack, slack_row)
 
 
 def _numbers(v: np.ndarray) -> np.ndarray:
     """`v` with a number in the place of what is none; to look first takes a tenth of the time."""
-    return v if np.isfinite(v).all() else np.nan_to_num(v)
+    return v if _finite(v) else np.nan_to_num(v)
+
+
+def _finite(values: np.ndarray) -> bool:
+    """Whether all are numbers: only then their sum is one, short of sums beyond 1e308."""
+    return isfinite(values.sum())
