@@ -235,9 +235,8 @@ class Controller:
         acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:
             return seen.x
-        phi, gamma = self.model.hold(delay)
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
-        return phi @ seen.x + gamma @ acting + drift
+        return self.model.ahead(seen.x, acting, delay) + drift
 
     def _adopt(self, oracle: OracleState, hidden: HiddenSet | None) -> tuple[OracleState, str]:
         if hidden is None:

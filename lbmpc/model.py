@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 
+from lbmpc.bound import Bound
 from lbmpc.plants.base import Plant
 from lbmpc.pole_placement import place
 
@@ -23,7 +24,7 @@ Pieces = tuple[tuple[float, np.ndarray], ...]
 # Up to two periods the argument of the series has a norm of at most 2 * SERIES_NORM = 1, so what is left out is
 # below 1 / 19! = 8e-18.
 SERIES_NORM = 0.5
-POWERS = np.arange(19)
+TERMS = 19
 
 
 class ModelError(ValueError):
@@ -75,34 +76,49 @@ class Model:
     def answer(self, pieces: Pieces) -> np.ndarray:
         """The linear model's state, (d,), after the inputs of `pieces` in turn, from the equilibrium."""
         x = np.zeros(self.d)
-        for k, (seconds, u) in enumerate(pieces):
-            phi, gamma = self.hold(seconds)
-            x = phi @ x + gamma @ u if k else gamma @ u
+        for seconds, u in pieces:
+            x = self.ahead(x, u, seconds)
         return x
 
-    def hold(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """`discretise` for a part of a period, for use in every tick: the same to rounding, in a tenth of the time."""
+    def ahead(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray:
+        """The linear model's state, (d,), `seconds` after x, (d,), under the input u, (m,), for use in every tick.
+
+        Up to two periods by a series: `discretise` to rounding, in a tenth of the time.
+        """
         if not 0.0 <= seconds <= 2.0 * self.period:
-            return discretise(self.a, self.b, seconds)
-        terms, squarings = self._series
-        d, m = self.b.shape
-        block = ((seconds / self.period) ** POWERS @ terms).reshape(d + m, d + m)
-        for _ in range(squarings):
-            block = block @ block
-        return block[:d, :d], block[:d, d:]
+            phi, gamma = discretise(self.a, self.b, seconds)
+            return phi @ x + gamma @ u
+        held = self._held
+        inputs = held.inputs
+        inputs["x"][:, 0], inputs["u"][:, 0], inputs["share"][0, 0] = x, u, seconds / self.period
+        held()
+        return held.outputs["after"][:, 0].copy()
 
     @cached_property
-    def _series(self) -> tuple[np.ndarray, int]:
-        """Terms (powers, (d + m)^2) of the exponential series at one period / 2^squarings, and squarings."""
+    def _held(self) -> Bound:
+        """(x, u, share) -> the state after this share of a period.
+
+        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings) is a polynomial in the share; squaring does the rest.
+        """
         d, m = self.b.shape
         block = np.zeros((d + m, d + m))
         block[:d, :d], block[:d, d:] = self.a * self.period, self.b * self.period
         squarings = max(0, math.ceil(math.log2(max(np.abs(block).sum(axis=0).max(), 1e-300) / SERIES_NORM)))
         block /= 2.0**squarings
         terms = [np.eye(d + m)]
-        for k in POWERS[1:]:
+        for k in range(1, TERMS):
             terms.append(terms[-1] @ block / k)
-        return np.array([term.ravel() for term in terms]), squarings
+        share = ca.SX.sym("share")
+        series = ca.DM(terms[-1])
+        for term in reversed(terms[:-1]):
+            series = ca.sparsify(ca.DM(term)) + share * series
+        held = ca.Function("series", [share], [ca.densify(series)])
+        x, u, part = ca.MX.sym("x", d), ca.MX.sym("u", m), ca.MX.sym("share")
+        power = held(part)
+        for _ in range(squarings):
+            power = power @ power
+        after = power[:d, :d] @ x + power[:d, d:] @ u
+        return Bound(ca.Function("held", [x, u, part], [after], ["x", "u", "share"], ["after"]))
 
 
 def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from lbmpc.oracles import base, watch
 from lbmpc.oracles.backends import ACTIVATIONS, Numbers, Symbols
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.last_layer import LastLayer, Realise
-from lbmpc.oracles.trial import Finding, Trial, empty, newest, remember
+from lbmpc.oracles.trial import Finding, Trial, empty, had, newest, only, remember, tried
 from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription, hash_layers, initial_hidden, why_unacceptable
 
@@ -32,6 +32,7 @@ IN_USE, NEWEST = 0, 1
 """Entries of `version`: that of the hidden layers in use, and the highest that was ever adopted."""
 LEAP = 10**9
 """By which a version may rise at once: after the largest number that there is nobody's weights would be newer."""
+NOTHING = np.zeros(0)
 Network = tuple[list[np.ndarray], np.ndarray]
 """W_1..W_{L-1} and K."""
 
@@ -82,6 +83,7 @@ class DnnOracle:
         self.pairs = description.window
         self._architecture, self._sizes = get_architecture(description.architecture), description.sizes
         self._dense = description.architecture == "mlp" and self.pairs == 1
+        self._hidden = [f"W{i + 1}" for i in range(len(self.shapes) - 1)]
         self._last_layer: LastLayer | None = None
 
     # -- expressions ---------------------------------------------------------------------------------------------
@@ -160,7 +162,7 @@ class DnnOracle:
             state["sampled"] = np.zeros(1, dtype=np.int64)
         if self.trial is not None:
             state |= empty(self.trial, self.pairs * (self.d + self.m) + self.d)
-            state |= watch.nothing(self.hidden(state), state["K"])
+            state |= watch.nothing(self.hidden(state), state["K"]) | only(hash_layers(hidden))
         return state
 
     def _first_K(self, hidden: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -184,11 +186,11 @@ class DnnOracle:
 
     def hidden(self, state: OracleState) -> list[np.ndarray]:
         """W_1..W_{L-1}."""
-        return [state[f"W{i + 1}"] for i in range(len(self.shapes) - 1)]
+        return [state[name] for name in self._hidden]
 
     def pack(self, hidden: list[np.ndarray], K: np.ndarray) -> np.ndarray:
         """theta from hidden layers and scaled output weights K, (1 + n_L, d)."""
-        return np.concatenate([np.ravel(matrix) for matrix in (*hidden, K)])
+        return np.concatenate([matrix.ravel() for matrix in (*hidden, K)])
 
     def theta(self, state: OracleState) -> np.ndarray:
         return self.pack(self.hidden(state), state["K"])
@@ -208,16 +210,16 @@ class DnnOracle:
         self._last_layer = LastLayer(self, realise)
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return self._every_tick().estimate(self.hidden(state), state["K"], self._point(state, x, u))
+        return self._every_tick().estimate(self.hidden(state), state["K"], x, self._before(state), u)
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
-        K = self._every_tick().learn(self.hidden(state), state["K"], self._point(state, x, u), h)
+        before = self._before(state)
+        K = self._every_tick().learn(self.hidden(state), state["K"], x, before, u, h)
         learned = {**state, "K": K}
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
         if self.refit is not None or self.trial is not None:
-            before = (state["past"].ravel(),) if self.pairs > 1 else ()
-            parts = (*before, x, u, h / self.output_scale)
+            parts = (before, x, u, h / self.output_scale)
             if self.refit is not None:
                 number = int(state["sampled"][0])
                 learned["samples"] = state["samples"].copy()
@@ -233,7 +235,7 @@ class DnnOracle:
         """Swap in a new set of hidden weights; K is kept, or refitted to the samples remembered.
 
         Returns:
-            The state and "adopted", or the state unchanged and "refused: <reason>".
+            The state and "adopted", or the state as it was, but for the memory of trials, and "refused: <reason>".
         """
         known = int(state["version"][NEWEST])
         if version <= known:
@@ -255,6 +257,9 @@ class DnnOracle:
             samples = newest(self.trial, state)
             if len(samples) < self.trial.least:
                 return state, f"refused: trial: {len(samples)} samples so far, {self.trial.least} are needed"
+            if tried(state, sha256):
+                return state, "refused: stale: these layers were in use or on trial before"
+            state = {**state, **had(state, sha256)}
             found = self._compare(samples, (hidden, K), (self.hidden(state), state["K"]))
             if self.trial.refuses(found):
                 return state, f"refused: trial: {found}"
@@ -298,9 +303,9 @@ class DnnOracle:
             self._last_layer = LastLayer(self, lambda function: function)
         return self._last_layer
 
-    def _point(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """(s, u), (D + m,)."""
-        return np.concatenate([x, u] if self.pairs == 1 else [x, state["past"].ravel(), u])
+    def _before(self, state: OracleState) -> np.ndarray:
+        """The pairs before the present one, one after the other, ((k - 1) (d + m),)."""
+        return state["past"].ravel() if self.pairs > 1 else NOTHING
 
     def _K_under(self, hidden: list[np.ndarray], state: OracleState) -> np.ndarray:
         """K for new hidden layers, scaled, (1 + n_L, d)."""

@@ -6,6 +6,7 @@ They could be compiled, and then cost a fifth of what numpy takes for so few num
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import is_
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -34,30 +35,49 @@ class LastLayer:
         self._learn.inputs["bounds"][:, 0] = oracle.bounds
         self._hidden: Sequence[np.ndarray] = ()
 
-    def estimate(self, hidden: Sequence[np.ndarray], K: np.ndarray, su: np.ndarray) -> np.ndarray:
-        """h_hat at (s, u), (D + m,), in units of h, (d,)."""
-        self._load(self._estimate, hidden, K, su)
+    def estimate(
+        self, hidden: Sequence[np.ndarray], K: np.ndarray, x: np.ndarray, past: np.ndarray, u: np.ndarray
+    ) -> np.ndarray:
+        """h_hat, (d,), in units of h, at x (d,) and u (m,), after the pairs `past`, ((k - 1) (d + m),)."""
+        self._load(self._estimate, hidden, K, x, past, u)
         self._estimate()
         return self._estimate.outputs["h_hat"][:, 0].copy()
 
-    def learn(self, hidden: Sequence[np.ndarray], K: np.ndarray, su: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """K_{t+1}, (1 + n_L, d), after the label h (d,) of (s, u), (D + m,)."""
-        self._load(self._learn, hidden, K, su)
+    def learn(
+        self,
+        hidden: Sequence[np.ndarray],
+        K: np.ndarray,
+        x: np.ndarray,
+        past: np.ndarray,
+        u: np.ndarray,
+        h: np.ndarray,
+    ) -> np.ndarray:
+        """K_{t+1}, (1 + n_L, d), after the label h (d,) of the same."""
+        self._load(self._learn, hidden, K, x, past, u)
         self._learn.inputs["h"][:, 0] = h
         self._learn()
         return self._learn.outputs["K_next"].T.copy()
 
-    def _load(self, bound: Bound, hidden: Sequence[np.ndarray], K: np.ndarray, su: np.ndarray) -> None:
+    def _load(
+        self,
+        bound: Bound,
+        hidden: Sequence[np.ndarray],
+        K: np.ndarray,
+        x: np.ndarray,
+        past: np.ndarray,
+        u: np.ndarray,
+    ) -> None:
         # They change at an adoption and are never written to, so the same arrays are the same numbers.
-        if len(self._hidden) != len(hidden) or any(
-            a is not b for a, b in zip(self._hidden, hidden, strict=True)
-        ):
+        if len(self._hidden) != len(hidden) or not all(map(is_, self._hidden, hidden)):
             packed = np.concatenate([layer.ravel() for layer in hidden])
             for each in (self._estimate, self._learn):
                 each.inputs["hidden"][:, 0] = packed
             self._hidden = list(hidden)
         bound.inputs["K"][:] = K.T
-        bound.inputs["su"][:, 0] = su
+        point, d, m = bound.inputs["su"][:, 0], len(x), len(u)
+        point[:d], point[-m:] = x, u
+        if len(past):
+            point[d:-m] = past
 
 
 def build_last_layer(oracle: DnnOracle) -> tuple[ca.Function, ca.Function]:
