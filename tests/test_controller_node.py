@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from live import Ear, Process, health_of, live_config, wait_for
+from live import HANG_S, Ear, Process, health_of, live_config, wait_for
 
 from controller_node import node
 from controller_node.core import ControllerCore
@@ -136,9 +136,9 @@ def run() -> Iterator[Run]:
             ear.until(lambda message: isinstance(message, m.Samples) and message.seq >= 15)
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 3))
             ear.until(tick_with_weights)
-            ear.until(lambda message: isinstance(message, m.TickResult) and message.seq >= 47)
+            wait_for(lambda: sum(tick.state_verdict == "fresh" for tick in ear.of(topics.TICK)) >= 40)
             snapshot = snapshot_of(trainer)
-            answer = trainer.ask(topics.OUTBOX_QUERY, {"since": "-1"}, 5.0)
+            answer = trainer.ask(topics.OUTBOX_QUERY, {"since": "-1"}, HANG_S)
             process.signal(signal.SIGINT)
             ear.until(health_of("controller", status="stopping"))
             assert process.end() == 0
@@ -168,9 +168,10 @@ def test_every_tick_has_its_command_and_all_else(run: Run) -> None:
 def test_the_slots_lie_behind_the_plants_samples(run: Run) -> None:
     ticks = [tick for tick in run.of(topics.TICK) if tick.state_verdict == "fresh"]
     # Both clocks are this machine's, so a slot minus its sample's time is the delay plus the phase.
-    spread = [tick.t - tick.state.t for tick in ticks[10:]]
-    assert len(ticks) >= 40
-    assert np.ptp(spread) < 0.5 * run.config.period
+    behind = np.array([tick.t - tick.state.t for tick in ticks[10:]])
+    # One that came late, or one that waited for its plant, says nothing of the grid; slots without one would lie
+    # anywhere, a quarter of a period off in the middle.
+    assert np.median(np.abs(behind - np.median(behind))) < 0.1 * run.config.period
     answered = [tick.state.seq for tick in ticks]
     assert answered == sorted(set(answered))
 

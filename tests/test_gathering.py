@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator
 
 import pytest
-from live import live_config, wait_for
+from live import HANG_S, live_config, wait_for
 
 from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus
@@ -113,7 +113,7 @@ def test_control_goes_straight_to_who_needs_it_and_once_to_who_logs_it(config: C
             wait_for(lambda: states.received == seq + 1)  # noqa: B023 - called before the loop goes on
         # Long before the batch is due, and under the key that it has at any rate.
         assert [one.payload for one in states.drain()] == payloads
-        assert plant.flush(2.0)
+        assert plant.flush(HANG_S)
         heard: list[Delivery] = []
         wait_for(lambda: len(hear(heard, everything.drain())) >= 50)
         assert [one.payload for one in heard] == payloads
@@ -139,7 +139,7 @@ def test_what_was_published_before_goes_out_before(config: Config) -> None:
             bus.publish(topics.TIMING, timing(seq))
         bus.publish(topics.KEYFRAME, m.Keyframe(run_id="controller-a", seq=2, arrays={}))
         bus.publish(topics.TIMING, timing(3))
-        assert bus.flush(2.0)
+        assert bus.flush(HANG_S)
         heard: list[Delivery] = []
         wait_for(lambda: len(hear(heard, everything.drain())) >= 5)
         names = [topics.TIMING] * 3 + [topics.KEYFRAME, topics.TIMING]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 import zenoh
-from live import live_config
+from live import HANG_S, Ear, health_of, live_config
 
 from node_runtime import clock
 from node_runtime.bus import Bus, session_config
@@ -39,13 +39,17 @@ def test_the_exit_code_follows_the_status(
     config: Config, status: ProcessStatus, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with (
+        Bus(config, "recorder", "recorder-1") as other,
         Bus(config, "plant", "plant-1") as bus,
         HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,
     ):
+        ear = Ear(other)
         said.set(status, "held at x0")
-        assert health.run(config, "plant", 5.0, as_json=False) == code
+        # What it said before is on nobody's way any more.
+        ear.until(health_of("plant", status=status, note="held at x0"))
+        assert health.run(config, "plant", HANG_S, as_json=False) == code
         assert capsys.readouterr().out == f"plant: {status}: held at x0\n"
-        assert health.run(config, "plant", 5.0, as_json=True) == code
+        assert health.run(config, "plant", HANG_S, as_json=True) == code
         shown = json.loads(capsys.readouterr().out)
     assert (shown["process"], shown["run_id"], shown["status"]) == ("plant", "plant-1", status)
 
@@ -64,8 +68,10 @@ def test_garbage_is_not_health(config: Config) -> None:
     topic, done = topics.HEALTH["plant"], threading.Event()
     with (
         Bus(config, "plant", "plant-1") as bus,
+        Bus(config, "recorder", "recorder-1") as other,
         zenoh.open(session_config("client", config.bus.endpoint, 1500)) as raw,
     ):
+        ear = Ear(other)
 
         def garble() -> None:
             while not done.wait(0.01):
@@ -75,7 +81,8 @@ def test_garbage_is_not_health(config: Config) -> None:
         garbler.start()
         with HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said:
             said.set("running")
-            heard = health.ask(config, "plant", 5.0)
+            ear.until(health_of("plant", status="running"))
+            heard = health.ask(config, "plant", HANG_S)
         done.set()
         garbler.join()
     assert heard is not None
@@ -85,7 +92,7 @@ def test_garbage_is_not_health(config: Config) -> None:
 def test_without_a_router_it_gives_up_in_time(capsys: pytest.CaptureFixture[str]) -> None:
     began = clock.now()
     assert health.run(live_config(), "router", 0.5, as_json=True) == 1
-    assert clock.now() - began < 5.0
+    assert clock.now() - began < HANG_S
     assert json.loads(capsys.readouterr().out)["status"] is None
 
 

@@ -11,7 +11,7 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
-from live import live_config, wait_for
+from live import HANG_S, live_config, wait_for
 
 from node_runtime import clock
 from node_runtime.bus import Bus, session_config
@@ -147,7 +147,10 @@ class Sender:
         self.inbox: Inbox[m.PlantState] = Inbox(
             self.bus, topics.PLANT_STATE, states=4, inputs=1, sent=lambda message: message.t
         )
-        self.publisher = session.declare_publisher(topics.PLANT_STATE.key(self.bus.config.name))
+        # A burst would overflow the control lane, which drops rather than waits.
+        block = zenoh.CongestionControl.BLOCK
+        key = topics.PLANT_STATE.key(self.bus.config.name)
+        self.publisher = session.declare_publisher(key, congestion_control=block)
         wait_for(lambda: self.publisher.matching_status.matching)
         self.before = self.bus.counters()
 
@@ -217,12 +220,12 @@ def _waiting(sender: Sender) -> int:
 def test_waiting_goes_on_past_what_must_not_be_obeyed(buses: tuple[Bus, zenoh.Session]) -> None:
     sender = Sender(buses)
     sender.send(b"junk", b"junk", state(0))
-    received = sender.inbox.wait(10.0)
+    received = sender.inbox.wait(HANG_S)
     assert received is not None
     assert received.message.seq == 0
     before = clock.now()
     assert sender.inbox.wait(0.05) is None
-    assert clock.now() - before < 5.0
+    assert clock.now() - before < HANG_S
 
 
 @pytest.mark.live
@@ -231,13 +234,15 @@ def test_old_data_in_a_burst_is_recognised(buses: tuple[Bus, zenoh.Session]) -> 
     now = clock.now()
     # Sent on time, then nothing for three seconds, then all of it at once.
     sender.send(state(0, t=now))
-    first = sender.inbox.wait(10.0)
+    first = sender.inbox.wait(HANG_S)
     assert first is not None
     assert sender.inbox.age(first, first.arrived) == 0.0
-    sender.send(*(state(1 + k, t=now - 3.0 + 0.05 * k) for k in range(60)), state(61, t=clock.now()))
+    old, sent = [state(1 + k, t=now - 3.0 + 0.05 * k) for k in range(60)], clock.now()
+    sender.send(*old, state(61, t=sent))
     heard = []
     wait_for(lambda: heard.extend(sender.inbox.take_all()) or len(heard) == 61)
     ages = [sender.inbox.age(received, received.arrived) for received in heard]
     assert all(age > 0.05 for age in ages[:-1])
     assert ages[0] > 2.9
-    assert ages[-1] < 0.05
+    # Only as old as it was under way: what was sent before it does not age it.
+    assert ages[-1] <= heard[-1].arrived - sent

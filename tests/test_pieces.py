@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from live import live_config, wait_for
+from live import HANG_S, live_config, wait_for
 
 from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus, session_config
@@ -166,6 +166,6 @@ def test_answers_travel_in_pieces(config: Config) -> None:
     ):
         controller.serve("controller/large", lambda _parameters: answers)
         found: list[list[bytes]] = []
-        wait_for(lambda: bool(found.append(trainer.ask("controller/large", {}, 5.0)) or found[-1]))
+        wait_for(lambda: bool(found.append(trainer.ask("controller/large", {}, HANG_S)) or found[-1]))
         assert found[-1] == answers
         assert "bad controller/large: pieces lost" not in trainer.counters()
