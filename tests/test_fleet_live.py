@@ -24,7 +24,7 @@ def fleet(config: Config) -> Iterator[Config]:  # noqa: F811
     thread.start()
     yield config
     stop.set()
-    thread.join(20.0)
+    thread.join(60.0)
     assert not thread.is_alive()
 
 

@@ -50,7 +50,7 @@ DESCRIPTION = NetworkDescription(
     output_scale=[0.01, 0.01],
 )
 TRAINING = TrainerConfig(capacity=5000, train_every=20, min_samples=20, batch=64, steps=10, device="cpu")
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 @pytest.fixture
@@ -253,7 +253,8 @@ def test_lost_samples_are_fetched_and_missed_ticks_are_not_asked_for_again(confi
             controller.tick(1, miss=2)
             controller.tick(1, miss=2)
         controller.until(holds(40))
-        assert np.diff(controller.questions).min() > 0.9 * trainer_module.REFILL_EVERY
+        # They are stamped where they arrive; asked at every gap they would be a tick apart.
+        assert np.diff(controller.questions).min() > 0.5 * trainer_module.REFILL_EVERY
         expected = [*range(30), *(29 + 3 * made for made in range(1, 11))]
         assert trainer.labels() == expected
 
@@ -303,13 +304,14 @@ def test_another_network_begins_anew(config: Config) -> None:
 
 
 def test_bad_messages_are_counted_and_stop_nothing(config: Config) -> None:
+    # The stranger must stay one, however slow this machine is.
+    config = msgspec.structs.replace(config, bus=msgspec.structs.replace(config.bus, follow_silence=60.0))
     with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
         controller.until(joined)
         stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
         for topic in (topics.SAMPLES, topics.OUTPUT_WEIGHTS):
             for payload in (b"", b"\xc1" * 40, os.urandom(200)):
                 stranger.put(topic.key(config.name), payload)
-        # In one go, so that the trainer still follows this controller when the foreign one comes.
         controller.tick(5)
         nan = Sample(seq=9, x=[float("nan"), 0.0], u=[0.0], h=[0.0, 0.0])
         long = Sample(seq=9, x=[0.0] * 3, u=[0.0], h=[0.0, 0.0])
