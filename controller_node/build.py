@@ -8,13 +8,14 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
+from lbmpc.backup import BackupPlanner
 from lbmpc.controller import Controller
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.dnn import Refit
 from lbmpc.oracles.trial import Trial
 from lbmpc.plants import Plant, get_plant
-from lbmpc.problem import build_problem
+from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.polytope import EmptySetError
 from lbmpc.solver import Solver
@@ -159,6 +160,11 @@ def build_controller(
     controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
     _warm_up(controller, config.seed)
     return controller
+
+
+def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:
+    """What plans for the plant's outages; arguments as for `build_controller`."""
+    return BackupPlanner(problem, config.controller.backup.margin, realise or _as_it_is)
 
 
 def _warm_up(controller: Controller, seed: int) -> None:

@@ -19,9 +19,10 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from controller_node.build import build_controller, model_for
+from controller_node.build import build_backup, build_controller, model_for
 from controller_node.compile import Compiler
 from controller_node.sets import CertifiedSets, find_sets
+from lbmpc.backup import BackupPlanner
 from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.dnn import IN_USE, NEWEST
@@ -95,6 +96,8 @@ class ControllerCore:
             self.sets = find_sets(config, model_for(config)) if sets is None else sets
         compiler = Compiler() if config.controller.solver.compile == "auto" else None
         self.controller = build_controller(config, compiler, self.sets.certificate if self.sets else None)
+        self._realise = compiler
+        self._backup: BackupPlanner | None = None
         self.kernels = compiler.note if compiler else "virtual machine, as configured"
         self._timed = self.controller.solver = _Timed(self.controller.solver)
         self.plant = self.controller.model.plant
@@ -120,6 +123,35 @@ class ControllerCore:
     def prepare(self) -> None:
         """Use the time until the next tick; see `Controller.prepare`."""
         self.controller.prepare(self.state)
+
+    def backup(self, command: m.Command) -> m.Backup | None:
+        """What the plant may follow if no command comes after this one, the last step's; None where there is nothing.
+
+        Nothing else depends on it: who needs it asks.
+        """
+        policy = self.controller.backup(self._planner(), self.state)
+        if policy is None:
+            return None
+        # From deviations to plant units.
+        inputs = policy.inputs + self.plant.u_e - policy.gain @ self.plant.x_e
+        return m.Backup(
+            run_id=self.run_id,
+            seq=command.seq,
+            period=self.config.period,
+            gain=policy.gain.tolist(),
+            inputs=inputs.tolist(),
+        )
+
+    def ready_backup(self) -> None:
+        """Build now what `backup` would build when it is first called."""
+        state = self.controller.initial_state(self.config.seed)
+        theta = self.controller.oracle.theta(state.oracle)
+        self._planner().policy(state.predicted, theta, state.plan.v)
+
+    def _planner(self) -> BackupPlanner:
+        if self._backup is None:
+            self._backup = build_backup(self.config, self.controller.problem, self._realise)
+        return self._backup
 
     @property
     def solve_seconds(self) -> float:

@@ -35,6 +35,8 @@ OLDEST_STATE = 0.8
 # How long a slot waits for its state, as a share of a period.
 STATE_PATIENCE = 0.25
 LONGEST_PHASE = 0.5
+# Seconds; in a shorter period there is no time for a backup policy, which takes a few milliseconds.
+BACKUP_FROM = 0.01
 # Seconds, and share of a period at most.
 USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.25
 COUNTS = (
@@ -85,6 +87,9 @@ class ControllerNode:
         self._settings = core.config.controller
         self._period = core.config.period
         self._phase = phase(core.config)
+        self._backs_up = core.config.controller.backup.enabled and self._period >= BACKUP_FROM
+        if self._backs_up:
+            core.ready_backup()
         self._weights_every = topics.OUTPUT_WEIGHTS.every(self._period)
         self._samples_batch = max(SAMPLES_BATCH, round(SAMPLES_WAIT / self._period))
         self._run_id = core.run_id
@@ -214,6 +219,8 @@ class ControllerNode:
         outputs = self._core.step(tick)
         self._bus.publish(topics.COMMAND, outputs.command)
         sent = clock.now()
+        if self._backs_up and (backup := self._core.backup(outputs.command)) is not None:
+            self._bus.publish(topics.BACKUP, backup)
         timing = m.TickTiming(
             run_id=self._run_id,
             seq=self._seq,

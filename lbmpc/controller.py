@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from lbmpc.backup import BackupPlanner, Policy
 from lbmpc.fallback import Plan, empty_plan, feedback_plan, shift
 from lbmpc.model import Model, Pieces
 from lbmpc.oracles.base import OracleState, follow
@@ -179,6 +180,12 @@ class Controller:
         if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
             self.solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
             self._prepared_for = state
+
+    def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
+        """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
+        if state.plan.left == 0:
+            return None
+        return planner.policy(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""

@@ -9,6 +9,9 @@ the cost is a constant plus |w|^2 / 2. The constrained subproblem is then a leas
 w = 0, the unconstrained minimiser, as the rows allow. `sweep` finds that minimiser; `rows` says how the inputs and
 the nominal states move with w. No Hessian is formed and nothing is factorised but m x m blocks.
 
+The rows look at the nominal states zbar. A backup policy (`lbmpc.backup`) has them look at the learned states z
+instead, of which the recursion holds the linearisation anyway: `constrained`.
+
 Where the oracle looks back, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D: the
 cost sees x alone, and of the Jacobians only the d rows of x+ are stored, since the rest of s+ is a shift. Without a
 look back s is x and D is d.
@@ -16,18 +19,24 @@ look back s is x and D is d.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import casadi as ca
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, follow_symbols, remembered
 
+Constrained = Literal["nominal", "learned"]
+"""Whose states the rows look at."""
 
-def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
+
+def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
     """(x, v, theta, xr, ur) -> (cost, vs, zs, A, B, K, L) for a horizon of n.
 
     Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
     Outputs: half of psi at v; the subproblem's unconstrained minimiser vs (m, n) and its *nominal* states zbar_1..n, zs
     (d, n); the Jacobians along the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
     d, m, behind = model.d, model.m, remembered(oracle)
     a, b, q, r = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R))
@@ -63,34 +72,33 @@ def build_sweep(model: Model, oracle: Oracle, n: int) -> ca.Function:
             p_matrix, p_vector, a_i[i], b_i[i], columns_z[i], columns_v[i]
         )
 
-    step, nominal, minimiser, nominal_states = ca.MX.zeros(d + behind), x[:d] if behind else x, [], []
+    step, nominal = ca.MX.zeros(d + behind), x[:d] if behind else x
+    minimiser, nominal_states, learned_states = [], [], []
     for i in range(n):
         move = gains[i] @ step + offsets[i]
         step = follow_symbols(step, move, a_i[i] @ step + b_i[i] @ move)
         minimiser.append(inputs[i] + move)
         nominal = a @ nominal + b @ minimiser[i]
         nominal_states.append(nominal)
+        learned_states.append(z[:, i + 1] + step[:d])
+    blocks = {"vs": minimiser, "zs": nominal_states, "A": a_i, "B": b_i, "K": gains, "L": inverses}
+    if constrained == "learned":
+        blocks |= {"zs": learned_states, "z": ca.horzsplit(z[:, 1:])}
     return ca.Function(
-        "sweep",
+        "sweep" if constrained == "nominal" else "backup_sweep",
         [x, v, theta, xr, ur],
-        [
-            cost,
-            *(
-                ca.densify(ca.horzcat(*blocks))
-                for blocks in (minimiser, nominal_states, a_i, b_i, gains, inverses)
-            ),
-        ],
+        [cost, *(ca.densify(ca.horzcat(*parts)) for parts in blocks.values())],
         ["x", "v", "theta", "xr", "ur"],
-        ["cost", "vs", "zs", "A", "B", "K", "L"],
+        ["cost", *blocks],
     )
 
 
-def build_rows(model: Model, n: int, behind: int = 0) -> ca.Function:
+def build_rows(model: Model, n: int, behind: int = 0, constrained: Constrained = "nominal") -> ca.Function:
     """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n): how v_0..n-1, then zbar_1..n, move with w; transposed.
 
-    `behind`: D - d.
+    `behind`: D - d. With `learned`, z_1..n instead of zbar_1..n.
     """
-    return _propagation(model, n, behind, follow_state=False)
+    return _propagation(model, n, behind, follow_state=False, constrained=constrained)
 
 
 def build_tangent(model: Model, n: int, behind: int = 0) -> ca.Function:
@@ -98,7 +106,9 @@ def build_tangent(model: Model, n: int, behind: int = 0) -> ca.Function:
     return _propagation(model, n, behind, follow_state=True)
 
 
-def _propagation(model: Model, n: int, behind: int, follow_state: bool) -> ca.Function:
+def _propagation(
+    model: Model, n: int, behind: int, follow_state: bool, constrained: Constrained = "nominal"
+) -> ca.Function:
     """Forward sensitivities, one row a direction: the blocks of all stages then lie side by side in memory."""
     d, m, length = model.d, model.m, model.d + behind
     a, b = ca.DM(model.A).T, ca.DM(model.B).T
@@ -124,12 +134,12 @@ def _propagation(model: Model, n: int, behind: int, follow_state: bool) -> ca.Fu
         step = ca.horzcat(after, step[:, 2 * d + m :], step[:, :d], move) if behind else after
         nominal = nominal @ a + move @ b
         moves.append(move)
-        states.append(nominal)
+        states.append(nominal if constrained == "nominal" else step[:, :d])
     everything = ca.densify(ca.horzcat(*moves, *states))
     outputs, names = (
         ([everything[:before, :], everything[before:, :]], ["Y", "M"]) if before else ([everything], ["M"])
     )
-    name = "tangent" if follow_state else "rows"
+    name = "tangent" if follow_state else "rows" if constrained == "nominal" else "backup_rows"
     return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
 
 

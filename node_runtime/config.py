@@ -75,6 +75,15 @@ class SolverConfig(Section, frozen=True):
     """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
 
 
+class BackupConfig(Section, frozen=True):
+    """Of the policy that the plant follows when its controller falls silent."""
+
+    enabled: bool = True
+    """Up to 100 Hz; in a faster loop there is no time for it, and the plan is what the plant follows."""
+    margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.0125
+    """By how much X shrinks for it, as a share of its half-widths."""
+
+
 class ControllerConfig(Section, frozen=True):
     horizon: PositiveInt = 60
     oracle: OracleName = "dnn"
@@ -96,6 +105,7 @@ class ControllerConfig(Section, frozen=True):
     checkpoint: str = ""
     """File from which the controller takes its memory when it is started again; "": none."""
     solver: SolverConfig = SolverConfig()
+    backup: BackupConfig = BackupConfig()
 
 
 class NetworkConfig(Section, frozen=True):

@@ -19,7 +19,7 @@ from node_runtime.pacer import Grid, Pacer
 from node_runtime.realtime import GarbageCollection, core_for, on_core, punctual, said_of
 from plant_sim.plant import PlantSim
 from protocol import topics
-from protocol.messages import Command, InputSource
+from protocol.messages import Backup, Command, InputSource
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +28,8 @@ IN_ADVANCE_FROM = 0.005
 NOTES: dict[InputSource, str] = {
     "hold": "held at x0 until the first command",
     "command": "",
-    "plan": "no fresh command: following the rest of the last plan",
-    "safe": "no fresh command and the plan has ended: safe input",
+    "plan": "no fresh command: following the backup policy, or the last plan",
+    "safe": "no fresh command and nothing left to follow: safe input",
 }
 
 
@@ -57,6 +57,7 @@ class PlantNode:
         self._health = health
         self._counts = counts
         self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=sim.plant.d, inputs=sim.plant.m)
+        self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=sim.plant.d, inputs=sim.plant.m)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set. Raises `PlantError`."""
@@ -91,6 +92,13 @@ class PlantNode:
                     f"command {command.seq} of {command.run_id} for {command.state_seq}, {command.period} s"
                 )
                 self._bus.bad.count(topics.COMMAND.name, verdict, detail)
+        for ready in self._backups.take_all():
+            verdict = self._sim.backup(ready.message)
+            if verdict != "ok":
+                backup = ready.message
+                self._bus.bad.count(
+                    topics.BACKUP.name, verdict, f"for command {backup.seq} of {backup.run_id}"
+                )
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from lbmpc.plants import Plant, Truth
-from plant_sim.watchdog import Orders
-from protocol.messages import Command, InputSource, Piece, PlantState
+from plant_sim.watchdog import Orders, Standby
+from protocol.messages import Backup, Command, InputSource, Piece, PlantState
 
 CommandVerdict = Literal["ok", "wrong period", "foreign", "stale"]
 
@@ -45,6 +45,7 @@ class PlantSim:
         self._seq = -1
         self._orders: Orders | None = None
         self._pending: list[Orders] = []
+        self._standby: dict[int, Standby] = {}
         self._memo: dict[tuple[bytes, bytes, float], np.ndarray] = {}
 
     @property
@@ -78,6 +79,21 @@ class PlantSim:
         self._pending.append(Orders(self.plant, command, at, self._patience))
         return "ok"
 
+    def backup(self, backup: Backup) -> CommandVerdict:
+        """Keep `backup` ready for when commands stop coming.
+
+        It must have the plant's dimensions. It is refused unless it belongs to one of the last commands: only these
+        say when its periods begin.
+        """
+        if not math.isclose(backup.period, self.period, rel_tol=1e-6):
+            return "wrong period"
+        known = [order for order in (self._orders, *self._pending) if order is not None]
+        for order in known:
+            if (order.run_id, order.seq) == (backup.run_id, backup.seq):
+                self._standby[backup.seq] = Standby(backup, order.arrived)
+                return "ok"
+        return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
+
     def sample(self, t: float) -> PlantState:
         """x(t) and what acted since the sample before; t must rise by about whole periods.
 
@@ -92,14 +108,16 @@ class PlantSim:
         source: InputSource = "hold"
         if self._first is None:
             self._first, self._t = t, t
-        segments, orders = self._motion(t)
-        self._x = self._integrate(segments)
+        segments, orders, self._x = self._motion(t)
         if segments:
             source = segments[-1].source
             applied = self._applied(segments)
         pieces = [Piece(s.duration, s.u.tolist()) for s in _merged(segments) if s.u is not None]
         self._orders = orders
         self._pending = [order for order in self._pending if order.arrived > t]
+        if orders is not None:
+            # Of older commands nothing is followed any more, but for the one before the last: see `_drive`.
+            self._standby = {seq: standby for seq, standby in self._standby.items() if seq >= orders.seq - 1}
         self._t = t
         self._seq = max(self._seq + 1, round((t - self._first) / self.period))
         self._memo = {}
@@ -119,11 +137,11 @@ class PlantSim:
 
         Changes nothing else. Raises `PlantError` like `sample`.
         """
-        self._integrate(self._motion(t)[0])
+        self._motion(t)
 
-    def _motion(self, end: float) -> tuple[list[_Segment], Orders | None]:
-        """The segments from the last sample to `end`, and the orders that hold from there."""
-        t, orders = self._t, self._orders
+    def _motion(self, end: float) -> tuple[list[_Segment], Orders | None, np.ndarray]:
+        """The segments from the last sample to `end`, the orders that hold from there, and the state there."""
+        t, orders, x = self._t, self._orders, self._x
         segments: list[_Segment] = []
         arriving = [order for order in self._pending if order.arrived <= end]
         for order in [*arriving, None]:
@@ -132,26 +150,24 @@ class PlantSim:
                 if orders is None:
                     segments.append(_Segment(at - t, None, "hold"))
                     break
-                drive = orders.drive(t)
+                drive = orders.drive(t, x, self._standby.get(orders.seq) or self._standby.get(orders.seq - 1))
                 until = min(drive.until, at)
-                segments.append(_Segment(until - t, drive.u, drive.source))
+                # Differences of large times are not exact; the period is.
+                duration = self.period if math.isclose(until - t, self.period, rel_tol=1e-6) else until - t
+                segments.append(_Segment(duration, drive.u, drive.source))
+                x = self._step(x, segments[-1])
                 t = until
             t, orders = at, order or orders
-        if len(segments) == 1 and math.isclose(segments[0].duration, self.period, rel_tol=1e-6):
-            # Differences of large times are not exact; the period is.
-            segments = [_Segment(self.period, segments[0].u, segments[0].source)]
-        return segments, orders
+        return segments, orders, x
 
-    def _integrate(self, segments: list[_Segment]) -> np.ndarray:
-        x = self._x
-        for segment in segments:
-            if segment.u is None:
-                continue
-            key = (x.tobytes(), segment.u.tobytes(), segment.duration)
-            if key not in self._memo:
-                self._memo[key] = self._truth.step(x, segment.u, segment.duration)
-            x = self._memo[key]
-        return x
+    def _step(self, x: np.ndarray, segment: _Segment) -> np.ndarray:
+        """The state, (d,), behind a segment that begins at x."""
+        if segment.u is None:
+            return x
+        key = (x.tobytes(), segment.u.tobytes(), segment.duration)
+        if key not in self._memo:
+            self._memo[key] = self._truth.step(x, segment.u, segment.duration)
+        return self._memo[key]
 
     def _applied(self, segments: list[_Segment]) -> list[float] | None:
         total = sum(segment.duration for segment in segments)

@@ -1,4 +1,4 @@
-"""What drives the plant's input: a fresh command, else the rest of its plan, else the plant's safe input."""
+"""What drives the plant's input: a fresh command, else the backup policy or the plan, else the plant's safe input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbmpc.plants import Plant
-from protocol.messages import Command, InputSource
+from protocol.messages import Backup, Command, InputSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,19 +19,38 @@ class Drive:
     """(m,), within the actuator's range."""
     source: InputSource
     until: float
-    """When something else takes over if no command comes; infinite for the safe input."""
+    """When something else takes over if no command comes; infinite where nothing does."""
+
+
+class Standby:
+    """A backup policy and when its command began to act; immutable. Times in seconds."""
+
+    def __init__(self, backup: Backup, arrived: float):
+        """`backup` must have the plant's dimensions."""
+        self.seq = backup.seq
+        self._arrived = arrived
+        self._period = backup.period
+        self._inputs = backup.inputs
+        self._gain = np.array(backup.gain)
+
+    def drive(self, t: float, x: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """What it wants at time t in state x (d,), and until when; None before its first entry and behind its last."""
+        entry = _elapsed(self._arrived, t, self._period)
+        if not 1 <= entry <= len(self._inputs):
+            return None
+        return self._inputs[entry - 1] + self._gain @ x, self._arrived + (entry + 1) * self._period
 
 
 class Orders:
     """The last command and what follows from it as time goes by; immutable. Times in seconds.
 
-    The command's input acts for `patience` periods from its arrival. Then the plan's entry of each elapsed
-    period acts, and after the last one the plant's safe input, for ever.
+    The command's input acts for `patience` periods from its arrival. Then, in each period, the backup policy
+    acts while it has an entry, the plan's entry while it has one, and the plant's safe input for ever after.
     """
 
     def __init__(self, plant: Plant, command: Command, arrived: float, patience: float):
         """`command` must have the plant's dimensions; what acts of it is clipped to [u_min, u_max]."""
-        self.seq = command.seq
+        self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived
         self._period = command.period
         self._patience = patience
@@ -39,19 +58,35 @@ class Orders:
         self._plan = [command.u, *command.plan[1:]]
         self._first = self._within(command.u)
 
-    def drive(self, t: float) -> Drive:
-        """What acts at time t, `arrived` or later."""
-        # A switching time that rounding put a hair too late still counts as reached.
-        reached = t + 1e-9 * self._period + 4 * math.ulp(t)
+    def drive(self, t: float, x: np.ndarray, standby: Standby | None = None) -> Drive:
+        """What acts at time t, `arrived` or later, in state x (d,), plant units."""
         patience_ends = self.arrived + self._patience * self._period
-        if patience_ends > reached:
+        if patience_ends > _reached(t, self._period):
             return Drive(self._first, "command", patience_ends)
-        for entry in range(math.floor(self._patience), len(self._plan)):
-            ends = self.arrived + (entry + 1) * self._period
-            if ends > reached:
-                return Drive(self._within(self._plan[entry]), "plan", ends)
-        return Drive(self._within(self._plant.safe_input), "safe", math.inf)
+        if standby is not None and (backup := standby.drive(t, x)) is not None:
+            return Drive(self._within(backup[0]), "plan", backup[1])
+        entry = _elapsed(self.arrived, t, self._period)
+        ends = self.arrived + (entry + 1) * self._period
+        if entry < len(self._plan):
+            return Drive(self._within(self._plan[entry]), "plan", ends)
+        safe, gain = self._plant.safe_input, self._plant.safe_gain
+        if gain is None:
+            return Drive(self._within(safe), "safe", math.inf)
+        return Drive(self._within(safe + gain @ (x - self._plant.x_e)), "safe", ends)
 
     def _within(self, u: list[float] | np.ndarray) -> np.ndarray:
         # Entry by entry, as they are needed: most plans are never followed beyond their first.
         return np.minimum(np.maximum(u, self._plant.u_min), self._plant.u_max)
+
+
+def _reached(t: float, period: float) -> float:
+    """t, and a little more: a switching time that rounding put a hair too late still counts as reached."""
+    return t + 1e-9 * period + 4 * math.ulp(t)
+
+
+def _elapsed(since: float, t: float, period: float) -> int:
+    """Whole periods from `since` to t, so that the next one ends later than t."""
+    entry = max(0, math.floor((t - since) / period))
+    while since + (entry + 1) * period <= _reached(t, period):
+        entry += 1
+    return entry

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from functools import cache
+from math import isfinite
 from typing import Literal, TypeVar
 
 import msgspec
@@ -35,6 +35,24 @@ _decoders: dict[type, msgspec.msgpack.Decoder] = {}
 def encode(message: m.Message) -> bytes:
     """Deterministic msgpack: the same message is the same bytes, in every process."""
     return _encoder.encode(message)
+
+
+class Head(msgspec.Struct):
+    """What every message begins with, whatever else is in it."""
+
+    run_id: m.RunId
+    seq: m.Sequence
+
+
+_head = msgspec.msgpack.Decoder(Head)
+
+
+def head_of(payload: bytes) -> Head | None:
+    """Who wrote a message, and its number, without a look at the rest of it; None where that cannot be read."""
+    try:
+        return _head.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError):
+        return None
 
 
 def decode_as(kind: type[M], payload: bytes) -> M:
@@ -98,7 +116,7 @@ def _may_hold_float(kind: inspect.Type) -> bool:
 def first_non_finite(value: object, path: str = "") -> str | None:
     """Name of the first field that holds a NaN or an infinity, or None. msgspec lets both pass."""
     if isinstance(value, float):
-        return None if math.isfinite(value) else path or "value"
+        return None if isfinite(value) else path or "value"
     if value is None:
         return None
     if isinstance(value, m.Array):
@@ -107,15 +125,19 @@ def first_non_finite(value: object, path: str = "") -> str | None:
         return None
     children: Iterable[tuple[object, object]]
     if isinstance(value, msgspec.Struct):
-        children = [(name, getattr(value, name)) for name in _fields_with_floats(type(value))]
+        fields = [(name, getattr(value, name)) for name in _fields_with_floats(type(value))]
+        # Most are finite numbers or absent: to see that here saves a call for each.
+        children = [
+            (name, child) for name, child in fields if type(child) is not float or not isfinite(child)
+        ]
     elif isinstance(value, dict):
         children = value.items()
     elif isinstance(value, list):
         # Nearly all are vectors of finite numbers, and those have a finite sum.
         first = value[0] if value else None
-        if first is None or (type(first) is float and math.isfinite(sum(value))):
+        if first is None or (type(first) is float and isfinite(sum(value))):
             return None
-        if type(first) is list and first and type(first[0]) is float and math.isfinite(sum(map(sum, value))):
+        if type(first) is list and first and type(first[0]) is float and isfinite(sum(map(sum, value))):
             return None
         children = enumerate(value)
     else:
@@ -149,6 +171,14 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                     expect(f"plan[{i}]", entry, m_inputs)
             if not message.plan:
                 raise BadMessage(topic.name, "wrong size", "the plan is empty")
+            if not 0.0 < message.period < 3600.0:
+                raise BadMessage(topic.name, "wrong size", f"period {message.period} s")
+        case m.Backup():
+            if len(message.gain) != m_inputs or not message.inputs:
+                raise BadMessage(topic.name, "wrong size", "no entry in inputs, or in gain not one an input")
+            for name, rows, length in (("gain", message.gain, d), ("inputs", message.inputs, m_inputs)):
+                for i, row in enumerate(rows):
+                    expect(f"{name}[{i}]", row, length)
             if not 0.0 < message.period < 3600.0:
                 raise BadMessage(topic.name, "wrong size", f"period {message.period} s")
         case m.Samples():

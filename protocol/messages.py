@@ -26,7 +26,7 @@ RunId = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Digest = Annotated[str, msgspec.Meta(max_length=64)]
 
 InputSource = Literal["hold", "command", "plan", "safe"]
-"""What drove the plant: held at x0, a fresh command, the rest of the last plan, the local safe input."""
+"""What drove the plant: held at x0, a fresh command, the backup policy or else the last plan, the local safe input."""
 CommandMode = Literal["solver", "shifted_plan", "feedback"]
 StateVerdict = Literal["fresh", "stale", "missing"]
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
@@ -104,6 +104,21 @@ class Command(Message, frozen=True):
     u: list[float]
     plan: list[list[float]]
     """Inputs for this period and the following ones; plan[0] is u."""
+
+
+class Backup(Message, frozen=True):
+    """What to follow when no command comes any more, from one period after command `seq` began to act.
+
+    In the i-th period from then on u = inputs[i] + gain x, with x as the plant's own sensors have it at that period's
+    beginning; plant units.
+    """
+
+    period: float
+    """Seconds between the entries of `inputs`."""
+    gain: list[list[float]]
+    """(m, d)."""
+    inputs: list[list[float]]
+    """(N, m)."""
 
 
 class HiddenWeights(Message, frozen=True):

@@ -19,7 +19,7 @@ QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
 
 _READS: dict[str, tuple[Topic, ...]] = {
     "controller": (topics.PLANT_STATE, topics.HIDDEN_WEIGHTS),
-    "plant": (topics.COMMAND,),
+    "plant": (topics.COMMAND, topics.BACKUP),
     "trainer": (topics.SAMPLES, topics.OUTPUT_WEIGHTS),
 }
 _ASKS: dict[str, tuple[str, ...]] = {"trainer": QUERIES}

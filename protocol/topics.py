@@ -62,6 +62,7 @@ PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIE
 COMMAND = Topic(
     "controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ, gathered=True
 )
+BACKUP = Topic("controller/backup", m.Backup, "control", "controller", 256 * 1024)
 TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ, gathered=True)
 RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
 TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
@@ -81,6 +82,7 @@ HEALTH = {name: Topic(f"{name}/health", m.Health, "bulk", name) for name in PROC
 ALL: tuple[Topic, ...] = (
     PLANT_STATE,
     COMMAND,
+    BACKUP,
     TICK,
     RESULT,
     TIMING,

@@ -29,7 +29,7 @@ Progress = Callable[[int, int], None]
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a replay found. Equal means: every command, result, output weight and keyframe, every byte."""
+    """What a replay found. Equal means: every command, backup, result, output weight and keyframe, every byte."""
 
     ticks: int
     """Replayed and compared."""
@@ -57,6 +57,7 @@ class _Recorded:
     config: Config
     ticks: dict[int, Entry[m.Tick]]
     commands: dict[int, Entry[m.Command]]
+    backups: dict[int, Entry[m.Backup]]
     results: dict[int, Entry[m.TickResult]]
     weights: dict[int, Entry[m.OutputWeights]]
     keyframes: dict[int, Entry[m.Keyframe]]
@@ -135,16 +136,17 @@ class _Comparison:
         self.lost = 0
         self.gaps: list[str] = []
 
-    def compare(self, entry: Entry[Any], replayed: m.Message, name: str) -> None:
-        payload = codec.encode(replayed)
+    def compare(self, entry: Entry[Any], replayed: m.Message | None, name: str) -> None:
+        payload = b"" if replayed is None else codec.encode(replayed)
         if payload == entry.payload:
             return
-        self.differing.add((replayed.run_id, replayed.seq))
+        recorded = entry.message
+        self.differing.add((recorded.run_id, recorded.seq))
         if self.first is None:
-            found = first_difference(entry.message, replayed, name)
+            found = first_difference(recorded, replayed, name)
             field, left, right = found or first_byte(entry.payload, payload, name)
             self.first = Difference(
-                run_id=replayed.run_id, tick=replayed.seq, field=field, recorded=left, replayed=right
+                run_id=recorded.run_id, tick=recorded.seq, field=field, recorded=left, replayed=right
             )
 
     def measure(self, recorded: m.Command, replayed: m.Command) -> None:
@@ -193,6 +195,8 @@ def _replay_tick(
     if seq in recorded.commands:
         comparison.compare(recorded.commands[seq], outputs.command, "command")
         comparison.measure(recorded.commands[seq].message, outputs.command)
+    if seq in recorded.backups:
+        comparison.compare(recorded.backups[seq], core.backup(outputs.command), "backup")
     if seq in recorded.results:
         comparison.compare(recorded.results[seq], outputs.result, "result")
     if seq in recorded.weights and outputs.output_weights is not None:
@@ -273,6 +277,7 @@ def _collect(run: Run, run_id: str) -> _Recorded:
         config=config,
         ticks=by_tick(topics.TICK),
         commands=by_tick(topics.COMMAND),
+        backups=by_tick(topics.BACKUP),
         results=by_tick(topics.RESULT),
         weights=by_tick(topics.OUTPUT_WEIGHTS),
         keyframes=by_tick(topics.KEYFRAME),
@@ -367,7 +372,10 @@ def _notes(run: Run, recorded: list[_Recorded], overrides: Sequence[str]) -> lis
                 )
     strangers = {tick.run_id for tick in run.ticks} - set(run.controllers)
     if strangers:
-        notes.append(f"not replayed, since it never said what it is: {', '.join(sorted(strangers))}")
+        notes.append(
+            "not replayed, since it never said what it is, or its results are not of its ticks: "
+            f"{', '.join(sorted(strangers))}"
+        )
     for r in recorded:
         if -1 in r.keyframes and (before := r.keyframes[-1].message.resumed):
             notes.append(f"{r.run_id}: goes on from the memory of {before}, out of a checkpoint")

@@ -123,8 +123,17 @@ def test_the_trainer_hears_of_an_adoption_at_once() -> None:
     assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == [0, 5]
 
 
+@pytest.mark.parametrize(("rate", "times"), [("20.0", 3), ("100.0", 3), ("200.0", 0)])
+def test_a_backup_follows_each_command_where_there_is_time(rate: str, times: int) -> None:
+    loop = Loop(f"rate={rate}")
+    loop.tick(3)
+    assert loop.bus.seqs(topics.BACKUP) == list(range(times))
+    names = [name for name, _ in loop.bus.said]
+    assert all(names[names.index(topics.BACKUP.name) - 1] == topics.COMMAND.name for _ in range(times))
+
+
 def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else() -> None:
-    loop = Loop("controller.solver.mode=real_time")
+    loop = Loop("controller.solver.mode=real_time", "controller.backup.enabled=false")
     loop.tick(3)
     loop.bus.said.clear()
     loop.tick()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ from node_runtime.bus import Bus
 from node_runtime.router import Router
 from plant_sim import node
 from plant_sim.plant import PlantSim
-from plant_sim.watchdog import Orders
+from plant_sim.watchdog import Orders, Standby
 from protocol import messages as m
 from protocol import topics
 
@@ -43,6 +44,20 @@ def command(
         mode="solver",
         u=[u],
         plan=entries,
+    )
+
+
+def backup(
+    seq: int, inputs: list[float], run_id: str = "controller-a", period: float = PERIOD, gain: float = 0.5
+) -> m.Backup:
+    """u = U + input + gain (z - z_e)."""
+    offset = U - gain * float(PLANT.x_e[0])
+    return m.Backup(
+        run_id=run_id,
+        seq=seq,
+        period=period,
+        gain=[[gain, 0.0, 0.0, 0.0]],
+        inputs=[[offset + value] for value in inputs],
     )
 
 
@@ -95,7 +110,7 @@ def test_an_input_in_the_middle_of_a_period_acts_from_there() -> None:
 def test_the_period_in_which_the_plant_is_released_has_no_applied_input() -> None:
     sim = plant()
     sim.sample(0.0)
-    sim.command(command(0, U), 0.3 * PERIOD)
+    sim.command(command(0, U, [U]), 0.3 * PERIOD)
     assert sim.sample(PERIOD).applied is None
     assert sim.sample(2 * PERIOD).applied == [U]
 
@@ -108,8 +123,76 @@ def test_without_commands_the_plan_and_then_the_safe_input() -> None:
     assert [state.source for state in states] == ["command", "plan", "plan", "plan", "safe", "safe", "safe"]
     # The first entry acts for the patience of 1.5 periods, so half of the second period is still its.
     applied = [state.applied[0] - U for state in states if state.applied]
-    assert applied == pytest.approx([0.01, 0.015, 0.03, 0.04, 0.0, 0.0, 0.0], abs=1e-12)
+    assert applied[:4] == pytest.approx([0.01, 0.015, 0.03, 0.04], abs=1e-12)
+    assert PLANT.safe_gain is not None
+    for before, u in zip(states[3:], applied[4:], strict=False):
+        assert u == pytest.approx(float((PLANT.safe_gain @ (np.array(before.x) - PLANT.x_e))[0]), abs=1e-12)
     assert all(state.command_seq == 0 for state in states)
+
+
+def test_without_commands_the_backup_policy_acts_on_what_the_plant_measures() -> None:
+    sim, truth = plant(), Truth(PLANT)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U + 0.5] * 4), 0.0)
+    assert sim.backup(backup(0, [0.01, 0.02])) == "ok"
+    states = [sim.sample(k * PERIOD) for k in range(1, 5)]
+    assert [state.source for state in states] == ["command", "plan", "plan", "plan"]
+    x = truth.step(truth.step(PLANT.x0, np.array([U]), PERIOD), np.array([U]), PERIOD / 2)
+    # Entry 0 belongs to the second period, half of which the command was still waited for.
+    u = np.array([U + 0.01 + 0.5 * (x[0] - PLANT.x_e[0])])
+    x = truth.step(x, u, PERIOD / 2)
+    assert states[1].x == pytest.approx(x.tolist(), abs=1e-10)
+    u = np.array([U + 0.02 + 0.5 * (x[0] - PLANT.x_e[0])])
+    assert states[2].applied == pytest.approx(u.tolist(), abs=1e-10)
+    # Where it has no entry any more, the plan goes on with its own of that period.
+    assert states[3].applied == [U + 0.5]
+
+
+def test_the_backup_of_the_command_before_serves_until_the_new_one_is_there() -> None:
+    def applied(backups: int) -> list[float]:
+        """Over the fourth and the fifth period, after three commands a fifth of a period late."""
+        sim = plant(PLANT.x_e)
+        for k in range(3):
+            sim.sample(k * PERIOD)
+            sim.command(command(k, U, [U + 0.3] * 9, answers=k), (k + 0.2) * PERIOD)
+            if k < backups:
+                assert sim.backup(backup(k, [0.01, 0.02, 0.03, 0.04], gain=0.0)) == "ok"
+        sim.sample(3 * PERIOD)
+        states = [sim.sample(4 * PERIOD), sim.sample(5 * PERIOD)]
+        return [state.applied[0] - U for state in states if state.applied]
+
+    # Command 2 acts until 3.7; then the entries of command 1 that belong to its periods from 3.2 and from 4.2 on.
+    assert applied(backups=2) == pytest.approx([0.3 * 0.02, 0.2 * 0.02 + 0.8 * 0.03], abs=1e-12)
+    # That of two commands ago is not followed.
+    assert applied(backups=1) == pytest.approx([0.3 * 0.3, 0.3], abs=1e-12)
+
+
+def test_a_backup_without_its_command_is_refused() -> None:
+    sim = plant(PLANT.x_e)
+    assert sim.backup(backup(0, [0.0])) == "foreign"
+    sim.sample(0.0)
+    sim.command(command(5, U, [U] * 3), 0.0)
+    assert sim.backup(backup(5, [0.0], period=1.0)) == "wrong period"
+    assert sim.backup(backup(4, [0.0])) == "stale"
+    assert sim.backup(backup(5, [0.0], run_id="controller-b")) == "foreign"
+    assert sim.backup(backup(5, [0.0])) == "ok"
+
+
+@pytest.mark.parametrize("period", [0.1, 0.05, 0.01])
+def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
+    """With a constant input it would leave for the surge that the equilibrium is unstable towards."""
+
+    def after(plant: Plant) -> float:
+        sim = PlantSim(plant, period, PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0]), 1.5, "plant-a")
+        sim.sample(0.0)
+        sim.command(command(0, U, period=period), 0.0)
+        for k in range(1, round(10 / period)):
+            state = sim.sample(k * period)
+        assert state.source == "safe"
+        return float(np.abs(np.array(state.x) - PLANT.x_e).max())
+
+    assert after(PLANT) < 0.01
+    assert after(replace(PLANT, safe_gain=None)) > 0.1
 
 
 def test_a_fresh_command_ends_the_plan() -> None:
@@ -124,19 +207,33 @@ def test_a_fresh_command_ends_the_plan() -> None:
     assert (state.source, state.applied, state.command_seq) == ("command", [U + 0.01], 9)
 
 
-@given(st.floats(1.0, 6.0), st.integers(0, 8), st.floats(0.0, 1e7), st.floats(0.001, 10.0))
-def test_what_drives_always_moves_on(patience: float, entries: int, arrived: float, period: float) -> None:
-    orders = Orders(PLANT, command(0, U, [U] * entries, period=period), arrived, patience)
+@given(
+    st.floats(1.0, 6.0),
+    st.integers(0, 8),
+    st.integers(0, 8),
+    st.floats(0.0, 1e7),
+    st.floats(0.001, 10.0),
+    st.sampled_from([None, PLANT.safe_gain]),
+)
+def test_what_drives_always_moves_on(
+    patience: float, entries: int, backups: int, arrived: float, period: float, gain: np.ndarray | None
+) -> None:
+    held = replace(PLANT, safe_gain=gain)
+    orders = Orders(held, command(0, U, [U] * entries, period=period), arrived, patience)
+    standby = Standby(backup(0, [0.0] * backups, period=period), arrived) if backups else None
     t, sources = arrived, []
     while np.isfinite(t):
-        drive = orders.drive(t)
+        drive = orders.drive(t, PLANT.x_e, standby)
         assert drive.until > t
         sources.append(drive.source)
         t = drive.until
-        assert len(sources) <= entries + 3
+        if (gain is not None and sources.count("safe") > 3) or len(sources) > 3 + max(entries, backups):
+            break
     assert sources[0] == "command"
     assert sources[-1] == "safe"
-    assert sources[1:-1] == ["plan"] * (len(sources) - 2)
+    safe = sources.index("safe")
+    assert sources[1:safe] == ["plan"] * (safe - 1)
+    assert sources[safe:] == ["safe"] * (len(sources) - safe)
 
 
 def test_the_actuator_clips_and_what_is_reported_is_the_clipped_input() -> None:
@@ -216,11 +313,12 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
                 ear.of(topics.PLANT_STATE)
                 state = ear.until(lambda message: isinstance(message, m.PlantState))
                 assert isinstance(state, m.PlantState)
-                answer = command(k, U + 0.01, [U] * 5, answers=state.seq, run_id=state.run_id)
+                answer = command(k, U + 0.01, [U] * 15, answers=state.seq, run_id=state.run_id)
                 bus.publish(topics.COMMAND, answer)
                 stranger.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
-            ear.until(health_of("plant", note="no fresh command and the plan has ended: safe input"))
-            health = ear.until(lambda message: isinstance(message, m.Health))
+            ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
+            foreign = "bad controller/command: foreign"
+            ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
             process.signal(signal.SIGINT)
             ear.until(health_of("plant", status="stopping"))
             assert process.end() == 0
@@ -230,10 +328,9 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
     assert order[0] == "hold"
     assert "command" in order
     assert order[-2:] == ["plan", "safe"]
-    applied = {state.applied[0] for state in ear.of(topics.PLANT_STATE) if state.applied}
+    driven = [state for state in ear.of(topics.PLANT_STATE) if state.source != "safe"]
+    applied = {state.applied[0] for state in driven if state.applied}
     assert all(U - 1e-9 <= u <= U + 0.01 + 1e-9 for u in applied)
-    assert isinstance(health, m.Health)
-    assert health.counters["bad controller/command: foreign"] == 5
     seqs = [state.seq for state in ear.of(topics.PLANT_STATE)]
     assert seqs == sorted(set(seqs))
 
@@ -245,13 +342,20 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
     with Router(config), Bus(config, "controller", "controller-a") as bus:
         ear = Ear(bus)
         with Process("plant_sim.node", config) as process:
-            state = ear.until(lambda message: isinstance(message, m.PlantState))
-            assert isinstance(state, m.PlantState)
-            answer = command(0, high, [high] * 60, answers=state.seq, run_id=state.run_id, period=0.02)
+            failed = health_of("plant", status="failed")
             wait_for(lambda: bus.matched(topics.COMMAND))
-            bus.publish(topics.COMMAND, answer)
-            health = ear.until(health_of("plant", status="failed"))
-            assert isinstance(health, m.Health)
+            health, seq = None, 0
+            # Until it has had one in time: a command that answers an old state is refused.
+            while not isinstance(health, m.Health):
+                health = ear.until(lambda message: isinstance(message, m.PlantState) or failed(message))
+                if isinstance(health, m.PlantState):
+                    bus.publish(
+                        topics.COMMAND,
+                        command(
+                            seq, high, [high] * 60, answers=health.seq, run_id=health.run_id, period=0.02
+                        ),
+                    )
+                    seq += 1
             assert "pressure y" in health.note
             assert process.end() == 3
             assert "Traceback" not in process.said

@@ -64,6 +64,8 @@ def seeds() -> dict[str, list[bytes]]:
         plant.command(outputs.command, step * settings.period + 0.003)
         said(topics.PLANT_STATE, state)
         said(topics.COMMAND, outputs.command)
+        if (backup := core.backup(outputs.command)) is not None:
+            said(topics.BACKUP, backup)
         said(topics.TICK, tick)
         said(topics.RESULT, outputs.result)
         timing = m.TickTiming(

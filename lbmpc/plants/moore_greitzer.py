@@ -62,6 +62,8 @@ MOORE_GREITZER = Plant(
     W=np.array([0.06, 0.01, 2e-4, 2.2e-3]),
     x0=np.array([0.15, 1.2875, 1.1547, 0.0]),
     safe_input=np.array([R_E]),
+    # x_e is unstable under a constant throttle. Flow and pressure alone; stable from 10 to 1000 Hz.
+    safe_gain=np.array([[-2.8, 1.9, 0.0, 0.0]]),
     performance=(0, 1),
     kernel=("z", "y", "u"),
     poles=POLES,

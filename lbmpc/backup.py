@@ -1,0 +1,133 @@
+"""What the plant follows when its controller falls silent: an affine policy that keeps X by the learned model.
+
+The plan of (e:LBMPC) keeps the constraints of the *nominal* model, step after step only its first input is certified,
+and each new sample mends what h did. Followed blindly it is no more than a guess. So besides it there is a second
+problem, solved where there is time, with the same cost and the learned states in the place of the nominal ones:
+
+    min over v      |z_N|_P^2 + sum_i |z_i|_Q^2 + |v_i|_R^2
+    subject to      z_{i+1} = A z_i + B v_i + h_hat(z_i, v_i),
+                    v_i in U,   z_{i+1} in (1 - margin) X                                    i = 0 .. N-1
+
+from z_0, the state to which the command that was just given leads. Its solution is followed with feedback,
+
+    u_i = v_i + K (x_i - z_i),
+
+which takes no more than the plant's own sensors. Nothing of this is certified: h_hat is what was learned so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.bound import Bound
+from lbmpc.kernels import build_rows, build_sweep
+from lbmpc.least_distance import NO_ROWS, least_distance, violation
+from lbmpc.oracles.base import remembered
+from lbmpc.problem import Problem
+from lbmpc.rows import Rows
+from lbmpc.sets.bounds import state_set
+
+STEPS = 2
+"""Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
+
+
+RAMP = 4
+"""Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """u_i = inputs[i] + gain x, deviations, for N periods: inputs (N, m), gain (m, d)."""
+
+    inputs: np.ndarray
+    gain: np.ndarray
+    states: np.ndarray
+    """z_0 .. z_{N-1}, which it expects, (N, d)."""
+
+
+class BackupPlanner:
+    """Solves that problem, always with the same number of steps.
+
+    Args:
+        problem: what the controller solves; its cost, oracle, horizon and U are taken over.
+        margin: by how much X shrinks, as a share of its half-widths; room for what h_hat does not know.
+        realise: what turns a CasADi function into the one that is called.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        margin: float,
+        realise: Callable[[ca.Function], ca.Function] = lambda function: function,
+    ):
+        self.problem, self.margin = problem, margin
+        model, oracle, n = problem.model, problem.oracle, problem.horizon
+        plain = state_set(model)
+        inside = margin * 0.5 * (plain.upper - plain.lower)
+        shares = np.minimum(np.arange(1, n + 1) / RAMP, 1.0)
+        states = tuple(plain.minus(share * inside, share * inside) for share in shares)
+        self._rows = Rows(replace(problem, states=states, soft=True, guard=None))
+        self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
+        self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
+
+    def policy(self, s: np.ndarray, theta: np.ndarray, plan: np.ndarray) -> Policy | None:
+        """The policy from the predicted state s, (D,), on.
+
+        Args:
+            s: where the command that was just given leads, with its past where the oracle looks back.
+            theta: the oracle's parameters.
+            plan: the nominal plan from there on, (N, m).
+
+        Returns:
+            None when the numbers are unusable.
+        """
+        best, least = None, np.inf
+        v = self._rows.clip(np.asarray(plan, dtype=float))
+        with np.errstate(all="ignore"):
+            for step in range(STEPS + 1):
+                merit = self._linearise(s, theta, v)
+                if not np.isfinite(merit):
+                    break
+                if merit < least:
+                    best, least = (v, self._sweep.outputs["z"].T.copy()), merit
+                if step == STEPS or (target := self._subproblem(v.shape)) is None:
+                    break
+                v = target
+        return None if best is None else self._with_feedback(s, *best)
+
+    def _linearise(self, s: np.ndarray, theta: np.ndarray, v: np.ndarray) -> float:
+        """Linearise at v, (N, m); its cost, with the penalty of what leaves the rows."""
+        sweep, rows = self._sweep, self._rows
+        sweep.inputs["x"][:, 0] = s
+        sweep.inputs["theta"][:, 0] = theta
+        sweep.inputs["v"][:] = v.T
+        sweep()
+        values = rows.values(v.T, sweep.outputs["z"])
+        return float(sweep.outputs["cost"][0, 0]) + rows.penalty.cost(
+            violation(values, rows.lower, rows.upper)
+        )
+
+    def _subproblem(self, shape: tuple[int, ...]) -> np.ndarray | None:
+        """The minimiser of the linearised problem, (N, m)."""
+        rows, outputs = self._rows, self._sweep.outputs
+        values = rows.values(outputs["vs"], outputs["zs"])
+        if not np.isfinite(values).all():
+            return None
+        for name in "ABKL":
+            self._move.inputs[name][:] = outputs[name]
+        self._move()
+        slopes = self._move.outputs["M"].T
+        nearest = least_distance(values, rows.apply(slopes), rows.lower, rows.upper, rows.penalty, NO_ROWS)
+        if nearest is None:
+            return None
+        free = outputs["vs"].T
+        return rows.clip(free + (slopes[: free.size] @ nearest.w).reshape(shape))
+
+    def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray) -> Policy:
+        gain, d = self.problem.model.K, self.problem.model.d
+        states = np.vstack([s[:d], z[:-1]])
+        return Policy(v - states @ gain.T, gain, states)
