@@ -67,7 +67,8 @@ class Facts(msgspec.Struct, kw_only=True):
     control_after: float | None
     """From that moment until fresh commands drove the plant again; 0 when they never ceased; None: they never came."""
     burst: int
-    """Most commands that reached the plant within one period."""
+    """Most steps that the controllers began within one period, by their own stamps: a plant that was itself without a
+    core finds at once what was sent one by one."""
     foreign_commands: int
     """Commands that the plant took from anybody but a controller of this run."""
     foreign_states: int
@@ -167,7 +168,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         safe_s=sum(one.state.source == "safe" for one in after) * config.period,
         ready_after=None if back_at is None else back_at - fault_at,
         control_after=None if control_at is None else max(0.0, control_at - (back_at or fault_at)),
-        burst=_burst([one.at for one in commands], config.period),
+        burst=_burst(witness.messages(topics.TICK), config.period),
         foreign_commands=sum(one.verdict == "ok" and one.run_id not in controllers for one in commands),
         foreign_states=_foreign_states(witness, {one.state.run_id for one in sampled}),
         samples_made=made,
@@ -223,11 +224,14 @@ def _control_at(moving: list[Sampled], fault_at: float, back_at: float | None) -
     return fresh[0] if fresh else None
 
 
-def _burst(arrivals: list[float], period: float) -> int:
-    times = np.array(sorted(arrivals))
-    if not times.size:
-        return 0
-    return int((np.searchsorted(times, times + 0.9 * period) - np.arange(len(times))).max())
+def _burst(ticks: list[m.Tick], period: float) -> int:
+    most = 0
+    for run_id in {tick.run_id for tick in ticks}:
+        # Each run counts from its own beginning.
+        times = np.sort([tick.t + tick.lateness for tick in ticks if tick.run_id == run_id])
+        within = np.searchsorted(times, times + 0.9 * period) - np.arange(len(times))
+        most = max(most, int(within.max()))
+    return most
 
 
 def _runs_of(values: list[str]) -> list[str]:

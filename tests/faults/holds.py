@@ -48,8 +48,8 @@ def punctual(run: Facts, calm: Facts) -> str | None:
 
 
 def no_burst(run: Facts, calm: Facts) -> str | None:
-    """Two commands within a period at most: the one that was late, and the next."""
-    return f"{run.burst} commands within a period" if run.burst > 2 else None
+    """Two steps within a period at most: the one that was late, and the next."""
+    return f"{run.burst} steps of the controller within a period" if run.burst > 2 else None
 
 
 def plan_then_safe(run: Facts, calm: Facts) -> str | None:
