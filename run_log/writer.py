@@ -21,6 +21,7 @@ from node_runtime.config import Config, to_toml
 from node_runtime.health import versions as installed
 from node_runtime.inbox import Follower
 from protocol import codec, topics
+from protocol.codec import Head
 from protocol.messages import Message
 from protocol.topics import Topic
 from run_log.errors import LogError
@@ -134,18 +135,21 @@ class LogWriter:
         topic = topics.BY_NAME.get(name)
         view = self._views.get(name)
         shown: bytes | None = None
-        if topic is not None and view is not None:
+        # Of a message between two views only who wrote it and its number are looked at.
+        head: Message | Head | None = None
+        if log_time < self._next_view.get(name, 0):
+            head = codec.head_of(payload)
+        if head is None and topic is not None and view is not None:
             try:
-                message = message or codec.decode(topic, payload)
-                if log_time >= self._next_view.get(name, log_time):
-                    shown = view.render(message)
-                    if math.isfinite(topic.view_hz):
-                        self._next_view[name] = log_time + int(1e9 / topic.view_hz)
+                head = message = message or codec.decode(topic, payload)
+                shown = view.render(message)
+                if math.isfinite(topic.view_hz):
+                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
-        if message is not None and name in COUNTED:
-            self._count_lost(name, message, log_time)
-        sequence = max(message.seq, 0) & 0xFFFFFFFF if message is not None else 0
+        if head is not None and name in COUNTED:
+            self._count_lost(name, head, log_time)
+        sequence = max(head.seq, 0) & 0xFFFFFFFF if head is not None else 0
         self._mcap.add_message(channel, log_time, payload, log_time, sequence)
         if view is not None and shown is not None:
             self._mcap.add_message(self._view_channel(view), log_time, shown, log_time, sequence)
@@ -197,7 +201,7 @@ class LogWriter:
             self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
         return self._shown[name]
 
-    def _count_lost(self, name: str, message: Message, log_time: int) -> None:
+    def _count_lost(self, name: str, message: Message | Head, log_time: int) -> None:
         """Ticks whose messages were made and never came here: cut links, full queues, whatever it was.
 
         What is out of order, or of another run than the one that speaks, was sent again or by a stranger.
