@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import mul
 from typing import Literal
 
 import numpy as np
@@ -171,13 +172,14 @@ class PlantSim:
 
     def _applied(self, segments: list[_Segment]) -> list[float] | None:
         total = sum(segment.duration for segment in segments)
-        inputs = [segment.u for segment in segments if segment.u is not None]
+        # Lists of Python's numbers: in a fast loop numpy would take longer than the motion itself.
+        inputs = [segment.u.tolist() for segment in segments if segment.u is not None]
         if len(inputs) < len(segments) or not math.isclose(total, self.period, rel_tol=1e-6):
             return None
-        if all(np.array_equal(u, inputs[0]) for u in inputs):
-            return inputs[0].tolist()
-        durations = np.array([segment.duration for segment in segments])
-        return (durations @ np.array(inputs) / total).tolist()
+        if all(u == inputs[0] for u in inputs):
+            return inputs[0]
+        shares = [segment.duration / total for segment in segments]
+        return [sum(map(mul, shares, entries)) for entries in zip(*inputs, strict=True)]
 
 
 def _merged(segments: list[_Segment]) -> list[_Segment]:
@@ -189,7 +191,7 @@ def _merged(segments: list[_Segment]) -> list[_Segment]:
             last is not None
             and last.u is not None
             and segment.u is not None
-            and np.array_equal(last.u, segment.u)
+            and last.u.tolist() == segment.u.tolist()
         ):
             merged[-1] = _Segment(last.duration + segment.duration, last.u, segment.source)
         else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -170,15 +171,17 @@ class Truth:
         return dx.copy()
 
     def _check(self, x: np.ndarray) -> None:
+        values = x.tolist()
         for domain in self.plant.positive:
-            value = float(x[domain.state])
+            value = values[domain.state]
             if not value > 0.0:
                 raise PlantError(
                     f"{self.plant.name}: {domain.name} is {value:.6g} {domain.unit}; its equations hold for positive "
                     f"values only. The plant has left every state from which it can be controlled."
                 )
-        if not np.isfinite(x).all():
-            raise PlantError(f"{self.plant.name}: the state is not finite: {np.asarray(x).tolist()}")
+        # Numbers that are all finite have a finite sum.
+        if not isfinite(sum(values)):
+            raise PlantError(f"{self.plant.name}: the state is not finite: {values}")
 
 
 def _method() -> Any:
