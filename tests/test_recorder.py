@@ -143,7 +143,7 @@ def test_a_killed_recorder_leaves_what_was_said_before_its_last_flush(
             if stop.wait(0.005):
                 return
 
-    talker = threading.Thread(target=talk)
+    talker = threading.Thread(target=talk, daemon=True)
     with recorder(config) as process:
         recorded(plant, ear, process, config)
         talker.start()
