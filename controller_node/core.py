@@ -11,8 +11,9 @@ import math
 import platform
 import time
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib import metadata
 from typing import Literal
 
@@ -74,7 +75,12 @@ class Outputs:
     command: m.Command
     result: m.TickResult
     sample: m.Sample | None
-    output_weights: m.OutputWeights | None
+    _weights: Callable[[], m.OutputWeights] | None
+
+    @cached_property
+    def output_weights(self) -> m.OutputWeights | None:
+        """Made when they are asked for: a fast loop sends them at few of its ticks."""
+        return None if self._weights is None else self._weights()
 
 
 class ControllerCore:
@@ -311,7 +317,7 @@ class ControllerCore:
             h=label.h.tolist() if label else None,
             h_hat=label.h_hat.tolist() if label else None,
             prediction_error=_norm(label.h_hat - label.h) if label else None,
-            oracle_norms=np.sqrt((state["K"] * state["K"]).sum(axis=0)).tolist() if self._dnn else [],
+            oracle_norms=[_norm(column) for column in state["K"].T] if self._dnn else [],
             hidden_version=self._version(),
             hidden_sha256=self._hidden_hash,
             tick_crc32=zlib.crc32(encode(tick)),
@@ -330,15 +336,12 @@ class ControllerCore:
         x, u, h, past = label.x.tolist(), label.u.tolist(), label.h.tolist(), label.past.tolist()
         return m.Sample(tick.seq - 1, x, u, h, past)
 
-    def _weights(self, tick: m.Tick) -> m.OutputWeights | None:
+    def _weights(self, tick: m.Tick) -> Callable[[], m.OutputWeights] | None:
         if self._dnn is None:
             return None
-        return m.OutputWeights(
-            run_id=self.run_id,
-            seq=tick.seq,
-            hidden_version=self._version(NEWEST),
-            hidden_sha256=self._hidden_hash,
-            K=m.Array.of(self.state.oracle["K"]),
+        K, version, sha256 = self.state.oracle["K"], self._version(NEWEST), self._hidden_hash
+        return lambda: m.OutputWeights(
+            run_id=self.run_id, seq=tick.seq, hidden_version=version, hidden_sha256=sha256, K=m.Array.of(K)
         )
 
     def _version(self, which: int = IN_USE) -> int:
@@ -361,4 +364,4 @@ def _source(run_id: str) -> int:
 
 def _norm(vector: np.ndarray) -> float:
     """Euclidean; numpy's own takes ten times as long for so few numbers."""
-    return math.sqrt(vector @ vector)
+    return math.sqrt(vector.dot(vector))

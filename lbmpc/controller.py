@@ -8,6 +8,7 @@ in, then the problem is solved.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import Literal, Protocol
 
 import numpy as np
@@ -189,7 +190,7 @@ class Controller:
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        if seen.x is not None and not np.isfinite(seen.x).all():
+        if seen.x is not None and not isfinite(sum(seen.x.tolist())):
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
         rolled_back = ""
@@ -206,7 +207,7 @@ class Controller:
         )
         s = self._with_past(oracle, start) if start is not None else state.predicted
         x, u = s[: self.model.d], plan.v[0]
-        predicted = follow(s, u, self.model.A @ x + self.model.B @ u + self.oracle.estimate(oracle, x, u))
+        predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
         after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
         return after, StepResult(plan.v, mode, solution, label, verdict, rolled_back, delay, first)
 

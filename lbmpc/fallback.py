@@ -27,7 +27,7 @@ def empty_plan(horizon: int, m: int) -> Plan:
 
 def shift(plan: Plan, last: np.ndarray) -> Plan:
     """The plan one period later; `last` (m,) goes behind its end. Also the warm start of the next solve."""
-    return Plan(np.vstack([plan.v[1:], last[None]]), max(plan.left - 1, 0))
+    return Plan(np.concatenate([plan.v[1:], last[None]]), max(plan.left - 1, 0))
 
 
 def feedback(model: Model, x: np.ndarray) -> np.ndarray:

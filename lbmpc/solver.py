@@ -350,5 +350,6 @@ def _numbers(v: np.ndarray) -> np.ndarray:
 
 
 def _finite(values: np.ndarray) -> bool:
-    """Whether all are numbers: only then their sum is one, short of sums beyond 1e308."""
-    return isfinite(values.sum())
+    """Whether all are numbers, none of them beyond 1e150; then, and only then, their sum of squares is one."""
+    flat = values.ravel(order="K")
+    return isfinite(flat.dot(flat))
