@@ -28,7 +28,7 @@ STEPS = 80
 SHORT, LONG = 3.0, 6.0
 DELAY = 0.002
 """Seconds from a sample until its command acts."""
-MARGINS = (0.0, 0.005, 0.0125, 0.02)
+MARGINS = (0.0, 0.0025, 0.005, 0.0125)
 OUTSIDE = 1e-9
 
 
@@ -94,11 +94,7 @@ def _follow(
             depths.append(np.inf)
             continue
         depths.append(float(np.max(np.maximum(plant.x_min - x, x - plant.x_max) / half)))
-    whole = np.array(depths)
-    short = whole[: round(SHORT * config.rate)]
-    return Silence(
-        *(value for part in (short, whole) for value in (int((part > 1e-9).sum()), float(part.max())))
-    )
+    return Silence(max(depths[: round(SHORT * config.rate)]), max(depths))
 
 
 def table(found: dict[str, list[Silence]]) -> str:

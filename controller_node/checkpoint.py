@@ -1,8 +1,8 @@
 """The controller's memory in a local file, so that a controller that is started again knows what it had learned.
 
-Written in a thread of its own, about once a second and at an orderly end: a temporary file, fsync, rename, so that the
-file is whole at every moment. A file that is damaged, or that belongs to another controller, is named, kept aside and
-not used.
+Written in a thread of its own, soon at first, then about once a second, and at an orderly end: a temporary file, fsync,
+rename, so that the file is whole at every moment. A file that is damaged, or that belongs to another controller, is
+named, kept aside and not used.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from protocol import messages as m
 log = logging.getLogger(__name__)
 
 EVERY = 1.0
+"""Seconds between two files."""
+FIRST = 0.1
+"""Seconds to the first one, and by how much each further one takes longer: most is learned at the beginning."""
 """Seconds between two files."""
 MAGIC = b"tandem checkpoint 1\n"
 LARGEST = 256 * 1024 * 1024
@@ -169,7 +172,7 @@ class CheckpointWriter:
         outbox: whose newest samples are saved too.
         samples: how many of them.
         counts: figures of this writer's, kept up to date here.
-        every: seconds.
+        every: seconds between two files in the long run.
     """
 
     def __init__(
@@ -213,7 +216,8 @@ class CheckpointWriter:
         self._write()
 
     def _run(self) -> None:
-        while not self._end.wait(self._every):
+        pause = 0.0
+        while not self._end.wait(pause := min(self._every, pause + FIRST)):
             self.wanted = True
             self._offered.wait()
             # Cleared after the wait, never before it: the end, which is said once, must not be missed.

@@ -12,7 +12,8 @@ from z_0, the state to which the command that was just given leads. Its solution
 
     u_i = v_i + K (x_i - z_i),
 
-which takes no more than the plant's own sensors. Nothing of this is certified: h_hat is what was learned so far.
+which takes no more than the plant's own sensors. K is stiffer than the model's: what the plan does not know must not
+add up. Nothing of this is certified: h_hat is what was learned so far.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import solve_discrete_are
 
 from lbmpc.bound import Bound
 from lbmpc.kernels import build_rows, build_sweep
 from lbmpc.least_distance import NO_ROWS, least_distance, violation
+from lbmpc.model import Model
 from lbmpc.oracles.base import remembered
 from lbmpc.problem import Problem
 from lbmpc.rows import Rows
@@ -37,6 +40,9 @@ STEPS = 2
 
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
+
+STIFFNESS = 25.0
+"""Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +79,7 @@ class BackupPlanner:
         self._rows = Rows(replace(problem, states=states, soft=True, guard=None))
         self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
         self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
+        self._gain = tracking_gain(model)
 
     def policy(self, s: np.ndarray, theta: np.ndarray, plan: np.ndarray) -> Policy | None:
         """The policy from the predicted state s, (D,), on.
@@ -128,6 +135,23 @@ class BackupPlanner:
         return rows.clip(free + (slopes[: free.size] @ nearest.w).reshape(shape))
 
     def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray) -> Policy:
-        gain, d = self.problem.model.K, self.problem.model.d
+        gain, d = self._gain, self.problem.model.d
         states = np.vstack([s[:d], z[:-1]])
         return Policy(v - states @ gain.T, gain, states)
+
+
+def tracking_gain(model: Model) -> np.ndarray:
+    """K, (m, d), that holds the plant on a trajectory: an LQR with Bryson's weights, in units of the half-widths.
+
+    The model's own K where the Riccati equation has no solution for these weights.
+    """
+    plant = model.plant
+    weights = np.full(model.d, 1e-6)
+    weights[list(plant.performance)] = STIFFNESS
+    Q = np.diag(weights / (0.5 * (plant.x_max - plant.x_min)) ** 2)
+    R = np.diag(1.0 / (0.5 * (plant.u_max - plant.u_min)) ** 2)
+    try:
+        P = solve_discrete_are(model.A, model.B, Q, R)
+    except np.linalg.LinAlgError:
+        return model.K
+    return -np.linalg.solve(R + model.B.T @ P @ model.B, model.B.T @ P @ model.A)
