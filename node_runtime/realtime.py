@@ -9,7 +9,7 @@ import os
 import struct
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import threadpoolctl
 
@@ -17,8 +17,9 @@ from node_runtime.config import Config, ConfigError
 
 log = logging.getLogger(__name__)
 
-KEENEST = -20
-"""Linux's lowest niceness: nearly all of the time that nobody with a real-time priority takes."""
+READER_PRIORITY = 1
+"""SCHED_FIFO priority of what reads everything on the bus: below the loops, above all that is not real-time. A reader
+that gets no core fills its link, and then the router waits, with everybody's messages."""
 WAKE_LATENCY = "/dev/cpu_dma_latency"
 """Linux holds the wake-up latency, in microseconds, that was written here for as long as the file stays open."""
 
@@ -108,29 +109,7 @@ def said_of(core: int | None) -> str:
 
 
 @contextmanager
-def keen(wanted: bool = True) -> Iterator[None]:
-    """Give the calling thread, and all threads that it starts from here on, nearly all the time that the loops leave.
-
-    For what reads everything on the bus: a reader that gets no core fills its link, and then the router waits, with
-    everybody's messages. A real-time priority would be worse. Where such processes leave the others of a core less
-    than a twentieth of it, Linux takes that twentieth from the highest of them, in one piece of 50 ms a second.
-
-    Without the privilege nothing changes.
-    """
-    before = os.getpriority(os.PRIO_PROCESS, 0)
-    if wanted:
-        with suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, 0, KEENEST)
-    with one_blas_thread(), quick_handover(), collection_as_before():
-        try:
-            yield
-        finally:
-            with suppress(PermissionError):
-                os.setpriority(os.PRIO_PROCESS, 0, before)
-
-
-@contextmanager
-def punctual(priority: int, *, keep_awake: bool = False) -> Iterator[str]:
+def punctual(priority: int, *, keep_awake: bool = False, silent: bool = False) -> Iterator[str]:
     """Make the calling thread, and all threads it starts from here on, punctual.
 
     Enter it before the bus opens, whose threads inherit the priority. Without the privilege the loop runs at
@@ -139,9 +118,10 @@ def punctual(priority: int, *, keep_awake: bool = False) -> Iterator[str]:
     Args:
         priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduler alone.
         keep_awake: see `awake`.
+        silent: no warning; for a process beside others that warn.
     """
     before = (os.sched_getscheduler(0), os.sched_getparam(0))
-    note = _raise_priority(priority)
+    note = _raise_priority(priority, silent)
     with awake(keep_awake) as sleepy, one_blas_thread(), quick_handover(), collection_as_before():
         try:
             yield "; ".join(filter(None, (note, sleepy)))
@@ -150,14 +130,15 @@ def punctual(priority: int, *, keep_awake: bool = False) -> Iterator[str]:
                 os.sched_setscheduler(0, *before)
 
 
-def _raise_priority(priority: int) -> str:
+def _raise_priority(priority: int, silent: bool) -> str:
     if priority == 0:
         return ""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         note = f"no privilege for SCHED_FIFO priority {priority}; slots may be late beside other load"
-        log.warning(
+        log.log(
+            logging.DEBUG if silent else logging.WARNING,
             "%s. Grant it with CAP_SYS_NICE or an rtprio limit, or set realtime.priority = 0 to go without.",
             note,
         )

@@ -12,7 +12,7 @@ from node_runtime.bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config import Config, ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.realtime import GarbageCollection, keen
+from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from protocol import topics
 from run_log.errors import LogError
 from run_log.writer import LogWriter
@@ -38,7 +38,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     """
     with (
         stopped_by_signals(stop) as stopping,
-        keen(config.realtime.priority > 0),
+        punctual(min(READER_PRIORITY, config.realtime.priority), silent=True) as punctuality,
     ):
         try:
             plant = get_plant(config.plant.model)
@@ -54,7 +54,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                 mailbox = bus.everything()
                 # Only now, so that what it says of itself is in the log too.
                 info = run_info(config, "recorder", run_id, plant.units)
-                with HealthPublisher(bus, info, lambda: _counters(writer)) as health:
+                with HealthPublisher(bus, info, lambda: _counters(writer), punctuality) as health:
                     _record(config, writer, mailbox, health, stopping)
         except OpenInterrupted:
             pass

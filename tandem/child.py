@@ -40,7 +40,6 @@ def end_with(parent: int, grace_s: float = GRACE_S) -> None:
 def main() -> int:
     # The supervisor's own priority is not for all: each process takes what it needs.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.setpriority(os.PRIO_PROCESS, 0, max(0, os.getpriority(os.PRIO_PROCESS, 0)))
     end_with(int(sys.argv[1]))
     from tandem.cli import main as tandem
 

@@ -13,7 +13,7 @@ from rich.status import Status
 
 from controller_node.guarantee import guarantee
 from node_runtime.config import Config, to_toml
-from node_runtime.realtime import GarbageCollection, keen
+from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from run_log import report
 from run_log.errors import LogError
 from run_log.reader import read_run
@@ -69,7 +69,8 @@ def _supervise(
     config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console, trainer: bool
 ) -> tuple[str | None, bool]:
     """Why the run ended badly, or None; and whether its log is whole."""
-    with Screen(console, monitor.new_events) as screen, keen(config.realtime.priority > 0):
+    priority = min(READER_PRIORITY, config.realtime.priority)
+    with Screen(console, monitor.new_events) as screen, punctual(priority, silent=True):
         garbage = GarbageCollection()
         garbage.begin()
 

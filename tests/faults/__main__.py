@@ -26,7 +26,8 @@ from rich.progress import (
 
 from benchmarks.marks import DocumentError
 from node_runtime import machine
-from node_runtime.realtime import keen
+from node_runtime.config import RealtimeConfig
+from node_runtime.realtime import READER_PRIORITY, punctual
 
 from . import link, table
 from .faults import ALL, Fault, Stage
@@ -89,7 +90,7 @@ def main(settings: Suite) -> int:
         results = Results(settings.out / "results.jsonl")
         # Ended politely by whatever way: namespaces, mounts and processes must not stay behind.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with keen():
+        with punctual(min(READER_PRIORITY, RealtimeConfig().priority), silent=True):
             pairs = _measure(settings, chosen, results, console)
         text = table.markdown(pairs, chosen, _head(settings))
         sys.stdout.write(text + "\n")
