@@ -44,9 +44,9 @@ class Facts(msgspec.Struct, kw_only=True):
     """One run in figures. Seconds throughout; None where there is nothing of the kind."""
 
     violations: int
-    """Samples of the true plant outside X, or inputs outside U, by more than 1e-6."""
+    """Samples of the true plant outside X, or inputs outside U, by more than 1e-6, from the fault on."""
     deepest: float
-    """How far outside at most, as a share of the half-width of X or U."""
+    """How far outside at most, as a share of the half-width of X or U, from the fault on."""
     cost: float
     """Sum of squared deviations of the performance states over the run's first `samples`."""
     samples: int
@@ -138,13 +138,17 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     moving = sampled[next((i for i, one in enumerate(sampled) if one.state.source != "hold"), len(sampled)) :]
     if not moving:
         raise RigError("the plant never moved")
-    x = np.array([one.state.x for one in moving])
-    applied = np.array([one.state.applied or [np.nan] * plant.m for one in moving])
+    fault_at = rig.events[0][0] if rig.events else math.inf
+    after = [one for one in moving if one.state.t > fault_at]
+    # What a late command cost before the fault, the fault has not done.
+    judged = after or moving
+    x = np.array([one.state.x for one in judged])
+    applied = np.array([one.state.applied or [np.nan] * plant.m for one in judged])
     outside = (x < plant.x_min - TOLERANCE) | (x > plant.x_max + TOLERANCE)
     beyond = (applied < plant.u_min - TOLERANCE) | (applied > plant.u_max + TOLERANCE)
-    deviation = (x - plant.x_e)[:, list(plant.performance)][: round(seconds * config.rate)]
+    every = np.array([one.state.x for one in moving])
+    deviation = (every - plant.x_e)[:, list(plant.performance)][: round(seconds * config.rate)]
 
-    fault_at = rig.events[0][0] if rig.events else math.inf
     back_at = _back_at(rig, fault_at)
     control_at = _control_at(moving, fault_at, back_at)
     late, by_machine = _late(rig, witness, sampled, fault_at, control_at)
@@ -153,7 +157,6 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     commands = [one for one in traced if isinstance(one, Commanded) and one.at > moving[0].state.t]
     made, held = _samples(witness)
     log, replayed = _log(rig)
-    after = [one for one in moving if one.state.t > fault_at]
     return Facts(
         violations=int((outside.any(axis=1) | beyond.any(axis=1)).sum()),
         deepest=_deepest(x, applied, plant),

@@ -18,6 +18,7 @@ SAYS_SO = re.compile("NOT LOGGED|silent|ended")
 OBEYED = {
     "plant/state": "controller",
     "controller/command": "plant",
+    "controller/backup": "plant",
     "controller/samples": "trainer",
     "controller/output_weights": "trainer",
     "trainer/hidden_weights": "controller",
