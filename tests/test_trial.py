@@ -10,12 +10,12 @@ from science import compressor, describe
 
 from controller_node.build import describe_trial
 from controller_node.core import ControllerCore
-from experiments.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise
+from experiments.attacks import Forge, Known, crude, drift, elsewhere, follow_attacked, noise
 from experiments.lockstep import simulate
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import IN_USE, NEWEST
-from lbmpc.oracles.trial import Finding, Trial, empty, newest, remember
+from lbmpc.oracles.trial import TRIED, Finding, Trial, empty, had, newest, remember, tried
 from node_runtime.config import Config, ConfigError, load, override
 from protocol.network import hash_layers
 from run_log.replay import replay
@@ -89,6 +89,18 @@ def offer(oracle: DnnOracle, state: OracleState, layers: Layers, version: int) -
     return oracle.adopt(state, version, layers, hash_layers(layers), oracle.description.sha256())
 
 
+def nudged(hidden: Layers) -> Layers:
+    """As good, and not the same."""
+    return [layer * (1 + 1e-5) for layer in hidden]
+
+
+def assert_as_it_was(after: OracleState, state: OracleState) -> None:
+    """But for what it remembers of trials."""
+    assert after.keys() == state.keys()
+    for name in state.keys() - {"tried"}:
+        assert after[name] is state[name], name
+
+
 def test_nothing_can_be_tried_without_samples() -> None:
     state = learned(9)
     after, verdict = offer(ORACLE, state, ORACLE.hidden(state), 1)
@@ -104,8 +116,8 @@ def test_a_set_that_predicts_worse_is_refused_with_both_figures(architecture: st
     after, verdict = offer(oracle, state, [*hidden[:-1], -hidden[-1]], 1)
     assert verdict.startswith("refused: trial: error ")
     assert " against " in verdict
-    assert after is state
-    adopted, verdict = offer(oracle, state, [layer * (1 + 1e-5) for layer in hidden], 1)
+    assert_as_it_was(after, state)
+    adopted, verdict = offer(oracle, state, nudged(hidden), 1)
     assert verdict == "adopted"
     np.testing.assert_array_equal(adopted["K"], state["K"])
     assert list(adopted["version"]) == [1, 1]
@@ -139,12 +151,12 @@ def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> N
     # What comes next must be newer than what was rolled back.
     assert int(state["version"][NEWEST]) == 7
     assert offer(ORACLE, state, ORACLE.hidden(state), 7)[1] == "refused: version 7 is not newer than 7"
-    assert offer(ORACLE, state, ORACLE.hidden(state), 8)[1] == "adopted"
+    assert offer(ORACLE, state, nudged(ORACLE.hidden(state)), 8)[1] == "adopted"
 
 
 def test_a_set_that_holds_is_confirmed_and_the_one_before_is_forgotten() -> None:
     state = learned(60)
-    state, verdict = offer(ORACLE, state, ORACLE.hidden(state), 1)
+    state, verdict = offer(ORACLE, state, nudged(ORACLE.hidden(state)), 1)
     assert verdict == "adopted"
     for _ in range(TRIAL.window):
         assert state["watch"][0] == 1
@@ -152,6 +164,34 @@ def test_a_set_that_holds_is_confirmed_and_the_one_before_is_forgotten() -> None
         assert said == ""
     assert not state["watch"].any()
     assert not state["before.W1"].any()
+
+
+def test_a_set_that_was_there_before_is_refused_under_any_version() -> None:
+    """At first, adopted and replaced, refused, rolled back: whoever sends it again sends something stale."""
+    state = learned(60)
+    first = ORACLE.hidden(state)
+    second, third = nudged(first), nudged(nudged(first))
+    worse = [*first[:-1], -first[-1]]
+    for version, layers in ((1, second), (2, third)):
+        state, verdict = offer(ORACLE, state, layers, version)
+        assert verdict == "adopted"
+    state, verdict = offer(ORACLE, state, worse, 3)
+    assert verdict.startswith("refused: trial: ")
+    for layers in (first, second, third, worse):
+        after, verdict = offer(ORACLE, state, layers, 9)
+        assert verdict.startswith("refused: stale: ")
+        assert after is state
+    assert offer(ORACLE, state, nudged(third), 9)[1] == "adopted"
+
+
+def test_the_memory_of_trials_has_an_end() -> None:
+    state = learned(60)
+    old = ORACLE.hidden(state)
+    for _ in range(TRIED):
+        assert tried(state, hash_layers(old))
+        state = {**state, **had(state, f"{len(state):064x}")}
+    assert not tried(state, hash_layers(old))
+    assert len(state["tried"]) == TRIED
 
 
 def test_a_version_near_the_end_of_all_numbers_does_not_shut_out_everybody_else() -> None:
@@ -214,6 +254,21 @@ def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe_betwee
     assert not replay(run, None, ["adaptation.trial.floor=0.0"]).equal
 
 
+def test_stale_sets_under_new_versions_are_refused_in_a_replay_from_a_keyframe_too() -> None:
+    heard: list[Layers] = []
+
+    def stale(known: Known, _rng: np.random.Generator) -> Layers:
+        heard.append(known.good)
+        return heard[0]
+
+    run = follow_attacked(override(Config(), SMALL), 100, stale, 3)
+    refused = [r.seq for r in run.results if r.weights_verdict.startswith("refused: stale")]
+    assert len(refused) == sum(
+        bool(tick.weights and tick.weights.run_id == "stolen") for tick in run.ticks[11:]
+    )
+    assert replay(run, from_tick=refused[-1]).equal
+
+
 def test_after_a_rollback_the_newest_version_and_the_hash_in_use_are_told() -> None:
     run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = next(result for result in run.results if result.weights_rolled_back)
@@ -231,6 +286,7 @@ def test_a_keyframe_carries_the_trial() -> None:
         "oracle.recent",
         "oracle.seen",
         "oracle.watch",
+        "oracle.tried",
         "oracle.before.K",
         "oracle.before.W1",
     } <= arrays.keys()

@@ -7,6 +7,9 @@ predict the samples that came since worse than the network that it replaced.
     worse:   mean |h_hat_new - h|^2  >  max((1 + margin) mean |h_hat_old - h|^2, floor^2)
 
 in units of the network's output scale. Below the floor both are as good as perfect, and rounding decides nothing.
+
+A set has one trial: the hashes of the last sets that had theirs, or were there at first, are remembered, and one that
+comes again under another version is refused.
 """
 
 from __future__ import annotations
@@ -18,6 +21,10 @@ import numpy as np
 State = dict[str, np.ndarray]
 CHECKS = 4
 """How often an adopted set is judged before it is confirmed."""
+TRIED = 128
+"""Sets whose hashes are remembered: of a minute or so, with a trainer that sends two a second."""
+HASH_DIGITS = 15
+"""Of a sha256, in hexadecimal: what an int64 can hold."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,28 @@ class Finding:
 
     def __str__(self) -> str:
         return f"error {self.new**0.5:.3g} against {self.old**0.5:.3g} (RMS of {self.samples} samples, output scale)"
+
+
+# -- the ring of hashes, -1 where there is none yet ------------------------------------------------------------------
+
+
+def only(sha256: str) -> State:
+    """One set was there from the beginning."""
+    return {"tried": np.array([_number(sha256)] + [-1] * (TRIED - 1), dtype=np.int64)}
+
+
+def tried(state: State, sha256: str) -> bool:
+    """Whether a set with this hash had its trial already."""
+    return _number(sha256) in state["tried"].tolist()
+
+
+def had(state: State, sha256: str) -> State:
+    """What a trial changes: this set had one. The newest is the first."""
+    return {"tried": np.concatenate([[_number(sha256)], state["tried"][:-1]])}
+
+
+def _number(sha256: str) -> int:
+    return int(sha256[:HASH_DIGITS], 16)
 
 
 # -- the ring of samples: rows (window of pairs, h / scale) ----------------------------------------------------------
