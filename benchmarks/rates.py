@@ -4,8 +4,9 @@
 
 For each rate and solver mode `tandem run` goes on for a while, with its trainer, recorder and live view. Beside it runs
 the empty loop of `benchmarks.wakeups`, one priority above: nothing of Tandem delays it, so what is late there is late
-because of the machine. Late is what the configuration calls late: begun later than a fifth of a period after its slot,
-or ended after its period; a slot that was skipped counts too.
+because of the machine; and so is, most likely, a tick that was late at the same moment. Late is what the configuration
+calls late: begun later than a fifth of a period after its slot, or ended after its period; a slot that was skipped
+counts too.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 from node_runtime.choices import SolverMode
 from node_runtime.config import Config
+from protocol import topics
 from run_log.errors import LogError
-from run_log.reader import read_run
+from run_log.reader import Run, read_run
 from run_log.summary import Spread, summarise
 
 MARKS = Marks.of("rates", "python -m benchmarks.rates")
@@ -39,6 +42,8 @@ COLUMNS = (
     "late",
     "skipped",
     "empty loop on time, %",
+    "late ones beside its misses, %",
+    "others, %",
     "tick p50 / p99, ms",
     "solve p50 / p99, ms",
     "constraint violations",
@@ -125,6 +130,7 @@ def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
         str(found.late_ticks),
         str(found.skipped_slots),
         "" if empty is None else f"{100.0 - empty['off_percent']:.2f}",
+        *(["", ""] if empty is None else _beside_misses(ran, empty)),
         _spread(found.tick_ms),
         _spread(found.solve_ms),
         str(found.constraint_violations),
@@ -144,6 +150,29 @@ def _beside(rate: int, seconds: float, running: subprocess.Popen[str]) -> dict[s
     done = subprocess.run([sys.executable, *module, *priority], capture_output=True, text=True, check=False)
     found: dict[str, Any] | None = json.loads(done.stdout) if done.returncode == 0 else None
     return found
+
+
+def _beside_misses(run: Run, empty: dict[str, Any]) -> list[str]:
+    """Of the ticks that were late or came after skipped slots, and of all others: how many percent lie beside a miss.
+
+    Beside: within a period of a moment at which the empty loop should have run and did not.
+    """
+    timing = {timing.seq: timing.tick_ms * 1e-3 for timing in run.timings}
+    entries, period = run.entries(topics.TICK), run.config.period
+    # The slots' own clock against that of the log; the message that took least from the one to the other says it best.
+    to_unix = min(
+        entry.log_time * 1e-9 - entry.message.t - timing.get(entry.message.seq, 0.0) for entry in entries
+    )
+    missed = np.array(empty["missed"]).reshape(-1, 2)
+    shares: dict[bool, list[bool]] = {True: [], False: []}
+    for tick in run.ticks:
+        slot = tick.t + to_unix
+        if not empty["span"][0] <= slot <= empty["span"][1]:
+            continue
+        begin, over = slot - tick.skipped * period, slot + tick.lateness + timing.get(tick.seq, 0.0)
+        off = tick.late or tick.skipped > 0 or over > slot + period
+        shares[off].append(bool(((missed[:, 0] < over + period) & (missed[:, 1] > begin - period)).any()))
+    return [f"{100.0 * np.mean(share):.1f}" if share else "" for share in (shares[True], shares[False])]
 
 
 def _replayed(log: Path) -> str:

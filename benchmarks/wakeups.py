@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import tyro
@@ -38,10 +40,15 @@ class Wakeups:
     """As `realtime.awake` in the configuration."""
 
 
-def measure(settings: Wakeups) -> dict[str, float | int]:
-    """Late and skipped slots in percent of all, and lateness in ms."""
+def measure(settings: Wakeups) -> dict[str, Any]:
+    """Late and skipped slots in percent of all, lateness in ms, and between which moments there was none on time.
+
+    The moments of `span` and `missed` are in seconds of Unix time.
+    """
     period = 1.0 / settings.rate
     lateness: list[float] = []
+    missed_at: list[tuple[float, float]] = []
+    to_unix = time.time() - clock.now()
     config = Config(
         rate=settings.rate, realtime=RealtimeConfig(priority=settings.priority, awake=settings.awake)
     )
@@ -50,7 +57,11 @@ def measure(settings: Wakeups) -> dict[str, float | int]:
         for _ in range(round(settings.seconds * settings.rate)):
             turn = pacer.next()
             assert turn is not None  # nobody tells it to stop
-            lateness.append(turn[1])
+            slot, late_by = turn
+            lateness.append(late_by)
+            if late_by > settings.late_fraction * period or slot.skipped:
+                missed_at.append((slot.time - slot.skipped * period, slot.time + late_by))
+        end = clock.now()
     late, skipped = np.array(lateness), pacer.grid.skipped
     missed = int((late > settings.late_fraction * period).sum()) + skipped
     p50, p99 = np.percentile(late * 1e3, [50, 99])
@@ -60,6 +71,8 @@ def measure(settings: Wakeups) -> dict[str, float | int]:
         "p50_ms": round(float(p50), 3),
         "p99_ms": round(float(p99), 3),
         "max_ms": round(float(late.max()) * 1e3, 3),
+        "span": [end - settings.seconds + to_unix, end + to_unix],
+        "missed": [[begin + to_unix, over + to_unix] for begin, over in missed_at],
     }
 
 
