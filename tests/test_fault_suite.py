@@ -57,6 +57,8 @@ CALM = Facts(
     replay="exact",
     forged_adopted=0,
     rolled_back=0,
+    errors=[1e-3] * 20 + [1e-4] * 20,
+    fault_tick=20,
     view_at_end="recorder running writing run.mcap",
     log_time_off=0.0,
     verdicts={},
@@ -95,7 +97,14 @@ def seen(**changes: Any) -> Facts:
             {"extra": {"sent plant/state": 2}, "counted": {"controller bad plant/state: x": 1}},
         ),
         (holds.all_counted, {"counted": {"plant bad controller/command: foreign": 1}}),
-        (holds.weights_refused, {"extra": {"sent trainer/hidden_weights": 3}, "forged_adopted": 1}),
+        (
+            holds.weights_refused,
+            {
+                "extra": {"sent trainer/hidden_weights": 3},
+                "forged_adopted": 1,
+                "errors": [1e-3] * 20 + [2e-4] * 20,
+            },
+        ),
         (holds.weights_refused, {}),
         (holds.refused_on_both_sides, {}),
         (holds.refused_on_both_sides, {"extra": {"tries": 2, "refused": 1, "said: no": 1}}),
@@ -118,6 +127,8 @@ def test_every_check_can_hold() -> None:
         late_by_machine=2,
         readable_gap=0.4,
         sources=["command", "plan", "safe", "command"],
+        forged_adopted=1,
+        errors=[9.0] * 20 + [1.2e-4] * 20,
         extra={
             "sent plant/state": 3,
             "sent trainer/hidden_weights": 2,

@@ -57,6 +57,7 @@ class Facts(msgspec.Struct, kw_only=True):
     late_by_machine: int
     """Of these, how many while an empty loop above everything was late too."""
     tick_p99_ms: float | None
+    """Of the ticks during which the machine itself did not stand still."""
     sources: list[str]
     """What drove the plant after the fault, one after the other."""
     plan_s: float
@@ -86,6 +87,10 @@ class Facts(msgspec.Struct, kw_only=True):
     forged_adopted: int
     """Sets of hidden weights of the attacker that were adopted."""
     rolled_back: int
+    errors: list[float]
+    """|h_hat - h| of each labelled tick of the first controller, in order; 0 for a tick without a label."""
+    fault_tick: int
+    """How many of these came before the fault."""
     view_at_end: str
     """What the live view's line about the recorder says when the run ends."""
     log_time_off: float | None
@@ -152,7 +157,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     back_at = _back_at(rig, fault_at)
     control_at = _control_at(moving, fault_at, back_at)
     late, by_machine = _late(rig, witness, sampled, fault_at, control_at)
-    timings, results = witness.messages(topics.TIMING), witness.messages(topics.RESULT)
+    results = witness.messages(topics.RESULT)
     controllers = {result.run_id for result in results}
     commands = [one for one in traced if isinstance(one, Commanded) and one.at > moving[0].state.t]
     made, held = _samples(witness)
@@ -165,7 +170,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         ticks=len(results),
         late=late,
         late_by_machine=by_machine,
-        tick_p99_ms=float(np.percentile([t.tick_ms for t in timings], 99)) if timings else None,
+        tick_p99_ms=_tick_p99(rig, witness),
         sources=_runs_of([one.state.source for one in after]),
         plan_s=sum(one.state.source == "plan" for one in after) * config.period,
         safe_s=sum(one.state.source == "safe" for one in after) * config.period,
@@ -181,6 +186,8 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         replay=replayed,
         forged_adopted=_forged_adopted(witness),
         rolled_back=sum(bool(r.weights_rolled_back) for r in results),
+        errors=[r.prediction_error or 0.0 for r in results if r.run_id == results[0].run_id],
+        fault_tick=sum(at < fault_at for at, _ in witness.of(topics.RESULT)),
         view_at_end=_view(rig),
         log_time_off=_log_time_off(log),
         verdicts=dict(Counter(_short(r.weights_verdict) for r in results if r.weights_verdict != "none")),
@@ -272,6 +279,20 @@ def _late(
             intervals += [(begin, end)] * max(1, tick.skipped)
     excused = sum(stalls.during(noted, begin, end) for begin, end in intervals)
     return len(intervals), excused
+
+
+def _tick_p99(rig: Rig, witness: Witness) -> float | None:
+    noted = stalls.read(rig.folder / "stalls.txt")
+    timing = {(t.run_id, t.seq): t for t in witness.messages(topics.TIMING)}
+    found = []
+    for tick in witness.messages(topics.TICK):
+        cost = timing.get((tick.run_id, tick.seq))
+        if cost is None or tick.state is None:
+            continue
+        begin = tick.state.t
+        if not stalls.during(noted, begin, begin + tick.lateness + cost.tick_ms * 1e-3 + 0.002):
+            found.append(cost.tick_ms)
+    return float(np.percentile(found, 99)) if found else None
 
 
 # -- learning -------------------------------------------------------------

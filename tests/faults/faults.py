@@ -158,6 +158,7 @@ def _attack_row(kind: str) -> Fault:
         holds.as_fast,
         holds.control_kept,
         holds.as_good,
+        holds.replays,
     )
     return Fault(
         f"{ATTACK_RATE:g} messages/s: {kind}", "messages", inflict, checks, span=ATTACK_S + 1.5, after=2.0

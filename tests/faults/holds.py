@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
@@ -14,6 +15,8 @@ CONTROL_BACK_S = 1.0
 READABLE_S = 0.6
 """Half a second between flushes, a state every 50 ms, and the time a flush takes."""
 COST_SHARE = 0.05
+PREDICTS_SHARE, PREDICTS_FLOOR = 1.5, 3e-5
+"""Two runs without an attack differ too. The floor is that of the trial: 0.003 of the output scale."""
 SAYS_SO = re.compile("NOT LOGGED|silent|ended")
 OBEYED = {
     "plant/state": "controller",
@@ -134,12 +137,26 @@ def refused_on_both_sides(run: Facts, calm: Facts) -> str | None:
 
 
 def weights_refused(run: Facts, calm: Facts) -> str | None:
-    """Whatever was forged was refused, or rolled back soon after."""
+    """Whatever was forged was refused, or rolled back soon after, or predicts as well as what the trainer sends.
+
+    The trial lets in what predicts the controller's own samples no worse. So what is in force after that must predict
+    what comes no worse than without the attack.
+    """
     if not run.extra.get("sent trainer/hidden_weights"):
         return "nothing was forged"
-    if run.forged_adopted > run.rolled_back:
-        return f"{run.forged_adopted} forged sets adopted, {run.rolled_back} rolled back"
+    if run.forged_adopted <= run.rolled_back:
+        return None
+    error, without = (_rms(one.errors[run.fault_tick :]) for one in (run, calm))
+    if error > PREDICTS_SHARE * without + PREDICTS_FLOOR:
+        return (
+            f"{run.forged_adopted} forged sets adopted, {run.rolled_back} rolled back; error of the prediction "
+            f"{error:.2g}, {without:.2g} without"
+        )
     return None
+
+
+def _rms(errors: list[float]) -> float:
+    return math.sqrt(sum(error * error for error in errors) / max(1, len(errors)))
 
 
 def whole(run: Facts, calm: Facts) -> str | None:
