@@ -213,8 +213,17 @@ def _serve(
     def weights(sample: zenoh.Sample) -> None:
         arrived.append((str(sample.key_expr).split("/")[1], sample.payload.to_bytes(), time.monotonic()))
 
+    def outbox(query: zenoh.Query) -> None:
+        """What was said before the trainer came is not kept."""
+        with query:
+            controller = controllers.get(str(query.key_expr).split("/")[1])
+            if controller is not None:
+                none = m.Samples(run_id=controller.run_id, seq=max(controller.seq, 0), samples=[])
+                query.reply(query.key_expr, codec.encode(none))
+
     direct = zenoh.handlers.Callback
     return [
+        session.declare_queryable(f"{topics.PREFIX}/*/{topics.OUTBOX_QUERY}", direct(outbox, indirect=False)),
         session.declare_queryable(f"{topics.PREFIX}/*/{topics.HIDDEN_QUERY}", direct(hidden, indirect=False)),
         session.declare_subscriber(topics.HIDDEN_WEIGHTS.key("*"), direct(weights, indirect=False)),
     ]

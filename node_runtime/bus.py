@@ -197,20 +197,26 @@ class Bus:
             return
         self._outgoing_count += 1
         self._outgoing_bytes += size
+        self._post(topic, payload)
+
+    def _post(self, topic: Topic, payload: Payload) -> None:
+        """Leave a message to the thread that sends bulk."""
         self._outgoing.put((topic, payload))
 
     def _send_bulk(self) -> None:
         while (item := self._outgoing.get()) is not None:
-            topic, payload = item
-            size = len(payload) if isinstance(payload, bytes) else size_of(payload)
-            # Put together, and cut in pieces, here, where nobody waits for it.
-            whole = payload if isinstance(payload, bytes) else self._gathering.encode(payload)
-            for part in split(whole, self.run_id, next(self._in_pieces)):
-                self._put(topic, part)
-            with self._idle:
-                self._outgoing_count -= 1
-                self._outgoing_bytes -= size
-                self._idle.notify_all()
+            self._send_one(*item)
+
+    def _send_one(self, topic: Topic, payload: Payload) -> None:
+        size = len(payload) if isinstance(payload, bytes) else size_of(payload)
+        # Put together, and cut in pieces, here, where nobody waits for it.
+        whole = payload if isinstance(payload, bytes) else self._gathering.encode(payload)
+        for part in split(whole, self.run_id, next(self._in_pieces)):
+            self._put(topic, part)
+        with self._idle:
+            self._outgoing_count -= 1
+            self._outgoing_bytes -= size
+            self._idle.notify_all()
 
     def _publisher(self, topic: Topic) -> zenoh.Publisher:
         publisher = self._publishers.get(topic.name)

@@ -6,6 +6,7 @@ import platform
 import threading
 import time
 from collections.abc import Callable
+from functools import cache
 from importlib import metadata
 from types import TracebackType
 
@@ -19,11 +20,19 @@ from protocol.messages import Health, ProcessStatus, RunInfo
 
 HEALTH_PERIOD = 0.5
 RUN_INFO_EVERY = 10
+BEATS = 200.0
+"""A second, at most, of all the publishers of one `Heart` together."""
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh", "torch", "mcap")
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of those of our packages that are installed here."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    # Each takes milliseconds to read, and a trainer of many plants has one `RunInfo` for each.
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -47,8 +56,54 @@ def run_info(config: Config, process: str, run_id: str, units: dict[str, str] | 
     )
 
 
+class Heart:
+    """One thread that lets many publishers speak, one after the other; a context manager.
+
+    Each comes twice a second, or, where there are more than a hundred, as often as `BEATS` allows.
+    """
+
+    def __init__(self) -> None:
+        self._publishers: list[HealthPublisher] = []
+        self._lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+
+    def add(self, publisher: HealthPublisher) -> None:
+        """From now on `publisher` speaks."""
+        with self._lock:
+            self._publishers.append(publisher)
+
+    def remove(self, publisher: HealthPublisher) -> None:
+        """From now on it does not."""
+        with self._lock:
+            self._publishers.remove(publisher)
+
+    def __enter__(self) -> Heart:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        turn = 0
+        while True:
+            with self._lock:
+                among = len(self._publishers)
+                publisher = self._publishers[turn % among] if among else None
+                turn += 1
+                if publisher is not None:
+                    # With the lock held, so that none speaks after it was removed.
+                    publisher.beat()
+            if self._end.wait(max(HEALTH_PERIOD / max(1, among), 1.0 / BEATS)):
+                return
+
+
 class HealthPublisher:
-    """A context manager with a small thread of its own. Any thread may call `set`."""
+    """A context manager with a small thread of its own, or a place at a `Heart`. Any thread may call `set`."""
 
     def __init__(
         self,
@@ -56,8 +111,13 @@ class HealthPublisher:
         info: RunInfo,
         counters: Callable[[], dict[str, int]] | None = None,
         note: str = "",
+        heart: Heart | None = None,
     ):
-        """`counters`: the process's own figures, added to the bus's. `note`: stands before all others."""
+        """`counters`: the process's own figures, added to the bus's. `note`: stands before all others.
+
+        heart: whose thread speaks; None: one of its own.
+        """
+        self._heart = heart
         self._bus = bus
         self._info = info
         self._counters = counters
@@ -95,25 +155,35 @@ class HealthPublisher:
             # Inside the lock, so that the order on the wire is the order of seq.
             self._bus.publish(topics.HEALTH[self._bus.process], health)
 
+    def beat(self) -> None:
+        """Say how this process is, and now and then what it is."""
+        if self._turns % RUN_INFO_EVERY == 0:
+            info = msgspec.structs.replace(self._info, seq=self._turns // RUN_INFO_EVERY)
+            self._bus.publish(topics.RUN_INFO[self._bus.process], info)
+        self._turns += 1
+        self.publish()
+
     def _run(self) -> None:
         while True:
-            if self._turns % RUN_INFO_EVERY == 0:
-                info = msgspec.structs.replace(self._info, seq=self._turns // RUN_INFO_EVERY)
-                self._bus.publish(topics.RUN_INFO[self._bus.process], info)
-            self._turns += 1
-            self.publish()
+            self.beat()
             if self._end.wait(HEALTH_PERIOD):
                 return
 
     def __enter__(self) -> HealthPublisher:
-        self._thread.start()
+        if self._heart is None:
+            self._thread.start()
+        else:
+            self._heart.add(self)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end.set()
-        self._thread.join()
+        if self._heart is None:
+            self._end.set()
+            self._thread.join()
+        else:
+            self._heart.remove(self)
         if error is not None and kind is not KeyboardInterrupt:
             self.set("failed", f"{type(error).__name__}: {error}")
         elif self._status != "failed":

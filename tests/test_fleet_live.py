@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import msgspec
 import pytest
@@ -50,3 +51,21 @@ def test_two_plants_get_weights_each_and_a_stranger_gets_none(
         pump.tick()
         assert not pump.adopted
     assert "no plant matches 'jet*' yet" in caplog.text
+
+
+def test_many_plants_have_no_thread_each(fleet: Config) -> None:
+    """Between the second plant and the sixth, the trainer starts none but those that wait for answers."""
+    with ExitStack() as stack:
+
+        def comes(name: str) -> None:
+            plant = stack.enter_context(Controller(named(fleet, name), name))
+            plant.until(lambda h: h.counters.get("joined", 0) >= 1, tick=True)
+
+        comes("jet1")
+        comes("jet2")
+        trainers = {thread.name for thread in threading.enumerate()}
+        for k in range(3, 7):
+            comes(f"jet{k}")
+        more = {thread.name for thread in threading.enumerate()} - trainers
+        assert not [name for name in more if "health" in name or "jet" in name]
+        assert [thread.name for thread in threading.enumerate()].count("health") == 1

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 import zenoh
@@ -15,7 +16,7 @@ from live import HANG_S, Ear, health_of, live_config
 from node_runtime import clock
 from node_runtime.bus import Bus, session_config
 from node_runtime.config import Config
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher, Heart, run_info
 from node_runtime.router import Router
 from protocol import topics
 from protocol.messages import ProcessStatus
@@ -103,3 +104,33 @@ def test_it_loads_nothing_heavy() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
     )
     assert ran.stdout.strip() == "[]"
+
+
+def test_one_heart_lets_many_speak_until_they_leave(config: Config) -> None:
+    with Bus(config, "recorder", "recorder-1") as other, Heart() as heart, ExitStack() as stack:
+        ear = Ear(other)
+        before = threading.active_count()
+        buses = [stack.enter_context(Bus(config, "plant", f"plant-{k}")) for k in range(3)]
+        of_buses = threading.active_count() - before
+        said = [
+            stack.enter_context(HealthPublisher(bus, run_info(config, "plant", bus.run_id), heart=heart))
+            for bus in buses
+        ]
+        assert threading.active_count() - before == of_buses
+        said[1].set("running", "well")
+        runs = {bus.run_id for bus in buses}
+
+        def spoke(at_least: int, among: set[str]) -> bool:
+            """Each says what it is, and how it is more than once."""
+            infos = {message.run_id for message in ear.of(topics.RUN_INFO["plant"])}
+            healths = [(message.run_id, message.seq) for message in ear.of(topics.HEALTH["plant"])]
+            return among <= infos and all((run, at_least) in healths for run in among)
+
+        ear.until(lambda _message: spoke(2, runs))
+        said[2].__exit__(None, None, None)
+        gone = said[2]._seq
+        ear.until(lambda _message: spoke(6, runs - {"plant-2"}))
+        assert gone == said[2]._seq
+        last = [message for message in ear.of(topics.HEALTH["plant"]) if message.run_id == "plant-2"][-1]
+        assert last.status == "stopping"
+        heart.add(said[2])

@@ -221,3 +221,31 @@ def test_what_is_remembered_of_sequence_numbers_is_bounded() -> None:
     for run in ("b", "c"):
         assert seen.add(run, 0)
     assert seen.last("a") == -1
+
+
+@pytest.mark.parametrize("strategy", ["fifo", "reservoir", "novelty"])
+def test_batches_leave_what_one_sample_after_the_other_leaves(strategy: Strategy) -> None:
+    rng = np.random.default_rng(8)
+    one, many = (ReplayBuffer(20, strategy, 3, [1.0, 2.0, 0.5]) for _ in range(2))
+    seq = 0
+    # Batches that fill it, that wrap, that are longer than it is, with some samples met before.
+    for size in (1, 7, 11, 4, 30, 0, 45, 20, 3):
+        seqs = [max(0, seq + k - 2) for k in range(size)]
+        seq += size
+        windows, h = rng.normal(size=(size, 3)), rng.normal(size=(size, 2))
+        new = sum(one.add("a", s, w[:2], w[2:], label) for s, w, label in zip(seqs, windows, h, strict=True))
+        assert many.add_batch("a", seqs, windows, h) == new
+        for left, right in zip(one.contents(), many.contents(), strict=True):
+            assert left.tobytes() == right.tobytes()
+        assert (one.offered, one.last("a")) == (many.offered, many.last("a"))
+
+
+def test_a_bad_sample_keeps_its_whole_batch_out() -> None:
+    buffer = ReplayBuffer(20, "fifo", 3, [1.0, 2.0, 0.5])
+    windows, h = np.zeros((3, 3)), np.zeros((3, 2))
+    windows[1, 1] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        buffer.add_batch("a", [0, 1, 2], windows, h)
+    with pytest.raises(ValueError, match="expected 3"):
+        buffer.add_batch("a", [0, 1, 2], windows[:, :2], h)
+    assert (len(buffer), buffer.last("a")) == (0, -1)

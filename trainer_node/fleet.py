@@ -21,7 +21,7 @@ import zenoh
 
 from node_runtime import clock
 from node_runtime.config import Config
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher, Heart, run_info
 from node_runtime.lifecycle import new_run_id
 from protocol import topics
 from trainer_node.node import NAMES, POLL, SHARE, TrainerNode, train_round
@@ -35,6 +35,8 @@ MOST = 1024
 """Plants followed at once: a stranger who invents names must not fill the memory."""
 ASKERS = 16
 """Plants that may be asked at once; one that does not answer keeps its place for two seconds."""
+AT_ONCE = 16
+"""Plants taken in between two looks at what has arrived."""
 SAY_EVERY = 30.0
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
 NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
@@ -80,6 +82,7 @@ class Fleet:
         self._heard = Heard(plants)
         self._nodes: dict[str, tuple[TrainerNode, ExitStack]] = {}
         self._pool = ThreadPoolExecutor(ASKERS, "ask")
+        self._heart = Heart()
         self._train_at = 0.0
         self._say_at = 0.0
 
@@ -91,15 +94,16 @@ class Fleet:
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
         subscribers = [] if self._named else [self._listen(topic.key("*")) for topic in FOUND_BY]
-        try:
-            while not stop.wait(POLL):
-                self.turn(clock.now())
-        finally:
-            for subscriber in subscribers:
-                subscriber.undeclare()
-            for name in self.plants:
-                self._drop(name)
-            self._pool.shutdown(cancel_futures=True)
+        with self._heart:
+            try:
+                while not stop.wait(POLL):
+                    self.turn(clock.now())
+            finally:
+                for subscriber in subscribers:
+                    subscriber.undeclare()
+                for name in self.plants:
+                    self._drop(name)
+                self._pool.shutdown(cancel_futures=True)
 
     def turn(self, now: float) -> None:
         """Who is there, what has arrived for each, and a round of training when it is time."""
@@ -117,9 +121,9 @@ class Fleet:
         for name in set(self._nodes) - set(present):
             log.info("%s has been silent for %.0f s; dropped until it comes back", name, SILENT)
             self._drop(name)
-        for name in present:
-            if name not in self._nodes:
-                self._take_in(name)
+        # A few at a time: those that are here must not wait for all that come.
+        for name in [name for name in present if name not in self._nodes][:AT_ONCE]:
+            self._take_in(name)
         if not present and now >= self._say_at:
             self._say_at = now + SAY_EVERY
             log.info("no plant matches %r yet; waiting for one", self._plants)
@@ -130,7 +134,7 @@ class Fleet:
         with ExitStack() as stack:
             bus = stack.enter_context(PlantBus(config, "trainer", run_id, self._sessions))
             info = run_info(msgspec.structs.replace(config, seed=self._config.seed), "trainer", run_id)
-            health = stack.enter_context(HealthPublisher(bus, info, counts.copy))
+            health = stack.enter_context(HealthPublisher(bus, info, counts.copy, heart=self._heart))
             node = TrainerNode(config, bus, health, counts, self._pool)
             node.start()
             self._nodes[name] = node, stack.pop_all()

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import queue
 import threading
 from types import TracebackType
 
 import zenoh
 
-from node_runtime.bus import Bus
+from node_runtime.bus import Bus, Payload
 from node_runtime.config import Config
 from node_runtime.session import connect
 from protocol import topics
+from protocol.topics import Topic
 
 
 class Sessions:
-    """The two sessions of a process, control and bulk. A context manager; entering waits for the router.
+    """The two sessions of a process, control and bulk, and one thread that sends the bulk of all its buses.
+
+    A context manager; entering waits for the router.
 
     Raises on entering:
         OpenInterrupted: `stop` was set first.
@@ -25,6 +29,17 @@ class Sessions:
     def __init__(self, config: Config, process: str, stop: threading.Event):
         self._config, self._process, self.stop = config, process, stop
         self._leaving = contextlib.ExitStack()
+        self._outgoing: queue.SimpleQueue[tuple[PlantBus, Topic, Payload] | None] = queue.SimpleQueue()
+        self._sender = threading.Thread(target=self._send, name="bulk", daemon=True)
+
+    def post(self, bus: PlantBus, topic: Topic, payload: Payload) -> None:
+        """Leave a bus's message to the thread that sends bulk."""
+        self._outgoing.put((bus, topic, payload))
+
+    def _send(self) -> None:
+        while (item := self._outgoing.get()) is not None:
+            bus, topic, payload = item
+            bus.send(topic, payload)
 
     def __enter__(self) -> Sessions:
         with contextlib.ExitStack() as opened:
@@ -33,6 +48,7 @@ class Sessions:
             self.bulk = connect(self._config, self.stop, self._process)
             opened.callback(self.bulk.close)
             self._leaving = opened.pop_all()
+        self._sender.start()
         return self
 
     def __exit__(
@@ -42,6 +58,8 @@ class Sessions:
         leaving = threading.Thread(target=self._leaving.close, name="leave", daemon=True)
         leaving.start()
         leaving.join(2.0)
+        self._outgoing.put(None)
+        self._sender.join(0.5)
 
 
 class PlantBus(Bus):
@@ -57,7 +75,13 @@ class PlantBus(Bus):
         for topic in topics.ALL:
             if topic.writer == self.process:
                 self._publisher(topic)
-        self._start(self._send_bulk, f"bulk {self.config.name}")
+
+    def _post(self, topic: Topic, payload: Payload) -> None:
+        self._shared.post(self, topic, payload)
+
+    def send(self, topic: Topic, payload: Payload) -> None:
+        """Send what was posted; for the thread that does so."""
+        self._send_one(topic, payload)
 
     def close(self, drain_s: float = 2.0) -> None:
         """Send what is left, and take back all that was declared."""
@@ -66,9 +90,6 @@ class PlantBus(Bus):
         self.flush(drain_s)
         with self._lock:
             self._closed = True
-        self._outgoing.put(None)
-        for thread in self._threads:
-            thread.join(0.5)
         for declared in (*self._entities, *self._publishers.values()):
             # The session may be gone already.
             with contextlib.suppress(zenoh.ZError):

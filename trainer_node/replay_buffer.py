@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -114,19 +115,32 @@ class ReplayBuffer:
             ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
         """
         before = np.zeros(0) if past is None else np.ravel(past)
-        xu, h = np.concatenate([before, x, u]).astype(np.float64), np.asarray(h, dtype=np.float64)
-        expected = self._h.shape[1] if self._length else len(h)
-        if xu.shape != self._scale.shape or h.shape != (expected,):
-            raise ValueError(f"the window has {len(xu)} entries, expected {len(self._scale)}; h has {len(h)}")
-        if not (np.isfinite(xu).all() and np.isfinite(h).all()):
+        window = np.concatenate([before, x, u]).astype(np.float64)
+        return self.add_batch(run_id, [seq], window[None], np.asarray(h, dtype=np.float64)[None]) == 1
+
+    def add_batch(self, run_id: str, seqs: Sequence[int], windows: np.ndarray, h: np.ndarray) -> int:
+        """`add` for one sample after the other: windows (n, k (d + m)), h (n, d). Returns how many were not met before.
+
+        Raises:
+            ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
+        """
+        width = self._h.shape[1] if self._length else h.shape[1]
+        if windows.shape[1:] != self._scale.shape or h.shape[1] != width or len(h) != len(windows):
+            raise ValueError(
+                f"the window has {windows.shape[1]} entries, expected {len(self._scale)}; h has {h.shape[1]}"
+            )
+        if not (np.isfinite(windows).all() and np.isfinite(h).all()):
             raise ValueError("not finite")
-        if not self._seen.add(run_id, seq):
-            return False
-        self._offered += 1
-        slot = self._slot(xu / self._scale)
-        if slot is not None:
-            self._store(slot, xu, h)
-        return True
+        new = [k for k, seq in enumerate(seqs) if self._seen.add(run_id, seq)]
+        if self.strategy == "fifo":
+            self._store_in_turn(windows[new], h[new])
+            return len(new)
+        for k in new:
+            self._offered += 1
+            slot = self._slot(windows[k] / self._scale)
+            if slot is not None:
+                self._store(slot, windows[k], h[k])
+        return len(new)
 
     def sample(self, M: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """M different samples at random, all when there are fewer: windows (M, k (d + m)), and h (M, d)."""
@@ -145,19 +159,33 @@ class ReplayBuffer:
             return self._pairs.insert(scaled)
         if self._length < self.capacity:
             return self._length
-        if self.strategy == "reservoir":
-            drawn = int(self._rng.integers(self._offered))
-            return drawn if drawn < self.capacity else None
-        slot, self._next = self._next, (self._next + 1) % self.capacity
-        return slot
+        drawn = int(self._rng.integers(self._offered))
+        return drawn if drawn < self.capacity else None
 
     def _store(self, slot: int, xu: np.ndarray, h: np.ndarray) -> None:
-        if slot >= len(self._xu):
-            room = min(self.capacity, max(256, 2 * len(self._xu)))
-            self._xu = _grown(self._xu, room, len(xu))
-            self._h = _grown(self._h, room, len(h))
+        self._make_room(slot + 1, len(xu), len(h))
         self._xu[slot], self._h[slot] = xu, h
         self._length = max(self._length, slot + 1)
+
+    def _store_in_turn(self, xu: np.ndarray, h: np.ndarray) -> None:
+        """First in, first out, for many at once: a buffer is a ring."""
+        n = len(xu)
+        if not n:
+            return
+        self._make_room(min(self.capacity, self._length + n), xu.shape[1], h.shape[1])
+        slots = (self._next + np.arange(n)) % self.capacity
+        # Where they are more than the buffer holds, the last ones stay.
+        kept = slice(max(0, n - self.capacity), n)
+        self._xu[slots[kept]], self._h[slots[kept]] = xu[kept], h[kept]
+        self._length = min(self.capacity, self._length + n)
+        self._next = (self._next + n) % self.capacity
+        self._offered += n
+
+    def _make_room(self, length: int, columns: int, labels: int) -> None:
+        if length > len(self._xu):
+            room = min(self.capacity, max(256, 2 * len(self._xu), length))
+            self._xu = _grown(self._xu, room, columns)
+            self._h = _grown(self._h, room, labels)
 
 
 class _ClosestPairs:

@@ -6,6 +6,7 @@ hidden layers, bit for bit, on a CPU with one thread (`use_one_thread`).
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
@@ -126,21 +127,32 @@ class Trainer:
 
     def add(self, run_id: str, samples: Iterable[Sample]) -> int:
         """Offer samples of one controller run; bad ones are counted, left out. Returns how many are new."""
-        new = 0
-        for sample in samples:
-            try:
-                x, u, h, past = (np.array(part) for part in (sample.x, sample.u, sample.h, sample.past))
-                known = not self.buffer.add(run_id, sample.seq, x, u, h, past)
-            except ValueError:
-                self.counters["bad samples"] += 1
-                continue
-            if known:
-                self.counters["samples met before"] += 1
-            else:
-                new += 1
+        batch = list(samples)
+        try:
+            new = self._add(run_id, batch)
+        except ValueError:
+            # Some are bad: which ones, is found out one by one.
+            new, good = 0, 0
+            for sample in batch:
+                try:
+                    new += self._add(run_id, [sample])
+                    good += 1
+                except ValueError:
+                    self.counters["bad samples"] += 1
+            self.counters["samples met before"] += good - new
+        else:
+            self.counters["samples met before"] += len(batch) - new
         self.counters["samples"] += new
         self._fresh += new
         return new
+
+    def _add(self, run_id: str, samples: list[Sample]) -> int:
+        """How many are new. Raises `ValueError` when one is bad, and takes none then."""
+        if not samples:
+            return 0
+        rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
+        windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
+        return self.buffer.add_batch(run_id, [sample.seq for sample in samples], windows, labels)
 
     def due(self) -> bool:
         """Whether enough new samples came since the last training began."""
