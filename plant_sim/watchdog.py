@@ -34,11 +34,16 @@ class Standby:
         self._gain = np.array(backup.gain)
 
     def drive(self, t: float, x: np.ndarray) -> tuple[np.ndarray, float] | None:
-        """What it wants at time t in state x (d,), and until when; None before its first entry and behind its last."""
+        """What it wants at time t in state x (d,), and until when.
+
+        None before its first entry, behind its last, and where its numbers, each of them finite, add up to none.
+        """
         entry = _elapsed(self._arrived, t, self._period)
         if not 1 <= entry <= len(self._inputs):
             return None
-        return self._inputs[entry - 1] + self._gain @ x, self._arrived + (entry + 1) * self._period
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = self._inputs[entry - 1] + self._gain @ x
+        return (u, self._arrived + (entry + 1) * self._period) if np.isfinite(u).all() else None
 
 
 class Orders:

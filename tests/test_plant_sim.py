@@ -178,6 +178,16 @@ def test_a_backup_without_its_command_is_refused() -> None:
     assert sim.backup(backup(5, [0.0])) == "ok"
 
 
+def test_a_backup_whose_numbers_overflow_leaves_the_plant_to_the_plan() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U + 0.1] * 3), 0.0)
+    huge = msgspec.structs.replace(backup(0, [0.0, 0.0]), gain=[[1e308, 1e308, -1e308, 1e308]])
+    assert sim.backup(msgspec.structs.replace(huge, inputs=[[-1e308], [1e308]])) == "ok"
+    sim.sample(PERIOD)
+    assert sim.sample(2 * PERIOD).applied == pytest.approx([U + 0.05], abs=1e-12)
+
+
 @pytest.mark.parametrize("period", [0.1, 0.05, 0.01])
 def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
     """With a constant input it would leave for the surge that the equilibrium is unstable towards."""

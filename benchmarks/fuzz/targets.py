@@ -68,6 +68,7 @@ def targets(seed: int, folder: Path) -> list[Target]:
             add(topic.name, _decoding(topic), payloads[topic.name], weight)
     for topic in topics.BATCH.values():
         add(topic.name, _separating(topic), payloads[topic.name], 1.0)
+    add("head of a message", _glancing, everything, 0.5)
     settings = config()
     core = ControllerCore(settings, "controller-1")
     add("hidden weights: adoption", _adopting(core), payloads[topics.HIDDEN_WEIGHTS.name], 0.5)
@@ -96,6 +97,10 @@ def _decoding(topic: Topic) -> Read:
         return "accepted"
 
     return read
+
+
+def _glancing(payload: bytes) -> str:
+    return "malformed" if codec.head_of(payload) is None else "accepted"
 
 
 def _separating(topic: Topic) -> Read:
