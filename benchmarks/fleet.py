@@ -117,6 +117,11 @@ class Simulated:
         if served:
             self.waited.append((now, now - served[0]))
 
+    @property
+    def oldest(self) -> float | None:
+        """When the oldest sample was said that no weights have come for."""
+        return self._told[0][1] if self._told else None
+
     def _put(self, session: zenoh.Session, topic: topics.Topic, message: m.Message) -> None:
         session.put(
             topic.key(self.name), codec.encode(message), congestion_control=zenoh.CongestionControl.BLOCK
@@ -132,6 +137,8 @@ class Row:
     waited: list[float] = field(default_factory=list)
     trainings: list[int] = field(default_factory=list)
     """Weights that each plant got while it counted."""
+    waits: float = 0.0
+    """For how long the oldest sample had waited at the end."""
     cpu: float = 0.0
     """Of the trainer, cores."""
 
@@ -192,10 +199,11 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
             del declared
     row = Row(plants, batch, cpu=cpu)
     for controller in controllers.values():
-        # Samples from before the trainer was there waited for its start.
-        counted = [waited for at, waited in controller.waited if at - waited >= begin]
+        # A plant's first weights waited for the trainer to start.
+        counted = [waited for at, waited in controller.waited[1:] if at >= begin]
         row.waited += counted
-        row.trainings.append(len(counted))
+        row.trainings.append(sum(at >= begin for at, _ in controller.waited))
+        row.waits = max(row.waits, end - controller.oldest) if controller.oldest is not None else row.waits
     return row
 
 
@@ -332,17 +340,17 @@ def _table(rows: list[Row], settings: Fleet) -> list[str]:
         f"Of {settings.seconds:g} s with so many plants, after {settings.warm:g} s of warming up; a training is "
         f"{TrainerConfig().steps} steps.",
         "",
-        "| plants | samples drawn | from samples to weights, s: median | p99 | longest | "
-        "weights a plant, fewest, most | trainings a second | trainer, cores |",
-        "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| plants | samples drawn | from samples to weights, s: median | p99 | longest | still waiting at the end, s "
+        "| weights a plant, fewest, most | trainings a second | trainer, cores |",
+        "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for row in rows:
         spread = [
             f"{np.percentile(row.waited, at):.2f}" if row.waited else "none came" for at in (50, 99, 100)
         ]
         lines.append(
-            f"| {row.plants} | {row.batch} | {' | '.join(spread)} | {min(row.trainings)}, {max(row.trainings)} | "
-            f"{sum(row.trainings) / settings.seconds:.1f} | {row.cpu:.2f} |"
+            f"| {row.plants} | {row.batch} | {' | '.join(spread)} | {row.waits:.2f} | {min(row.trainings)}, "
+            f"{max(row.trainings)} | {sum(row.trainings) / settings.seconds:.1f} | {row.cpu:.2f} |"
         )
     return lines
 

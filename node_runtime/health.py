@@ -20,8 +20,9 @@ from protocol.messages import Health, ProcessStatus, RunInfo
 
 HEALTH_PERIOD = 0.5
 RUN_INFO_EVERY = 10
-BEATS = 200.0
-"""A second, at most, of all the publishers of one `Heart` together."""
+BEATS = 600.0
+"""A second, at most, of all the publishers of one `Heart` together: a thousand then speak within the two seconds after
+which a view calls one silent."""
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh", "torch", "mcap")
 
 
@@ -59,7 +60,7 @@ def run_info(config: Config, process: str, run_id: str, units: dict[str, str] | 
 class Heart:
     """One thread that lets many publishers speak, one after the other; a context manager.
 
-    Each comes twice a second, or, where there are more than a hundred, as often as `BEATS` allows.
+    Each comes twice a second, or, where there are more than three hundred, as often as `BEATS` allows.
     """
 
     def __init__(self) -> None:

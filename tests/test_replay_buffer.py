@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from itertools import pairwise
 
 import numpy as np
@@ -238,6 +239,18 @@ def test_batches_leave_what_one_sample_after_the_other_leaves(strategy: Strategy
         for left, right in zip(one.contents(), many.contents(), strict=True):
             assert left.tobytes() == right.tobytes()
         assert (one.offered, one.last("a")) == (many.offered, many.last("a"))
+
+
+def test_first_in_first_out_by_the_batch_is_a_bounded_queue() -> None:
+    rng = np.random.default_rng(9)
+    buffer, queue, seq = ReplayBuffer(20, "fifo", 3, [1.0, 2.0, 0.5]), deque[bytes](maxlen=20), 0
+    for size in (1, 7, 11, 4, 30, 45, 20, 3, 20, 40):
+        windows, h = rng.normal(size=(size, 3)), rng.normal(size=(size, 2))
+        buffer.add_batch("a", range(seq, seq + size), windows, h)
+        seq += size
+        queue.extend(np.concatenate(pair).tobytes() for pair in zip(windows, h, strict=True))
+        held = [np.concatenate(pair).tobytes() for pair in zip(*buffer.contents(), strict=True)]
+        assert sorted(held) == sorted(queue)
 
 
 def test_a_bad_sample_keeps_its_whole_batch_out() -> None:

@@ -35,6 +35,8 @@ MOST = 1024
 """Plants followed at once: a stranger who invents names must not fill the memory."""
 ASKERS = 16
 """Plants that may be asked at once; one that does not answer keeps its place for two seconds."""
+FLEET_SHARE = 0.9
+"""Of the time, at most, is spent training many plants: a trainer of a fleet has a machine to itself."""
 AT_ONCE = 16
 """Plants taken in between two looks at what has arrived."""
 SAY_EVERY = 30.0
@@ -83,6 +85,7 @@ class Fleet:
         self._nodes: dict[str, tuple[TrainerNode, ExitStack]] = {}
         self._pool = ThreadPoolExecutor(ASKERS, "ask")
         self._heart = Heart()
+        self._share = SHARE if self._named else FLEET_SHARE
         self._train_at = 0.0
         self._say_at = 0.0
 
@@ -112,7 +115,7 @@ class Fleet:
         for node in nodes:
             node.listen(now)
         if now >= self._train_at:
-            self._train_at = now + train_round(nodes, now) / SHARE
+            self._train_at = now + train_round(nodes, now) / self._share
         for node in nodes:
             node.tell()
 
