@@ -52,7 +52,7 @@ class Fleet:
     plants: tuple[int, ...] = (1, 8, 64, 256)
     seconds: float = 40.0
     """For each number of plants."""
-    warm: float = 10.0
+    warm: float = 20.0
     """Seconds at the beginning that do not count."""
     batch: tuple[int, ...] = (512, 64)
     """`trainer.batch`: the samples drawn for one training."""
