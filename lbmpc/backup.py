@@ -36,11 +36,8 @@ from lbmpc.sets.bounds import state_set
 
 STEPS = 2
 """Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
-
-
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
-
 STIFFNESS = 25.0
 """Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
 
