@@ -67,7 +67,7 @@ class BackupPlanner:
         margin: float,
         realise: Callable[[ca.Function], ca.Function] = lambda function: function,
     ):
-        self.problem, self.margin = problem, margin
+        self.problem = problem
         model, oracle, n = problem.model, problem.oracle, problem.horizon
         plain = state_set(model)
         inside = margin * 0.5 * (plain.upper - plain.lower)

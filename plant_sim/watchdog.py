@@ -27,7 +27,6 @@ class Standby:
 
     def __init__(self, backup: Backup, arrived: float):
         """`backup` must have the plant's dimensions."""
-        self.seq = backup.seq
         self._arrived = arrived
         self._period = backup.period
         self._inputs = backup.inputs
