@@ -37,6 +37,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
 
 
 Fail = Callable[[str, str], NoReturn]
@@ -175,6 +176,17 @@ class L2nwConfig(Section, frozen=True):
     """Names of the states and inputs the kernel sees; None: the plant's own choice."""
 
 
+class PlantPlace(Section, frozen=True):
+    """Where a trainer of many plants finds one that has a router of its own."""
+
+    name: Name
+    """The plant's, as in its own configuration."""
+    endpoint: str
+    """Its router's: tls/10.0.0.5:7448."""
+    keys: str | None = None
+    """Folder of the trainer's certificate for this plant; None: `bus.tls.keys`."""
+
+
 class TrainerConfig(Section, frozen=True):
     enabled: bool = True
     """False: hidden layers are never trained (last layer only)."""
@@ -190,6 +202,8 @@ class TrainerConfig(Section, frozen=True):
     """Adam steps in one training, each on all M samples."""
     learning_rate: Positive = 1e-3
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    fleet: list[PlantPlace] = msgspec.field(default_factory=list)
+    """Plants with a router each, trained by one `tandem trainer` (docs/fleet.md); empty: who is at `bus.endpoint`."""
 
 
 class TlsConfig(Section, frozen=True):
@@ -214,6 +228,10 @@ class LogConfig(Section, frozen=True):
     path: str = "run.mcap"
     chunk_bytes: PositiveInt = 256 * 1024
     flush_ms: PositiveInt = 500
+    split_minutes: NonNegative = 60.0
+    """A new file, NAME.part2.mcap, after so long: the index of a file is in memory until it ends. 0: never."""
+    keep: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """How many of a run's files stay, the one being written included; older ones are removed. 0: all."""
 
 
 class RealtimeConfig(Section, frozen=True):
@@ -228,7 +246,7 @@ class RealtimeConfig(Section, frozen=True):
 class Config(Section, frozen=True):
     """The whole tree; `rate` is the one sampling rate of plant, model and controller."""
 
-    name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")] = "jet1"
+    name: Name = "jet1"
     """The plant's name, part of every key."""
     rate: Positive = 20.0
     """Samples a second (Hz)."""
@@ -310,6 +328,9 @@ def from_tree(
             f"trainer.min_samples = {config.trainer.min_samples} exceeds trainer.capacity = "
             f"{config.trainer.capacity}: the first training would never come",
         )
+    for i, place in enumerate(config.trainer.fleet):
+        if place.name in {earlier.name for earlier in config.trainer.fleet[:i]}:
+            fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is there twice")
     return config
 
 
@@ -385,7 +406,11 @@ def apply_override(tree: dict[str, Any], assignment: str) -> str:
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
     return {
-        key: _without_none(value) if isinstance(value, dict) else value
+        key: _without_none(value)
+        if isinstance(value, dict)
+        else [_without_none(item) if isinstance(item, dict) else item for item in value]
+        if isinstance(value, list)
+        else value
         for key, value in tree.items()
         if value is not None
     }

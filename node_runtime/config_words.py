@@ -14,6 +14,7 @@ import msgspec
 from msgspec import inspect
 
 _PLACE = re.compile(r"^(?P<text>.*) - at `\$\.?(?P<key>.*)`$", re.DOTALL)
+_ABSENT = re.compile(r"missing required field `(\w+)`")
 _STEP = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
 
 
@@ -43,6 +44,8 @@ def explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
         near = difflib.get_close_matches(str(value), choices, n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         return key, f"{key} = {_shown(value)} is not one of {', '.join(choices)}{hint}"
+    if absent := _ABSENT.search(found["text"]):
+        return f"{key}.{absent[1]}", f"{key}.{absent[1]} is missing"
     if isinstance(wanted, inspect.StructType):
         return key, f"{key} = {_shown(value)} is a table: write [{key}] and its keys below"
     return key, f"{key} = {_shown(value)} is not {allowed(wanted)}"
@@ -59,6 +62,8 @@ def allowed(kind: inspect.Type) -> str:
             return "a number" + _range(kind)
         case inspect.StrType():
             return "a string" + (f" matching {kind.pattern}" if kind.pattern else "")
+        case inspect.StructType():
+            return f"a table with {', '.join(field.name for field in kind.fields)}"
         case inspect.ListType():
             return f"a list, each entry {allowed(without_none(kind.item_type))}"
     return f"a {type(kind).__name__.removesuffix('Type').lower()}"

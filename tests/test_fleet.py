@@ -17,9 +17,10 @@ from node_runtime.mailbox import Mailbox
 from protocol.messages import Array, OutputWeights, Sample
 from protocol.network import NetworkDescription, initial_hidden
 from protocol.topics import Topic
-from trainer_node import fleet
+from trainer_node import finding
 from trainer_node.descent import Problem, descend_together
-from trainer_node.fleet import Heard, seed_of
+from trainer_node.finding import Heard
+from trainer_node.fleet import seed_of
 from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
 from trainer_node.training import Draw, Trainer, use_one_thread
 
@@ -118,16 +119,16 @@ def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
     heard.note("tandem/jet1/controller/samples", 0.0)
     heard.note("tandem/pump/controller/samples", 0.0)
     assert heard.present(1.0) == ["jet1"]
-    assert heard.present(1.0 + fleet.SILENT) == []
+    assert heard.present(1.0 + finding.SILENT) == []
     heard.note("tandem/jet1/controller/samples", 20.0)
     assert heard.present(20.0) == ["jet1"]
 
 
 def test_a_stranger_who_invents_names_fills_no_memory() -> None:
     heard = Heard("*")
-    for k in range(fleet.MOST + 100):
+    for k in range(finding.MOST + 100):
         heard.note(f"tandem/x{k}/controller/samples", 0.0)
-    assert len(heard.present(0.0)) == fleet.MOST
+    assert len(heard.present(0.0)) == finding.MOST
 
 
 def test_the_seed_is_the_name_and_not_the_order() -> None:

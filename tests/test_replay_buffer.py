@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
+import tracemalloc
 from collections import deque
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -210,18 +210,42 @@ def test_what_is_not_finite_or_of_another_size_is_refused_and_may_be_sent_again(
     assert buffer.add("run-1", 1, np.zeros(2), np.zeros(1), np.zeros(2))
 
 
+def test_a_sample_is_new_once_in_whatever_order_they_come() -> None:
+    rng = np.random.default_rng(11)
+    seen, met = Seen(), set[int]()
+    # Stretches, holes that are filled later, repetitions, all over the place.
+    for seq in [*rng.permutation(300), *range(250, 400), *rng.integers(0, 600, 2000)]:
+        assert seen.add("a", int(seq)) == (int(seq) not in met)
+        met.add(int(seq))
+        assert seen.last("a") == max(met)
+
+
 def test_what_is_remembered_of_sequence_numbers_is_bounded() -> None:
-    seen = Seen(remembered=100, runs=2)
+    seen = Seen(stretches=100, runs=2)
     order = [*range(0, 1000, 3), *range(999, 0, -1)]
     new = [seq for seq in order if seen.add("a", seq)]
     assert len(set(new)) == len(new)
     # Recent gaps are still filled, ancient ones are not.
     assert set(range(900, 1000)) <= set(new)
+    assert 1 not in new
     assert seen.last("a") == 999
-    assert all(later > earlier for earlier, later in pairwise(seq for seq in new if seq % 3 == 0))
     for run in ("b", "c"):
         assert seen.add(run, 0)
     assert seen.last("a") == -1
+
+
+def test_a_long_run_takes_no_more_memory_than_a_short_one() -> None:
+    def memory(samples: int) -> int:
+        tracemalloc.start()
+        seen = Seen()
+        # Every other one comes late: the holes close again.
+        for seq in [*range(0, samples, 2), *range(1, samples, 2)]:
+            seen.add("a", seq)
+        found = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        return found
+
+    assert memory(16_000) < memory(1000) + 1000
 
 
 @pytest.mark.parametrize("strategy", ["fifo", "reservoir", "novelty"])

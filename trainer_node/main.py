@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 import threading
 
@@ -9,6 +10,7 @@ from node_runtime.config import Config
 from node_runtime.lifecycle import stopped_by_signals
 from node_runtime.realtime import quick_handover
 from node_runtime.session import OpenInterrupted
+from trainer_node.finding import OneRouter, OwnRouters
 from trainer_node.fleet import Fleet
 from trainer_node.plant_bus import Sessions
 from trainer_node.training import TrainerError, pick_device, use_one_thread
@@ -22,10 +24,11 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
     Args:
         config: of this process; the networks' shapes come from the controllers.
         stop: ends it; signals do too.
-        plants: names of the plants, as a pattern of fnmatch; None: the one plant of the configuration.
+        plants: names of the plants, as a pattern of fnmatch; None: all of `trainer.fleet`, or, where that is empty,
+            the one plant of the configuration.
 
     Returns:
-        0 when told to stop, 2 when this machine cannot train as configured.
+        0 when told to stop; 2 when this machine cannot train as configured, or the pattern leaves no plant.
     """
     try:
         pick_device(config.trainer.device)
@@ -35,8 +38,18 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
     use_one_thread()
     with stopped_by_signals(stop) as stopping, quick_handover():
         try:
-            with Sessions(config, "trainer", stopping) as sessions:
-                Fleet(config, plants or config.name, sessions).run(stopping)
+            if config.trainer.fleet:
+                places = [
+                    place for place in config.trainer.fleet if fnmatch.fnmatchcase(place.name, plants or "*")
+                ]
+                if not places:
+                    names = ", ".join(place.name for place in config.trainer.fleet)
+                    log.error("no plant of trainer.fleet matches %r; it has %s", plants, names)
+                    return 2
+                Fleet(OwnRouters(config, places, stopping)).run(stopping)
+            else:
+                with Sessions(config, "trainer", stopping) as sessions:
+                    Fleet(OneRouter(config, plants or config.name, sessions)).run(stopping)
         except OpenInterrupted:
             log.info("stopped before there was a router")
     return 0

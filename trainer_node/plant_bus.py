@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import queue
 import threading
 from types import TracebackType
@@ -14,6 +15,8 @@ from node_runtime.config import Config
 from node_runtime.session import connect
 from protocol import topics
 from protocol.topics import Topic
+
+log = logging.getLogger(__name__)
 
 
 class Sessions:
@@ -39,7 +42,11 @@ class Sessions:
     def _send(self) -> None:
         while (item := self._outgoing.get()) is not None:
             bus, topic, payload = item
-            bus.send(topic, payload)
+            try:
+                bus.send(topic, payload)
+            except Exception:
+                # Whatever one plant's message did, the others' are to be sent.
+                log.exception("a message of %s at %s was not sent", bus.config.name, topic.name)
 
     def __enter__(self) -> Sessions:
         with contextlib.ExitStack() as opened:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
 
@@ -9,8 +10,8 @@ import numpy as np
 
 from node_runtime.config import Strategy
 
-REMEMBERED = 40_000
-"""Sequence numbers remembered for one run: twice what a controller's outbox holds."""
+STRETCHES = 10_000
+"""Stretches of sequence numbers remembered for one run."""
 RUNS = 8
 """Runs whose sequence numbers are remembered."""
 STALE_LOOKS = 16
@@ -20,37 +21,45 @@ STALE_LOOKS = 16
 class Seen:
     """Which samples were met before, by (run_id, seq), in bounded memory.
 
-    Of each run the newest `remembered` sequence numbers are kept; older ones count as met.
+    Sequence numbers are kept as stretches without a hole, so a run takes no more memory the longer it lasts. Of a run
+    with more than `stretches` of them the oldest hole counts as met.
     """
 
-    def __init__(self, remembered: int = REMEMBERED, runs: int = RUNS):
-        self._remembered = remembered
+    def __init__(self, stretches: int = STRETCHES, runs: int = RUNS):
+        self._stretches = stretches
         self._runs = runs
-        self._known: OrderedDict[str, set[int]] = OrderedDict()
-        self._floor: dict[str, int] = {}
-        self._last: dict[str, int] = {}
+        self._known: OrderedDict[str, tuple[list[int], list[int]]] = OrderedDict()
+        """Of each run the first and the last number of every stretch, rising."""
 
     def add(self, run_id: str, seq: int) -> bool:
         """Remember a sample. Returns whether it was new."""
-        known = self._known.get(run_id)
-        if known is None:
-            known = self._known[run_id] = set()
-            self._floor[run_id] = self._last[run_id] = -1
+        if run_id not in self._known:
+            self._known[run_id] = [], []
             while len(self._known) > self._runs:
-                forgotten, _ = self._known.popitem(last=False)
-                del self._floor[forgotten], self._last[forgotten]
-        if seq in known or seq <= self._floor[run_id]:
+                self._known.popitem(last=False)
+        first, last = self._known[run_id]
+        after = bisect_right(first, seq)
+        if after and seq <= last[after - 1]:
             return False
-        known.add(seq)
-        self._last[run_id] = max(self._last[run_id], seq)
-        if len(known) >= 2 * self._remembered:
-            self._floor[run_id] = sorted(known)[-self._remembered - 1]
-            self._known[run_id] = {s for s in known if s > self._floor[run_id]}
+        goes_on = after > 0 and last[after - 1] == seq - 1
+        meets = after < len(first) and first[after] == seq + 1
+        if goes_on and meets:
+            del last[after - 1], first[after]
+        elif goes_on:
+            last[after - 1] = seq
+        elif meets:
+            first[after] = seq
+        else:
+            first.insert(after, seq)
+            last.insert(after, seq)
+            if len(first) > self._stretches:
+                del last[0], first[1]
         return True
 
     def last(self, run_id: str) -> int:
         """The newest sequence number of a run, -1 when there is none."""
-        return self._last.get(run_id, -1)
+        _, last = self._known.get(run_id, ([], []))
+        return last[-1] if last else -1
 
 
 class ReplayBuffer:

@@ -1,0 +1,129 @@
+"""One trainer, plants with a router each: every link has its own certificate, and none holds up another."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+from live import HANG_S, Process, free_endpoint, live_config
+from test_trainer_node import TRAINING, Controller
+
+from node_runtime.config import Config, ConfigError, from_json, load, override, to_json, to_toml
+from protocol.messages import Health
+from tandem import keys_files
+from trainer_node.main import main
+
+pytestmark = pytest.mark.live
+
+
+def site(folder: Path, name: str, *more: str) -> Config:
+    """The configuration of one plant's machine: a router with a local endpoint and one for others, and its keys."""
+    keys_files.create(name, [], folder / name, 30)
+    door = free_endpoint().replace("tcp/", "tls/")
+    return live_config(
+        f"name={name}", f'bus.remote="{door}"', f'bus.tls.keys="{folder / name / "router"}"', *more
+    )
+
+
+def fleet(folder: Path, *sites: Config) -> Config:
+    """The trainer's configuration: all sites, with the trainer's folder of each."""
+    places = ", ".join(
+        f'{{name="{one.name}", endpoint="{one.bus.remote}", keys="{folder / one.name / "trainer"}"}}'
+        for one in sites
+    )
+    return override(Config(trainer=TRAINING), [f"trainer.fleet=[{places}]"])
+
+
+@contextmanager
+def routing(config: Config) -> Iterator[None]:
+    with Process("node_runtime.router", config) as process:
+        assert any("with certificates, on" in line for line in process.lines())
+        # Read on: a full pipe would stop it.
+        threading.Thread(target=lambda: list(process.lines()), daemon=True).start()
+        yield
+
+
+@contextmanager
+def training(config: Config) -> Iterator[None]:
+    stop = threading.Event()
+    ended: list[int] = []
+    thread = threading.Thread(target=lambda: ended.append(main(config, stop)))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(HANG_S)
+    assert ended == [0]
+
+
+def published(health: Health) -> bool:
+    return health.counters.get("published", 0) > 0
+
+
+def test_plants_behind_routers_of_their_own_get_weights_from_one_trainer(tmp_path: Path) -> None:
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    absent = site(tmp_path, "jet3")  # its router never runs
+    with ExitStack() as stack:
+        for one in sites:
+            stack.enter_context(routing(one))
+        plants = [
+            stack.enter_context(Controller(one, f"controller-{k}", seed=k)) for k, one in enumerate(sites)
+        ]
+        stack.enter_context(training(fleet(tmp_path, *sites, absent)))
+        for plant in plants:
+            plant.until(published, tick=True)
+        for plant in plants:
+            plant.until(lambda health: health.counters.get("adopted", 0) > 0, tick=True)
+            assert plant.adopted[-1].for_run == plant.run_id
+
+
+def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_relent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.finding.TRY_AGAIN", 0.2)
+    good, other = site(tmp_path, "jet1"), site(tmp_path, "jet2")
+    right = tmp_path / "jet2" / "trainer"
+    kept = tmp_path / "kept"
+    right.rename(kept)
+    with ExitStack() as stack:
+        for one in (good, other):
+            stack.enter_context(routing(one))
+        first = stack.enter_context(Controller(good, "controller-1"))
+        second = stack.enter_context(Controller(other, "controller-2"))
+        stack.enter_context(training(fleet(tmp_path, good, other)))
+        first.until(published, tick=True)
+        assert any("jet2" in text and "no such folder" in text for text in caplog.messages)
+        # Its folder is copied there at last.
+        kept.rename(right)
+        second.until(published, tick=True)
+
+
+def test_a_pattern_chooses_from_the_list(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert main(fleet(tmp_path, Config(name="jet1")), threading.Event(), "pump*") == 2
+    assert "no plant of trainer.fleet matches 'pump*'; it has jet1" in caplog.text
+
+
+def test_the_list_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.toml"
+    text = '[[trainer.fleet]]\nname = "jet1"\nendpoint = "tls/10.0.0.5:7448"\n'
+    file.write_text(text)
+    config = load(file)
+    assert config.trainer.fleet[0].endpoint == "tls/10.0.0.5:7448"
+    assert from_json(to_json(config)) == config
+    (tmp_path / "again.toml").write_text(to_toml(config))
+    assert load(tmp_path / "again.toml") == config
+    for wrong, says in (
+        (text + 'kees = "k"\n', "did you mean 'trainer.fleet[0].keys'"),
+        (text + text, "'jet1' is there twice"),
+        (text.replace("jet1", "jet 1"), "name"),
+        (text.replace("endpoint", "#"), "endpoint"),
+    ):
+        file.write_text(wrong)
+        with pytest.raises(ConfigError, match="trainer") as raised:
+            load(file)
+        assert says in str(raised.value)
+        assert str(file) in str(raised.value)
