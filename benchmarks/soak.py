@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,11 @@ from node_runtime import machine
 from node_runtime.config import Config
 from protocol import codec, topics
 from protocol import messages as m
+from run_log.errors import LogError
+from run_log.parts import existing_parts
 from run_log.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
+from run_log.reader import read_run
+from run_log.replay import replay
 from run_log.scan import Scan
 
 MARKS = Marks.of("soak", "make soak")
@@ -57,6 +62,8 @@ class Soak:
 
     minutes: float = 30.0
     rate: float = 50.0
+    split_minutes: float = 5.0
+    """A new part of the log after so long; the recorder's memory goes up until then, and down again."""
     every: float = 10.0
     """Seconds between two readings of the memory."""
     warm: float = 60.0
@@ -109,14 +116,17 @@ def main(settings: Soak) -> int:
         if found is None:
             return 1
         memory, figures = found
-        lateness = late(Path(folder) / "run.mcap", stalls.read(Path(folder) / "stalls.txt"), settings.rate)
+        parts = existing_parts(Path(folder) / "run.mcap")
+        lateness = late(parts, stalls.read(Path(folder) / "stalls.txt"), settings.rate)
+        console.print("replaying")
+        replays = replayed(parts)
     picture = (
         settings.out / "soak.png" if settings.document is None else settings.document.with_name("soak.png")
     )
     draw(memory, settings.warm / 60.0, picture)
-    results = {"memory": memory, "lateness": lateness, "run": figures}
+    results = {"memory": memory, "lateness": lateness, "replays": replays, "run": figures}
     (settings.out / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(results)))
-    body = "\n".join(_table(memory, lateness, figures, picture.name))
+    body = "\n".join(_table(memory, lateness, replays, figures, picture.name))
     sys.stdout.write(body + "\n")
     MARKS.put(settings.document, body)
     return 0
@@ -126,7 +136,7 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
     """Memory by process, and what the run says of itself; None when it failed, which is said."""
     seconds = 60.0 * settings.minutes
     words = ["run", "--json", "--rate", str(settings.rate), "--seconds", str(seconds)]
-    words += ["--log", str(folder / "run.mcap")]
+    words += ["--log", str(folder / "run.mcap"), "--set", f"log.split_minutes={settings.split_minutes}"]
     for override in settings.set:
         words += ["--set", override]
     said: list[str] = []
@@ -202,21 +212,15 @@ def _slope(minutes: list[float], rss: list[int], since: float) -> tuple[float | 
     return float(line.slope), float(np.nan_to_num(wide))
 
 
-def late(log: Path, noted: list[stalls.Stall], rate: float) -> Lateness:
+def late(parts: list[Path], noted: list[stalls.Stall], rate: float) -> Lateness:
     """Walks the log once; a tick's place in time is that of the state that it used."""
-    period, names = 1.0 / rate, {f"raw/{topic.name}": topic for topic in (topics.TICK, topics.TIMING)}
-    channels: dict[int, topics.Topic] = {}
+    period = 1.0 / rate
+    ticks: set[int] = set()
     when: dict[int, tuple[float, float]] = {}
     suspects: dict[int, int] = {}
-    ticks = 0
-    for record in Scan(log):
-        if isinstance(record, Channel) and record.topic in names:
-            channels[record.id] = names[record.topic]
-        if not isinstance(record, Message) or record.channel_id not in channels:
-            continue
-        message = codec.decode(channels[record.channel_id], record.data)
+    for message in _timed(parts):
         if isinstance(message, m.Tick):
-            ticks += 1
+            ticks.add(message.seq)
             if message.state is not None:
                 when[message.seq] = (message.state.t, message.lateness)
             if message.late or message.skipped:
@@ -228,7 +232,34 @@ def late(log: Path, noted: list[stalls.Stall], rate: float) -> Lateness:
         at, lateness = when.get(seq, (0.0, 0.0))
         excused += count * stalls.during(noted, at - count * period, at + lateness + period)
     longest = max((late for _, late in noted), default=0.0)
-    return Lateness(ticks, sum(suspects.values()), excused, len(noted), longest * 1e3)
+    return Lateness(len(ticks), sum(suspects.values()), excused, len(noted), longest * 1e3)
+
+
+def _timed(parts: list[Path]) -> Iterator[m.Message]:
+    """Ticks and their timings; what two parts both have comes twice."""
+    names = {f"raw/{topic.name}": topic for topic in (topics.TICK, topics.TIMING)}
+    for part in parts:
+        channels: dict[int, topics.Topic] = {}
+        for record in Scan(part):
+            if isinstance(record, Channel) and record.topic in names:
+                channels[record.id] = names[record.topic]
+            if isinstance(record, Message) and record.channel_id in channels:
+                yield codec.decode(channels[record.channel_id], record.data)
+
+
+def replayed(parts: list[Path]) -> list[str]:
+    """What a replay of each part found, in a few words."""
+    found = []
+    for part in parts:
+        try:
+            result = replay(read_run(part))
+        except LogError as error:
+            found.append(f"{part.name}: {error}")
+            continue
+        verdict = "equal, byte for byte" if result.equal else f"differ, {result.differing_ticks}"
+        lost = f", {result.lost_ticks} not in the log" * (result.lost_ticks > 0)
+        found.append(f"ticks {result.first_tick} to {result.first_tick + result.ticks - 1} {verdict}{lost}")
+    return found
 
 
 def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
@@ -264,7 +295,9 @@ def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
     figure.savefig(path)
 
 
-def _table(memory: dict[str, Memory], lateness: Lateness, run: dict[str, Any], picture: str) -> list[str]:
+def _table(
+    memory: dict[str, Memory], lateness: Lateness, replays: list[str], run: dict[str, Any], picture: str
+) -> list[str]:
     facts = machine.describe()
     command = shlex.join(["python", "-m", "benchmarks.soak", *sys.argv[1:]])
     lines = [
@@ -292,8 +325,10 @@ def _table(memory: dict[str, Memory], lateness: Lateness, run: dict[str, Any], p
         f"machine itself stood still: an empty loop on each core, above all of Tandem, woke more than 2 ms late "
         f"{lateness.stalls} times, at most by {lateness.longest_stall_ms:.1f} ms. "
         f"Solve {_spread(solve)}, tick {_spread(tick)} ms (p50, p99, largest). "
-        f"Constraint violations: {run.get('constraint_violations')}. Messages lost to the log: "
-        f"{run.get('lost_ticks')} ticks.",
+        f"These, constraint violations, {run.get('constraint_violations')}, and ticks lost to the log, "
+        f"{run.get('lost_ticks')}, are of its first part.",
+        "",
+        f"Replay of the log's {len(replays)} parts: {'; '.join(replays)}.",
     ]
 
 

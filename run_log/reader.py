@@ -17,7 +17,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 from run_log.errors import LogError
 from run_log.scan import Scan
-from run_log.writer import FORMAT, PROFILE
+from run_log.writer import CONTINUED, FORMAT, IDENTITY, PROFILE
 
 M = TypeVar("M", bound=m.Message)
 RAW = "raw/"
@@ -48,6 +48,10 @@ class Run:
     """Messages on keys that are no topic of ours, by key."""
     truncated: bool = False
     recovered: bool = False
+    part: int = 1
+    """Which one of its run's logs this is (`run_log.parts`)."""
+    continued: str | None = None
+    """Name of the next one; None: this is the last, or was cut short."""
     note: str = ""
     """What a person should know about the file, e.g. where it was cut."""
 
@@ -125,6 +129,11 @@ class Run:
         return [run_id for run_id in known if run_id in answered] or known or ticked
 
     @property
+    def ends_within(self) -> bool:
+        """The log ends while its run goes on: the last tick may lack some of its messages."""
+        return self.truncated or self.recovered or self.continued is not None
+
+    @property
     def versions(self) -> dict[str, str]:
         """What the recorder had installed."""
         return cast(dict[str, str], json.loads(self.attachments.get("versions.json", b"{}")))
@@ -160,7 +169,7 @@ def read_run(path: str | Path) -> Run:
             case Attachment():
                 run.attachments[record.name] = record.data
             case Metadata():
-                run.recovered |= record.name == "recovered"
+                _take_metadata(run, record)
             case Channel():
                 names[record.id] = record.topic
             case Message():
@@ -177,6 +186,8 @@ def read_run(path: str | Path) -> Run:
             f"{path} was cut short at byte {scan.cut_at} of {scan.size}; all before that is read. "
             f"`tandem recover {path}` makes a whole file of it."
         )
+    elif run.continued is not None:
+        run.note = f"{path} is part {run.part} of its log, which goes on in {run.continued}."
     run.config = _config(path, run)
     return run
 
@@ -191,6 +202,15 @@ def check_ours(path: Path, header: Header) -> None:
     expected = f"tandem log {FORMAT};"
     if not header.library.startswith(expected):
         raise LogError(f"{path}: was written as {header.library!r}; this Tandem reads {expected!r}")
+
+
+def _take_metadata(run: Run, record: Metadata) -> None:
+    if record.name == "recovered":
+        run.recovered = True
+    elif record.name == CONTINUED:
+        run.continued = record.metadata.get("in")
+    elif record.name == IDENTITY and (part := record.metadata.get("part", "")).isdecimal():
+        run.part = int(part)
 
 
 def _take(run: Run, name: str, record: Message) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from pathlib import Path
 
 from lbmpc.plants import get_plant
 from node_runtime import clock
@@ -15,7 +16,7 @@ from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from protocol import topics
 from run_log.errors import LogError
-from run_log.writer import LogWriter
+from run_log.parts import PartedLog
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,7 @@ EXIT_NOTHING_WRITTEN = 4
 # After Ctrl-C the other processes still say their last words; listen for that long.
 QUIET_S = 0.25
 LAST_WORDS_S = 1.5
+Said = tuple[Path, str | None, bool]
 # Messages are fetched together: to wake for each costs more than to log it.
 GATHER_S = 0.02
 
@@ -42,7 +44,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     ):
         try:
             plant = get_plant(config.plant.model)
-            writer = LogWriter(config.log.path, config, plant, start_ns=time.time_ns(), patient=True)
+            writer = PartedLog(config, plant, now=clock.now(), start_ns=time.time_ns())
         except (LogError, KeyError) as error:
             log.error("%s", error.args[0])
             return EXIT_CANNOT
@@ -54,7 +56,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                 mailbox = bus.everything()
                 # Only now, so that what it says of itself is in the log too.
                 info = run_info(config, "recorder", run_id, plant.units)
-                with HealthPublisher(bus, info, lambda: _counters(writer), punctuality) as health:
+                with HealthPublisher(bus, info, lambda: writer.counters, punctuality) as health:
                     _record(config, writer, mailbox, health, stopping)
         except OpenInterrupted:
             pass
@@ -66,14 +68,14 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 
 
 def _record(
-    config: Config, writer: LogWriter, mailbox: Mailbox, health: HealthPublisher, stopping: threading.Event
+    config: Config, writer: PartedLog, mailbox: Mailbox, health: HealthPublisher, stopping: threading.Event
 ) -> None:
     prefix = topics.everything(config.name).removesuffix("**")
     # Arrival is stamped on the monotonic clock; one offset for the whole run keeps the times in order.
     to_unix = time.time_ns() - clock.now_ns()
     flush_s = config.log.flush_ms * 1e-3
     next_flush = clock.now()
-    said: tuple[str | None, bool] = ("", False)
+    said: Said | None = None
     end: float | None = None
     last_arrival = clock.now()
     garbage = GarbageCollection()
@@ -85,16 +87,18 @@ def _record(
         clock.sleep_until(clock.now() + GATHER_S)
         for delivery in mailbox.drain():
             last_arrival = clock.now()
-            writer.write(delivery.key.removeprefix(prefix), delivery.payload, delivery.received_ns + to_unix)
+            name, log_time = delivery.key.removeprefix(prefix), delivery.received_ns + to_unix
+            writer.write(name, delivery.payload, log_time, last_arrival)
         garbage.idle()
         if clock.now() >= next_flush:
-            writer.flush()
+            writer.flush(clock.now(), clock.now_ns() + to_unix)
             next_flush = clock.now() + flush_s
-            if (writer.error, bool(writer.lost)) != said:
-                said = _say(writer, health)
+            if (now := (writer.path, writer.error, bool(writer.lost))) != said:
+                said = now
+                _say(writer, health)
 
 
-def _say(writer: LogWriter, health: HealthPublisher) -> tuple[str | None, bool]:
+def _say(writer: PartedLog, health: HealthPublisher) -> None:
     error = writer.error
     note = f"writing {writer.path}"
     if error is None:
@@ -106,10 +110,9 @@ def _say(writer: LogWriter, health: HealthPublisher) -> tuple[str | None, bool]:
         log.error("ticks of the controller never arrived here; the log has gaps, and replay names them")
         note += "; THE LOG HAS GAPS: messages never arrived, see the counter 'lost ticks'"
     health.set("running", note)
-    return error, bool(writer.lost)
 
 
-def _finish(writer: LogWriter) -> int:
+def _finish(writer: PartedLog) -> int:
     if writer.last_bad is not None:
         log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
     if writer.lost:
@@ -120,11 +123,7 @@ def _finish(writer: LogWriter) -> int:
         writer.close()
     except LogError as error:
         log.error("%s", error)
-    if writer.written == 0:
+    if writer.counters["file bytes"] == 0:
         return EXIT_NOTHING_WRITTEN
     log.info("%s: %d messages", writer.path, writer.counters["messages"])
     return 0
-
-
-def _counters(writer: LogWriter) -> dict[str, int]:
-    return {**writer.counters, "write errors": writer.write_errors, "file bytes": writer.written}

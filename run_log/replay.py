@@ -283,7 +283,7 @@ def _collect(run: Run, run_id: str) -> _Recorded:
         keyframes=by_tick(topics.KEYFRAME),
         sets=_recorded_sets(run, run_id),
         # A simulation has no health; a live run that ended says so.
-        complete=not (run.truncated or run.recovered) and (not said or "stopping" in said),
+        complete=not run.ends_within and (not said or "stopping" in said),
     )
 
 
@@ -293,6 +293,9 @@ def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
     before = [seq for seq in recorded.keyframes if seq < wanted]
     if before:
         return max(before)
+    if from_tick is None and run.part > 1 and recorded.keyframes:
+        # What comes before its first keyframe is in the part before this one as well.
+        return min(recorded.keyframes)
     later = sorted(seq for seq in recorded.keyframes if seq < recorded.last)
     way = f"; the first one is after tick {later[0]}: use --from-tick {later[0] + 1}" if later else ""
     raise LogError(

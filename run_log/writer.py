@@ -31,6 +31,10 @@ from run_log.views import View, views
 PROFILE = "tandem"
 FORMAT = "1"
 """Of the log: which channels and attachments there are. Rises when an older reader would be misled."""
+IDENTITY = "tandem"
+"""Metadata that says what a log is of."""
+CONTINUED = "continued"
+"""Metadata of a log that goes on in another file."""
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 COUNTED = ("controller/tick", "controller/result")
 """Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
@@ -48,6 +52,7 @@ class LogWriter:
         start_ns: time of the attachments, in the same clock as the messages.
         versions: what ran; None: the packages installed here.
         patient: see `Sink`.
+        part: which one of its run's it is, from 1 (`run_log.parts`).
 
     Raises:
         LogExistsError: something is at `path` already.
@@ -63,6 +68,7 @@ class LogWriter:
         start_ns: int = 0,
         versions: dict[str, str] | None = None,
         patient: bool = False,
+        part: int = 1,
     ):
         self.counters = {"messages": 0, "bytes": 0, "without view": 0, "dropped": 0, "lost ticks": 0}
         self.bad: dict[str, int] = {}
@@ -87,7 +93,8 @@ class LogWriter:
             enable_data_crcs=True,
         )
         self._mcap.start(profile=PROFILE, library=f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}")
-        self._mcap.add_metadata("tandem", {"format": FORMAT, "name": config.name, "plant": plant.name})
+        identity = {"format": FORMAT, "name": config.name, "plant": plant.name, "part": str(part)}
+        self._mcap.add_metadata(IDENTITY, identity)
         for name, kind, text in _attachments(
             config, plant, versions if versions is not None else installed()
         ):
@@ -161,12 +168,16 @@ class LogWriter:
         self._mcap.flush()
         return self._sink.error is None
 
-    def close(self) -> None:
+    def close(self, continued: Path | None = None) -> None:
         """Write the index and close.
+
+        continued: the part in which the log goes on; None: it is the last.
 
         Raises:
             LogError: the file does not hold everything; `tandem recover` saves what it holds.
         """
+        if continued is not None:
+            self._mcap.add_metadata(CONTINUED, {"in": continued.name})
         self._mcap.finish()
         if not self._sink.close():
             raise LogError(f"{self._sink.error}; the log is cut short: `tandem recover` saves what there is")

@@ -1,4 +1,7 @@
-"""The files a run leaves: NAME.mcap, NAME.png and the folder NAME.processes. None is ever overwritten."""
+"""The files a run leaves: NAME.mcap (after long, NAME.part2.mcap and so on), NAME.png and the folder NAME.processes.
+
+None is ever overwritten.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from run_log.parts import existing_parts
 from tandem.terminal import Refused
 
 
@@ -29,8 +33,17 @@ class RunFiles:
     def config(self) -> Path:
         return self.folder / "config.toml"
 
-    def all(self) -> tuple[Path, Path, Path]:
-        return self.log, self.picture, self.folder
+    def all(self) -> list[Path]:
+        return [self.log, self.picture, self.folder, *self.later_parts]
+
+    @property
+    def later_parts(self) -> list[Path]:
+        """Those of its log, after the first, that are there."""
+        return [path for path in existing_parts(self.log) if path != self.log]
+
+    def moved(self, path: Path, to: RunFiles) -> Path:
+        """What one of `all` is called among the files `to`."""
+        return path.with_name(to.log.stem + path.name.removeprefix(self.log.stem))
 
 
 @contextmanager
@@ -76,8 +89,9 @@ def _move_aside(files: RunFiles) -> list[str]:
             break
         number += 1
     said = []
-    for old, new in zip(files.all(), aside.all(), strict=True):
+    for old in files.all():
         if os.path.lexists(old):
+            new = files.moved(old, aside)
             old.rename(new)
             if old != files.folder:
                 said.append(f"{old} was there already; it is now {new}")

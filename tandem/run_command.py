@@ -16,6 +16,7 @@ from node_runtime.config import Config, to_toml
 from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
 from run_log import report
 from run_log.errors import LogError
+from run_log.parts import existing_parts
 from run_log.reader import read_run
 from run_log.summary import summarise
 from tandem import figures, terminal
@@ -94,7 +95,8 @@ def _conclude(
     result: dict[str, Any] = {}
     try:
         with Status("reading the log and drawing", console=console):
-            ran = read_run(files.log)
+            parts = existing_parts(files.log)
+            ran = read_run(parts[0] if parts else files.log)
             summary = summarise(ran)
             picture = report.picture(ran, files.picture)
     except LogError as error:
@@ -103,8 +105,12 @@ def _conclude(
         result = figures.of(summary)
         console.print(figures.table(summary))
         console.print(f"picture {_near(picture)}", markup=False, soft_wrap=True)
-        console.print(f"replay  tandem replay {_near(files.log)}", markup=False, soft_wrap=True)
-        if ran.note:
+        for part in parts:
+            console.print(f"replay  tandem replay {_near(part)}", markup=False, soft_wrap=True)
+        if len(parts) > 1:
+            text = f"the log has {len(parts)} parts; table and picture are of the first, {_near(parts[0])}"
+            console.print(text, style="yellow", markup=False, soft_wrap=True)
+        elif ran.note:
             console.print(ran.note, style="yellow", markup=False, soft_wrap=True)
     if trouble is not None:
         terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)

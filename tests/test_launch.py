@@ -239,12 +239,15 @@ def test_a_configuration_that_admits_no_controller_is_a_mistake_in_the_configura
 
 def test_files_are_moved_aside_together_and_two_runs_do_not_meet(tmp_path: Path):
     log = tmp_path / "a.mcap"
-    for name in ("a.mcap", "a.png", "a.1.png"):
+    for name in ("a.mcap", "a.part2.mcap", "a.png", "a.1.png", "ab.part2.mcap"):
         (tmp_path / name).write_text(name)
     with claimed(log) as (files, moved):
         assert files.folder.is_dir()
         assert not log.exists()
-        assert len(moved) == 2
+        assert len(moved) == 3
+        assert not (tmp_path / "a.part2.mcap").exists()
+        assert (tmp_path / "a.2.part2.mcap").read_text() == "a.part2.mcap"
+        assert (tmp_path / "ab.part2.mcap").exists()
         assert (tmp_path / "a.2.mcap").read_text() == "a.mcap"
         assert (tmp_path / "a.2.png").read_text() == "a.png"
         assert (tmp_path / "a.1.png").read_text() == "a.1.png"

@@ -21,6 +21,7 @@ from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError
+from run_log.parts import existing_parts
 from run_log.reader import read_run
 from run_log.recover import recover
 from run_log.replay import replay
@@ -129,6 +130,24 @@ def readable(path: str) -> int:
         return len(read_run(path).timings)
     except LogError:
         return 0
+
+
+def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: Ear) -> None:
+    with recorder(override(config, ["log.split_minutes=0.01"])) as process:
+        recorded(plant, ear, process, config)
+        plant.publish(topics.TIMING, timing(0))
+        said = ear.until(noted("run.part2.mcap"))
+        assert isinstance(said, m.Health)
+        plant.publish(topics.TIMING, timing(1))
+        ear.until(lambda x: noted("part2")(x) and x.counters["messages"] > said.counters["messages"])
+        process.signal(signal.SIGINT)
+        assert process.end() == 0
+    first, second = (read_run(part) for part in existing_parts(Path(config.log.path)))
+    # No keyframe came, so both were written to the end, and each says who wrote it.
+    assert [timing.seq for timing in first.timings] == [0, 1]
+    assert [timing.seq for timing in second.timings] == [1]
+    assert [info.process for info in first.run_infos + second.run_infos] == ["recorder", "recorder"]
+    assert (first.continued, second.part) == ("run.part2.mcap", 2)
 
 
 def test_a_killed_recorder_leaves_what_was_said_before_its_last_flush(

@@ -123,6 +123,9 @@ class Rig:
         self.folder, self._places = folder, places or {}
         self._seed, self._around = seed, around or Surroundings()
         port = _free_port()
+        while f":{port}" in str(self._around.settings):
+            # The scene's door for other machines has it, though nobody listens there yet.
+            port = _free_port()
         self.config = override(
             config,
             [
