@@ -21,7 +21,7 @@ import zenoh
 
 from node_runtime import clock
 from node_runtime.bad_messages import BadMessages
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
 from node_runtime.gathering import Gathered, Gathering, Separating, size_of
 from node_runtime.mailbox import Delivery, Latest, Mailbox, Sink
 from node_runtime.pieces import Assembler, split
@@ -85,13 +85,7 @@ class Bus:
         """
         if self._control is not None:
             raise RuntimeError("this bus is open already")
-        control = connect(self.config, self._stop, self.process)
-        try:
-            self._bulk = connect(self.config, self._stop, self.process)
-        except (OpenInterrupted, ConfigError):
-            control.close()
-            raise
-        self._control = control
+        self._control, self._bulk = connect(self.config, self._stop, self.process, 2)
         for topic in topics.ALL:
             if topic.writer == self.process:
                 self._publisher(topic)

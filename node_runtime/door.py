@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 # Zenoh opens a link that is welcome within some ten milliseconds.
 FIRST_KNOCK_S = 0.5
 NEXT_KNOCK_S = 3.0
+LOOK_AGAIN_S = 3600.0
+"""Seconds between two looks at the clock, which may be set meanwhile."""
 
 
 class Door:
@@ -54,6 +56,19 @@ class Door:
                 self._knocking = threading.Thread(target=self._knock, name="knock", daemon=True)
                 self._knocking.start()
         return self._reason
+
+    def watch(self, stop: threading.Event) -> None:
+        """Say it in the log when the certificate is over: the links end then, and Zenoh says nothing."""
+
+        def look() -> None:
+            while (reason := self._credentials.expired()) is None:
+                # A little later than that moment, so that it is over in any case.
+                left_s = self._credentials.days_left() * 86400.0
+                if stop.wait(min(LOOK_AGAIN_S, left_s + 0.1)):
+                    return
+            log.error("%s; our links to %s end now. Start again with the new one", reason, self._endpoint)
+
+        threading.Thread(target=look, name="certificate", daemon=True).start()
 
     def _knock(self) -> None:
         self._reason = self._credentials.expired() or knock(self._endpoint, self._credentials)

@@ -9,12 +9,16 @@ import threading
 from collections.abc import Mapping
 from concurrent.futures import Future
 from concurrent.futures import wait as wait_for
-from typing import Any, Literal
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Literal
 
 import zenoh
 
 from node_runtime import clock
 from node_runtime.config import Config, ConfigError
+
+if TYPE_CHECKING:
+    from node_runtime.door import Door
 
 log = logging.getLogger(__name__)
 
@@ -103,23 +107,36 @@ def lease_ms(config: Config, process: str) -> int:
     return short if process in OBEYING else max(short, PATIENT_LEASE_MS)
 
 
-def connect(config: Config, stop: threading.Event, process: str) -> zenoh.Session:
-    """A client session of `process` to the router at `config.bus.endpoint`; waits for the router for ever.
-
-    `zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind.
+def connect(
+    config: Config, stop: threading.Event, process: str, sessions: int = 1
+) -> tuple[zenoh.Session, ...]:
+    """Client sessions of `process` to the router at `config.bus.endpoint`; waits for the router for ever.
 
     Raises:
         OpenInterrupted: `stop` was set first.
         ConfigError: the endpoint is none; our certificate cannot be used; or the router and we refuse each other,
             which no waiting heals. The text says why.
     """
-    endpoint = config.bus.endpoint
     door = None
-    if secure(endpoint):
+    if secure(config.bus.endpoint):
         # Only here, for a machine that needs no certificates loads nothing for them.
         from node_runtime.door import Door
 
         door = Door(config, process)
+    with ExitStack() as undo:
+        opened = []
+        for _ in range(sessions):
+            opened.append(_connect(config, stop, process, door))
+            undo.callback(opened[-1].close)
+        undo.pop_all()
+    if door is not None:
+        door.watch(stop)
+    return tuple(opened)
+
+
+def _connect(config: Config, stop: threading.Event, process: str, door: Door | None) -> zenoh.Session:
+    """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
+    endpoint = config.bus.endpoint
     client = session_config(
         "client", endpoint, lease_ms(config, process), more=None if door is None else door.settings
     )

@@ -8,9 +8,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from live import HANG_S, Process, free_endpoint, live_config
+from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from live import HANG_S, Process, free_endpoint, live_config, wait_for
 from test_trainer_node import TRAINING, Controller
 
+from node_runtime import credentials
 from node_runtime.config import Config, ConfigError, from_json, load, override, to_json, to_toml
 from protocol.messages import Health
 from tandem import keys_files
@@ -127,3 +130,25 @@ def test_the_list_in_a_file(tmp_path: Path) -> None:
             load(file)
         assert says in str(raised.value)
         assert str(file) in str(raised.value)
+
+
+def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.finding.TRY_AGAIN", 0.2)
+    only = site(tmp_path, "jet1")
+    folder = tmp_path / "jet1"
+    authority = folder / "authority"
+    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
+    assert isinstance(key, EllipticCurvePrivateKey)
+    issuer = credentials.load_certificate(authority / "certificate.pem")
+    keys_files.issue(folder / "trainer", "trainer.jet1", key, issuer, 3.0 / 86400.0, [])
+    with ExitStack() as stack:
+        stack.enter_context(routing(only))
+        plant = stack.enter_context(Controller(only, "controller-1"))
+        stack.enter_context(training(fleet(tmp_path, only)))
+        first = plant.until(published, tick=True)
+        wait_for(lambda: any("expired on" in text for text in caplog.messages))
+        keys_files.renew("trainer", folder, [], 30, None)
+        plant.until(published, tick=True, ignored=first.run_id)
+    assert any("our links to" in text for text in caplog.messages)

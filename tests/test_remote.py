@@ -331,6 +331,49 @@ def test_a_message_beyond_its_topic_s_size_ends_at_the_router(site: Site):
         assert len(heard.recv().payload) == health.max_bytes
 
 
+# -- how long a link lasts, and the other protocol ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_a_link_ends_with_its_certificate_and_the_process_says_so(
+    site: Site, protocol: str, caplog: pytest.LogCaptureFixture
+):
+    place = f"short-{protocol}"
+    _issue(site.folder, place, "trainer.jet1", 3.0 / 86400.0)
+    remote = free_endpoint().replace("tcp/", f"{protocol}/")
+    local = override(site.local, [f'bus.remote="{remote}"', f'bus.endpoint="{free_endpoint()}"'])
+    far = override(site.far("trainer", "jet1"), [f'bus.endpoint="{remote}"'])
+    short = override(far, [f'bus.tls.keys="{site.folder / "jet1" / place}"'])
+    with (
+        Router(local),
+        Bus(local, "controller", "c-1") as controller,
+        Bus(far, "trainer", "t-1") as trainer,
+        Bus(short, "trainer", "t-2") as brief,
+    ):
+        weights, commands = controller.queue(topics.HIDDEN_WEIGHTS), controller.queue(topics.COMMAND)
+        heard = trainer.queue(topics.SAMPLES), brief.queue(topics.SAMPLES)
+        # The rights are the same by either protocol.
+        wait_for(lambda: trainer.matched(topics.HIDDEN_WEIGHTS))
+        trainer._session().put(topics.COMMAND.key("jet1"), b"bad")
+        trainer._put(topics.HIDDEN_WEIGHTS, b"weights")
+        arrived = weights.get(HANG_S)
+        assert arrived is not None
+        assert arrived.payload == b"weights"
+        assert commands.drain() == []
+
+        def both_hear() -> bool:
+            controller._put(topics.SAMPLES, b"samples")
+            return all(box.drain() for box in heard)
+
+        wait_for(both_hear, every=0.05)
+        wait_for(lambda: not brief.connected)
+        wait_for(lambda: any("expired on" in text and "our links to" in text for text in caplog.messages))
+        assert trainer.connected
+        controller._put(topics.SAMPLES, b"later")
+        wait_for(lambda: b"later" in [one.payload for one in heard[0].drain()])
+        assert b"later" not in [one.payload for one in heard[1].drain()]
+
+
 # -- what needs no router --------------------------------------------------------------------------------------------
 
 

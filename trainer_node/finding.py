@@ -15,7 +15,7 @@ import zenoh
 
 from node_runtime import clock
 from node_runtime.config import Config, ConfigError, PlantPlace
-from node_runtime.session import OpenInterrupted
+from node_runtime.session import OpenInterrupted, secure
 from protocol import topics
 from protocol.topics import Topic
 from trainer_node.plant_bus import Sessions
@@ -136,6 +136,8 @@ class OwnRouters:
         self._heard = Heard("*")
         self._lock = threading.Lock()
         self._reached: dict[str, Sessions] = {}
+        """The latest of each plant, whether they are open still or not."""
+        self._open: set[str] = set()
         self._leaving = threading.Event()
         self._threads = [
             threading.Thread(target=self._reach, args=(name,), name=f"reach {name}", daemon=True)
@@ -154,7 +156,7 @@ class OwnRouters:
 
     def present(self, now: float) -> Sequence[str]:
         with self._lock:
-            return [name for name in self._heard.present(now) if name in self._reached]
+            return [name for name in self._heard.present(now) if name in self._open]
 
     def config(self, plant: str) -> Config:
         place, bus = self._places[plant], self._config.bus
@@ -166,22 +168,37 @@ class OwnRouters:
         return self._reached[plant]
 
     def _reach(self, name: str) -> None:
-        """In a thread of its own: open the plant's sessions, and keep them until all is over."""
+        """In a thread of its own: keep the plant's sessions open, anew with a new certificate when one is over."""
+        config = self.config(name)
         while not self._leaving.is_set():
             try:
-                with Sessions(self.config(name), "trainer", self._stop) as sessions:
+                valid_s = _valid_s(config)
+                with Sessions(config, "trainer", self._stop) as sessions:
                     subscribers = self._heard.listen(sessions.bulk, name, READABLE)
                     with self._lock:
                         self._reached[name] = sessions
-                    log.info("%s: reached at %s", name, self._places[name].endpoint)
-                    self._leaving.wait()
+                        self._open.add(name)
+                    log.info("%s: reached at %s", name, config.bus.endpoint)
+                    self._leaving.wait(valid_s)
+                    with self._lock:
+                        self._open.discard(name)
                     _undeclare(subscribers)
-                return
             except OpenInterrupted:
                 return
-            except ConfigError as error:
+            except (ConfigError, zenoh.ZError) as error:
                 log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN)
-            self._leaving.wait(TRY_AGAIN)
+                self._leaving.wait(TRY_AGAIN)
+
+
+def _valid_s(config: Config) -> float | None:
+    """For how many seconds the certificate for this address is valid, and a moment more; None: it needs none."""
+    if not secure(config.bus.endpoint):
+        return None
+    # Only here, for a machine that needs no certificates loads nothing for them.
+    from node_runtime import credentials
+
+    own = credentials.of_process(config.bus.tls.keys, "trainer", config.name)
+    return min(own.days_left() * 86400.0 + 1.0, threading.TIMEOUT_MAX)
 
 
 def _undeclare(subscribers: Iterable[zenoh.Subscriber[None]]) -> None:

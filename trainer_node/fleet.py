@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import msgspec
+import zenoh
 
 from node_runtime import clock
 from node_runtime.health import HealthPublisher, Heart, run_info
@@ -81,11 +82,14 @@ class Fleet:
     def _gather(self, now: float) -> None:
         present = self._finder.present(now)
         for name in set(self._nodes) - set(present):
-            log.info("%s has been silent for %.0f s; dropped until it comes back", name, SILENT)
+            log.info("%s: no link, or not a word for %.0f s; dropped until it comes back", name, SILENT)
             self._drop(name)
         # A few at a time: those that are here must not wait for all that come.
         for name in [name for name in present if name not in self._nodes][:AT_ONCE]:
-            self._take_in(name)
+            try:
+                self._take_in(name)
+            except zenoh.ZError as error:
+                log.warning("%s could not be taken in: %s", name, error)
         if not present and now >= self._say_at:
             self._say_at = now + SAY_EVERY
             log.info("waiting for %s", self._finder.looks_for)

@@ -31,7 +31,6 @@ class Sessions:
 
     def __init__(self, config: Config, process: str, stop: threading.Event):
         self._config, self._process, self.stop = config, process, stop
-        self._leaving = contextlib.ExitStack()
         self._outgoing: queue.SimpleQueue[tuple[PlantBus, Topic, Payload] | None] = queue.SimpleQueue()
         self._sender = threading.Thread(target=self._send, name="bulk", daemon=True)
 
@@ -48,13 +47,12 @@ class Sessions:
                 # Whatever one plant's message did, the others' are to be sent.
                 log.exception("a message of %s at %s was not sent", bus.config.name, topic.name)
 
+    def _leave(self) -> None:
+        self.control.close()
+        self.bulk.close()
+
     def __enter__(self) -> Sessions:
-        with contextlib.ExitStack() as opened:
-            self.control = connect(self._config, self.stop, self._process)
-            opened.callback(self.control.close)
-            self.bulk = connect(self._config, self.stop, self._process)
-            opened.callback(self.bulk.close)
-            self._leaving = opened.pop_all()
+        self.control, self.bulk = connect(self._config, self.stop, self._process, 2)
         self._sender.start()
         return self
 
@@ -62,7 +60,7 @@ class Sessions:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # Leaving a link that is full and dead could take long, and the process must end nevertheless.
-        leaving = threading.Thread(target=self._leaving.close, name="leave", daemon=True)
+        leaving = threading.Thread(target=self._leave, name="leave", daemon=True)
         leaving.start()
         leaving.join(2.0)
         self._outgoing.put(None)

@@ -133,7 +133,7 @@ def flood(config: Config, kind: str, rate: float, seconds: float, seed: int) -> 
     sent: Counter[str] = Counter()
     with Bus(config, "monitor", STRANGER) as bus:
         ear = Ear(bus.everything(), topics.everything(config.name).removesuffix("**"))
-        session = connect(config, stop, "monitor")
+        (session,) = connect(config, stop, "monitor")
         block = zenoh.CongestionControl.BLOCK
         put = {
             t.name: session.declare_publisher(t.key(config.name), congestion_control=block)
@@ -208,7 +208,7 @@ def steal(config: Config, kind: str, rate: float, seconds: float, seed: int) -> 
     version = -1
     with Bus(config, "monitor", STRANGER) as bus:
         mailbox = bus.queue(topics.HIDDEN_WEIGHTS)
-        session = connect(config, threading.Event(), "monitor")
+        (session,) = connect(config, threading.Event(), "monitor")
         block = zenoh.CongestionControl.BLOCK
         put = session.declare_publisher(topics.HIDDEN_WEIGHTS.key(config.name), congestion_control=block)
         end, due = clock.now() + seconds, clock.now()
