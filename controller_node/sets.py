@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import io
 import os
 import tempfile
 import zipfile
@@ -33,6 +34,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "configs" / "sets"
 Kind = Literal["given", "box", "hull", "regions"]
 PREFERRED: tuple[Kind, ...] = ("regions", "hull", "box")
 """What is looked for where no file is named: the largest first."""
+LARGEST = 256 * 1024 * 1024
+"""Bytes of sets, unpacked: a small file may say that it is any size."""
 GZIPPED = b"\x1f\x8b"
 
 
@@ -71,9 +74,14 @@ class CertifiedSets:
         """Raises `CertificateError`: not such a file, edited, or inconsistent."""
         if data.startswith(GZIPPED):
             try:
-                data = gzip.decompress(data)
+                with gzip.open(io.BytesIO(data)) as file:
+                    data = file.read(LARGEST + 1)
             except (OSError, EOFError, zlib.error) as error:
                 raise CertificateError(f"a damaged gzip file: {error}") from error
+            if len(data) > LARGEST:
+                raise CertificateError(
+                    f"more than {LARGEST / 1e6:.0f} MB when unpacked; no such sets are known"
+                )
         try:
             content = msgspec.json.decode(data, type=_Content)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:

@@ -201,6 +201,12 @@ def test_a_gzipped_file_is_the_same_sets(cached: Path):
         read_sets(cached / "torn.json.gz")
 
 
+def test_a_small_file_cannot_unpack_to_any_size(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("controller_node.sets.LARGEST", 10_000)
+    with pytest.raises(CertificateError, match="when unpacked"):
+        CertifiedSets.from_bytes(gzip.compress(bytes(1_000_000)))
+
+
 def test_a_run_is_replayed_from_its_log_alone(cached: Path):
     ran = simulate(invariant(), 30)
     summary = summarise(ran)
