@@ -28,7 +28,7 @@ STEPS = 80
 SHORT, LONG = 3.0, 6.0
 DELAY = 0.002
 """Seconds from a sample until its command acts."""
-MARGINS = (0.0, 0.0025, 0.005, 0.0125)
+MARGINS = (0.0, 0.005, 0.0075, 0.0125)
 OUTSIDE = 1e-9
 
 

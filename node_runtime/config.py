@@ -60,7 +60,7 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
-    plan_patience: Positive = 1.5
+    plan_patience: Positive = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
 
@@ -81,7 +81,7 @@ class BackupConfig(Section, frozen=True):
 
     enabled: bool = True
     """Up to 100 Hz; in a faster loop there is no time for it, and the plan is what the plant follows."""
-    margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.005
+    margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.0075
     """By how much X shrinks for it, as a share of its half-widths."""
 
 
