@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import tyro
 
+from benchmarks import processes
 from benchmarks.marks import DocumentError, Marks
-from node_runtime import machine
+from node_runtime import clock, machine
 from node_runtime.choices import SolverMode
 from node_runtime.config import Config
 from protocol import topics
@@ -46,9 +47,11 @@ COLUMNS = (
     "others, %",
     "tick p50 / p99, ms",
     "solve p50 / p99, ms",
+    "of a core: controller, plant, router, others",
     "constraint violations",
     "replay",
 )
+FIRST = ("controller", "plant", "router")
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
     for override in _overrides(settings, mode):
         arguments += ["--set", override]
     running = _tandem(*arguments)
-    empty = _beside(rate, settings.seconds, running)
+    empty, cores = _beside(rate, settings.seconds, running)
     running.communicate()
     try:
         ran = read_run(log)
@@ -133,13 +136,16 @@ def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
         *(["", ""] if empty is None else _beside_misses(ran, empty)),
         _spread(found.tick_ms),
         _spread(found.solve_ms),
+        ", ".join(f"{share:.2f}" for share in cores),
         str(found.constraint_violations),
         _replayed(log),
     ]
 
 
-def _beside(rate: int, seconds: float, running: subprocess.Popen[str]) -> dict[str, Any] | None:
-    """The empty loop's figures from the middle of the run; None when it did not run."""
+def _beside(
+    rate: int, seconds: float, running: subprocess.Popen[str]
+) -> tuple[dict[str, Any] | None, list[float]]:
+    """From the middle of the run: the empty loop's figures, None when it did not run, and what took the cores."""
     # Processes need some seconds to start; the loop waits here for the controller's first tick, not for the clock.
     assert running.stderr is not None
     for line in running.stderr:
@@ -147,9 +153,13 @@ def _beside(rate: int, seconds: float, running: subprocess.Popen[str]) -> dict[s
             break
     module = ["-m", "benchmarks.wakeups", "--rate", str(rate), "--seconds", str(0.8 * seconds)]
     priority = ["--priority", str(Config().realtime.priority + 1)]
+    before, began = processes.busy(running.pid), clock.now()
     done = subprocess.run([sys.executable, *module, *priority], capture_output=True, text=True, check=False)
     found: dict[str, Any] | None = json.loads(done.stdout) if done.returncode == 0 else None
-    return found
+    took, after = clock.now() - began, processes.busy(running.pid)
+    share = {name: (after[name] - before[name]) / took for name in after if name in before}
+    rest = sum(value for name, value in share.items() if name not in FIRST)
+    return found, [*(share.get(name, 0.0) for name in FIRST), rest]
 
 
 def _beside_misses(run: Run, empty: dict[str, Any]) -> list[str]:

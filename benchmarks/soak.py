@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from benchmarks import stalls
+from benchmarks import processes, stalls
 from benchmarks.marks import DocumentError, Marks
 from node_runtime import machine
 from node_runtime.config import Config
@@ -50,7 +50,6 @@ LOOKS = {
     "plant": (SKY, "-."),
     "controller": (BLUE, "-"),
 }
-NAMES = {"record": "recorder"}
 CONFIDENCE = 0.95
 AT_LEAST = 4
 """Readings after the first minute; with fewer there is no slope."""
@@ -161,7 +160,7 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
             while running.poll() is None and time.monotonic() < began + seconds:
                 elapsed = time.monotonic() - began
                 bar.update(task, completed=elapsed)
-                for name, rss in resident(running.pid).items():
+                for name, rss in processes.resident(running.pid).items():
                     readings.setdefault(name, []).append((elapsed / 60.0, rss))
                 due = settings.every * (elapsed // settings.every + 1)
                 time.sleep(max(0.0, min(due - elapsed, seconds - elapsed)))
@@ -171,27 +170,6 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
         console.print(f"tandem run failed with exit code {running.returncode}", style="red")
         return None
     return {name: fit(values, settings.warm / 60.0) for name, values in readings.items()}, json.loads(out)
-
-
-def resident(supervisor: int) -> dict[str, int]:
-    """Resident memory, kB, of `tandem run` and of the processes that it started, by name."""
-    found = {}
-    page = 4096
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            words = (entry / "cmdline").read_bytes().split(b"\0")
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            pages = int((entry / "statm").read_text().split()[1])
-        except (OSError, IndexError):  # it ended meanwhile
-            continue
-        if int(entry.name) == supervisor:
-            found["supervisor"] = pages * page // 1024
-        elif parent == supervisor and b"tandem.child" in words:
-            command = words[words.index(b"tandem.child") + 2].decode()
-            found[NAMES.get(command, command)] = pages * page // 1024
-    return found
 
 
 def fit(readings: list[tuple[float, int]], warm: float) -> Memory:

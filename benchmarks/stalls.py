@@ -16,7 +16,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-PERIOD = 0.01
+PERIOD = 0.002
+"""Seconds. A stall is seen where a loop should have woken during it, so none longer than this and `NOTED` is missed."""
 NOTED = 0.002
 ABOVE = 5
 """How far their priority lies above the loops' own."""
