@@ -19,9 +19,10 @@ from protocol.network import NetworkDescription, initial_hidden
 from protocol.topics import Topic
 from trainer_node import finding
 from trainer_node.descent import Problem, descend_together
-from trainer_node.finding import Heard
-from trainer_node.fleet import seed_of
+from trainer_node.finding import Heard, OneRouter
+from trainer_node.fleet import SAY_EVERY, Fleet, seed_of
 from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
+from trainer_node.plant_bus import Sessions
 from trainer_node.training import Draw, Trainer, use_one_thread
 
 TRAINING = TrainerConfig(capacity=600, batch=128, steps=40, device="cpu")
@@ -129,6 +130,21 @@ def test_a_stranger_who_invents_names_fills_no_memory() -> None:
     for k in range(finding.MOST + 100):
         heard.note(f"tandem/x{k}/controller/samples", 0.0)
     assert len(heard.present(0.0)) == finding.MOST
+
+
+class Nobody(OneRouter):
+    """A router behind which there is no plant."""
+
+    def __init__(self) -> None:
+        super().__init__(Config(), "jet*", cast(Sessions, None))
+
+
+def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    fleet = Fleet(Nobody())
+    for now in (0.0, 1.0, SAY_EVERY - 1.0, SAY_EVERY + 1.0):
+        fleet.turn(now)
+    assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
 
 
 def test_the_seed_is_the_name_and_not_the_order() -> None:

@@ -50,7 +50,8 @@ def test_two_plants_get_weights_each_and_a_stranger_gets_none(
         assert {weights.for_run for weights in two.adopted} == {"two"}
         pump.tick()
         assert not pump.adopted
-    assert "no plant matches 'jet*' yet" in caplog.text
+    assert "jet2 has come" in caplog.text
+    assert "pump" not in caplog.text
 
 
 def test_many_plants_have_no_thread_each(fleet: Config) -> None:
