@@ -28,6 +28,8 @@ MOST = 1024
 """Plants followed at once: a stranger who invents names must not fill the memory."""
 TRY_AGAIN = 10.0
 """Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
+LET_GO = 1.0
+"""Seconds from the end of a certificate until its sessions are closed."""
 NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
 READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
@@ -183,6 +185,8 @@ class OwnRouters:
                     with self._lock:
                         self._open.discard(name)
                     _undeclare(subscribers)
+                    # The fleet lets go of the plant first, and says a last word for it.
+                    self._leaving.wait(LET_GO)
             except OpenInterrupted:
                 return
             except (ConfigError, zenoh.ZError) as error:
