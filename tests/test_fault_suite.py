@@ -173,6 +173,8 @@ def test_control_is_back_with_the_first_fresh_command_that_is_followed_by_no_out
     assert measured._control_at(motion, 0.25, 0.45) == pytest.approx(0.7)
     assert measured._control_at(motion[:3], 0.05, None) == 0.05
     assert measured._control_at(motion[:5], 0.25, None) is None
+    late = [sampled("plan" if i == 20 else "command", 0.1 * i) for i in range(30)]
+    assert measured._control_at(late, 0.25, None) == 0.25
 
 
 def began(run_id: str, *times: float) -> list[m.Tick]:

@@ -222,7 +222,8 @@ def _back_at(rig: Rig, fault_at: float) -> float | None:
 def _control_at(moving: list[Sampled], fault_at: float, back_at: float | None) -> float | None:
     """When fresh commands drove the plant again; the fault's own moment when they never ceased."""
     ceased = [one.state.t for one in moving if one.state.t > fault_at and one.state.source in OTHERWISE]
-    if not ceased:
+    if not ceased or ceased[0] - fault_at > APART_S:
+        # What ceases long after the fault is a late tick, and counts as such.
         return fault_at
     end = ceased[0]
     for before, after in pairwise(ceased):
