@@ -37,7 +37,9 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
+PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
+"""What may be part of a key on the bus."""
+Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
 
 
 Fail = Callable[[str, str], NoReturn]

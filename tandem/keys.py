@@ -10,13 +10,14 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from node_runtime.config import PLANT_NAME
 from node_runtime.credentials import WARN_DAYS
 from protocol.rights import ROLES, rights_of
 from tandem import keys_files, terminal
 from tandem.keys_files import AUTHORITY_FOLDER, Issued
 from tandem.terminal import Refused
 
-PLANT = re.compile(r"[A-Za-z0-9_-]{1,40}")
+PLANT = re.compile(PLANT_NAME)
 
 
 def create(plant: str, hosts: Sequence[str], out: Path | None, days: int, as_json: bool) -> int:

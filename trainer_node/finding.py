@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 
 from node_runtime import clock
-from node_runtime.config import Config, ConfigError, PlantPlace
+from node_runtime.config import PLANT_NAME, Config, ConfigError, PlantPlace
 from node_runtime.session import OpenInterrupted, secure
 from protocol import topics
 from protocol.topics import Topic
@@ -30,7 +30,7 @@ TRY_AGAIN = 10.0
 """Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
 LET_GO = 1.0
 """Seconds from the end of a certificate until its sessions are closed."""
-NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+NAME = re.compile(PLANT_NAME)
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
 READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
 """Of these, what a trainer's certificate may read."""
