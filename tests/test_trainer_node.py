@@ -73,7 +73,7 @@ class Controller:
         self.run_id = run_id
         self.description = description
         self.hidden = initial_hidden(description, np.random.default_rng(seed))
-        self.version = 0
+        self.version, self.heard = 0, -1
         self.adopts = True
         self.claimed = ""
         self.adopted: list[HiddenWeights] = []
@@ -120,6 +120,7 @@ class Controller:
         if not lost:
             self.bus.publish(topics.SAMPLES, Samples(run_id=self.run_id, seq=self.seq, samples=batch))
         received = self._weights.take()
+        self.heard = max(self.heard, received.message.seq if received else -1)
         if self.adopts and received is not None and received.message.seq > self.version:
             self.adopted.append(received.message)
             self.version = received.message.seq
@@ -288,6 +289,55 @@ def test_a_controller_that_refuses_is_asked_what_it_holds(
         controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
         assert controller.adopted[0].base_sha256 == base
         assert controller.adopted[0].seq >= 2
+
+
+@pytest.mark.parametrize(("patience", "lead"), [(2 * PATIENCE, 0), (0.3, 20)], ids=["adopted", "heard"])
+def test_a_thief_under_its_name_does_not_silence_a_trainer(
+    config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int
+) -> None:
+    """A stranger's sets are adopted, which is known at once; or a later one is only heard, and versions must pass it."""
+    monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", patience)
+    patient = msgspec.structs.replace(
+        config, bus=msgspec.structs.replace(config.bus, follow_silence=2 * PATIENCE)
+    )
+    rng = np.random.default_rng(3)
+    with (
+        Controller(patient, "controller-1") as controller,
+        RunningTrainer(config, "trainer-1"),
+        Bus(config, "monitor", "thief") as thief,
+    ):
+        forged: list[str] = []
+
+        def steal(lead: int) -> None:
+            layers = [layer + 0.1 * rng.standard_normal(layer.shape) for layer in controller.hidden]
+            packed = [Array.of(layer, "<f4") for layer in layers]
+            forged.append(hash_layers([array.numpy() for array in packed]))
+            weights = msgspec.structs.replace(
+                controller.adopted[-1],
+                seq=controller.adopted[-1].seq + lead,
+                sha256=forged[-1],
+                layers=packed,
+            )
+            thief.publish(topics.HIDDEN_WEIGHTS, weights)
+
+        def in_use() -> str:
+            return controller.adopted[-1].sha256 if controller.adopted else ""
+
+        def stolen(_: Health) -> bool:
+            # Again and again: what the trainer sent meanwhile is ahead of it.
+            if in_use() not in forged:
+                steal(5)
+            return in_use() in forged
+
+        for _ in range(3):
+            controller.until(lambda _: in_use() not in ("", *forged), tick=True)
+            controller.until(stolen, tick=True)
+            if lead:
+                controller.adopts = False
+                steal(lead)
+                controller.until(lambda _: controller.heard >= controller.adopted[-1].seq + lead, tick=True)
+                controller.adopts = True
+        controller.until(lambda _: in_use() not in forged, tick=True)
 
 
 def test_another_network_begins_anew(config: Config) -> None:

@@ -179,16 +179,20 @@ class TrainerNode:
             if self._unadopted_since is not None:
                 self._count("adopted")
             self._unadopted_since = None
-        elif self._unadopted_since is None:
+            return
+        if self._unadopted_since is None:
             self._unadopted_since = now
-        elif now - self._unadopted_since > self._patience and not self._resync:
-            # Refused, lost on the way, or another trainer's were adopted: what the controller holds is right.
+        # Refused, lost on the way, or another's were adopted: what the controller holds is right. Of another's it need
+        # not be thought that ours are only under way.
+        elsewhere = output.hidden_version > self._trainer.version
+        if (elsewhere or now - self._unadopted_since > self._patience) and not self._resync:
             self._count("not adopted")
             log.warning(
-                "the controller still holds hidden weights version %d and not %d; going on from its own",
+                "the controller holds hidden weights version %d and not %d; going on from its own",
                 output.hidden_version,
                 self._trainer.version,
             )
+            self._trainer.leap()
             self._resync = True
 
     def _must_join(self) -> bool:

@@ -24,6 +24,10 @@ from trainer_node.replay_buffer import ReplayBuffer
 
 BASES = 8
 """Sets of hidden layers remembered, newest last: one of them must be what the controller's K belongs to."""
+LEAP = 1000
+"""From one version to the next where somebody else sends weights too: more than a stranger sends meanwhile."""
+FARTHEST = 10**8
+"""How far versions may run ahead of the adopted: a controller refuses those that are 1e9 ahead."""
 
 
 def use_one_thread() -> None:
@@ -96,6 +100,7 @@ class Trainer:
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
         self._fresh = 0
+        self._step = 1
         self.resume(hidden, version)
 
     @property
@@ -124,6 +129,14 @@ class Trainer:
         self._bases.clear()
         self._take(hidden)
         self.version = max(self.version, version)
+
+    def leap(self) -> None:
+        """From now on leave gaps between versions: what was sent last did not come to be used.
+
+        Who else sends weights under this trainer's name is ahead of it by a few versions, and a controller takes none
+        that is behind what it heard.
+        """
+        self._step = LEAP
 
     def add(self, run_id: str, samples: Iterable[Sample]) -> int:
         """Offer samples of one controller run; bad ones are counted, left out. Returns how many are new."""
@@ -225,7 +238,8 @@ class Trainer:
             raise _Kept("loss not lower")
         self._bases.move_to_end(output.hidden_sha256)
         self._take(trained)
-        self.version = max(self.version, output.hidden_version) + 1
+        near = self.version < output.hidden_version + FARTHEST
+        self.version = max(self.version, output.hidden_version) + (self._step if near else 1)
         self.counters["trained"] += 1
         return HiddenWeights(
             run_id=self.run_id,
