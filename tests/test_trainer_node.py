@@ -291,7 +291,7 @@ def test_a_controller_that_refuses_is_asked_what_it_holds(
         assert controller.adopted[0].seq >= 2
 
 
-@pytest.mark.parametrize(("patience", "lead"), [(2 * PATIENCE, 0), (0.3, 20)], ids=["adopted", "heard"])
+@pytest.mark.parametrize(("patience", "lead"), [(2 * PATIENCE, 0), (0.3, 400)], ids=["adopted", "heard"])
 def test_a_thief_under_its_name_does_not_silence_a_trainer(
     config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int
 ) -> None:
