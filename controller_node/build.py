@@ -19,7 +19,8 @@ from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.polytope import EmptySetError
 from lbmpc.solver import Solver
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
+from node_runtime.strict import ConfigError
 from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription
 

@@ -16,12 +16,13 @@ from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
 from node_runtime import clock
 from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
 from node_runtime.health import HealthPublisher
 from node_runtime.inbox import Inbox, Received
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime import GarbageCollection, core_for, on_core, one_blas_thread, punctual, said_of
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 

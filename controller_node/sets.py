@@ -25,7 +25,8 @@ import numpy as np
 from lbmpc.model import Model
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
+from node_runtime.strict import ConfigError
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""

@@ -12,16 +12,8 @@ import msgspec
 
 from experiments.faults import Faults
 from lbmpc.plants import Plant
-from node_runtime.config import (
-    Config,
-    ConfigError,
-    PositiveInt,
-    Section,
-    apply_override,
-    from_tree,
-    load_tree,
-    strict,
-)
+from node_runtime.config import Config, PositiveInt, Section, from_tree
+from node_runtime.strict import ConfigError, apply_override, load_tree, strict
 
 Picture = Literal["trajectories", "states", "survival", "lemma", "recovery", "rows"]
 Name = Annotated[str, msgspec.Meta(pattern=r"^[^/\\]{1,60}$")]

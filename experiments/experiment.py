@@ -15,7 +15,8 @@ from experiments.report import header, page
 from experiments.runner import run_all, time_all, wanted
 from experiments.work import write_whole
 from lbmpc.plants import Plant
-from node_runtime.config import Config, ConfigError, from_tree
+from node_runtime.config import Config, from_tree
+from node_runtime.strict import ConfigError
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""

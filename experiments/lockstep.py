@@ -19,8 +19,9 @@ from controller_node.build import initial_state
 from controller_node.core import ControllerCore, Outputs
 from experiments.faults import Faults
 from lbmpc.plants import Plant, PlantError
-from node_runtime.config import Config, ConfigError, override
+from node_runtime.config import Config, override
 from node_runtime.realtime import one_blas_thread
+from node_runtime.strict import ConfigError
 from plant_sim.plant import PlantSim
 from protocol import messages as m
 from protocol import topics

@@ -8,17 +8,13 @@ the paper leaves out.
 from __future__ import annotations
 
 import difflib
-import tomllib
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar
+from typing import Annotated, Any, Literal
 
 import msgspec
-import msgspec.inspect
 import tomli_w
 
-from node_runtime import config_words
 from node_runtime.choices import (
     AdoptionName,
     AwakeMode,
@@ -29,6 +25,7 @@ from node_runtime.choices import (
     Strategy,
     TighteningName,
 )
+from node_runtime.strict import ConfigError, Fail, apply_override, convert, failing, load_tree
 from protocol.architecture import BOUNDED, Activation, get_architecture
 from protocol.codec import first_non_finite
 from protocol.network import Width
@@ -42,16 +39,9 @@ PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
 
 
-Fail = Callable[[str, str], NoReturn]
-T = TypeVar("T", bound=msgspec.Struct)
-
 AWAKE_BELOW = 0.01
 """Seconds. Waking a sleeping core takes up to a few tenths of a millisecond: little of a longer period, but power all
 the time if it is avoided."""
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the text says what, where and what would be right."""
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -291,18 +281,6 @@ def load(path: str | Path | None = None, overrides: list[str] | None = None) -> 
     return from_tree(tree, str(path) if path is not None else "configuration", origins)
 
 
-def load_tree(path: str | Path | None) -> dict[str, Any]:
-    """What a TOML file gives, unchecked; {} for None. Raises `ConfigError` for a file that cannot be read."""
-    if path is None:
-        return {}
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
-
-
 def from_tree(
     tree: dict[str, Any], where: str = "configuration", origins: Mapping[str, str] | None = None
 ) -> Config:
@@ -311,8 +289,8 @@ def from_tree(
     where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
     """
 
-    fail = _failing(where, origins)
-    config = _strict(tree, Config, fail)
+    fail = failing(where, origins)
+    config = convert(tree, Config, fail)
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
@@ -383,29 +361,6 @@ def override(config: Config, assignments: list[str]) -> Config:
     return from_tree(tree, "configuration", origins)
 
 
-def apply_override(tree: dict[str, Any], assignment: str) -> str:
-    """Put one `section.key=value` into a plain tree; returns the key. Raises `ConfigError`.
-
-    The value is read as TOML (`0.5`, `[32, 32]`, `true`), and as a bare string where it is not.
-    """
-    key, separator, text = assignment.partition("=")
-    key = key.strip()
-    if not separator or not key:
-        raise ConfigError(f"{assignment!r}: an override is written section.key=value")
-    try:
-        value = tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()
-    *tables, last = key.split(".")
-    for table in tables:
-        child = tree.setdefault(table, {})
-        if not isinstance(child, dict):
-            raise ConfigError(f"{assignment!r}: {table} is a value, not a table")
-        tree = child
-    tree[last] = value
-    return key
-
-
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
     return {
         key: _without_none(value)
@@ -416,58 +371,3 @@ def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
         for key, value in tree.items()
         if value is not None
     }
-
-
-def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
-    """A plain tree as the Struct `kind`. Raises `ConfigError`, as helpful as for a configuration.
-
-    where: the file, for messages.
-    """
-    return _strict(tree, kind, _failing(where, None))
-
-
-def _failing(where: str, origins: Mapping[str, str] | None) -> Fail:
-    def fail(key: str, text: str) -> NoReturn:
-        place = key.split("[")[0]
-        given = [origin for name, origin in (origins or {}).items() if f"{name}.".startswith(f"{place}.")]
-        raise ConfigError(f"{given[-1] if given else where}: {text}")
-
-    return fail
-
-
-def _strict(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
-    _reject_unknown(tree, _type_info(kind), fail, "")
-    try:
-        return msgspec.convert(tree, kind)
-    except msgspec.ValidationError as error:
-        key, text = config_words.explain(str(error), tree, kind)
-        fail(key, text)
-
-
-@cache
-def _type_info(kind: type) -> msgspec.inspect.Type:
-    return msgspec.inspect.type_info(kind)
-
-
-def _reject_unknown(value: Any, kind: msgspec.inspect.Type, fail: Fail, path: str) -> None:
-    """msgspec would reject unknown keys too, but cannot say which key was meant."""
-    match config_words.without_none(kind), value:
-        case msgspec.inspect.StructType(fields=known), dict():
-            fields = {field.name: field.type for field in known}
-            for key, below in value.items():
-                full = f"{path}.{key}" if path else key
-                if key not in fields:
-                    near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
-                    hint = (
-                        f"did you mean {(path + '.' if path else '') + near[0]!r}?"
-                        if near
-                        else f"known: {', '.join(fields)}"
-                    )
-                    fail(full, f"unknown key {full!r}; {hint}")
-                _reject_unknown(below, fields[key], fail, full)
-        case msgspec.inspect.ListType(item_type=item), list():
-            for i, below in enumerate(value):
-                _reject_unknown(below, item, fail, f"{path}[{i}]")
-        case msgspec.inspect.DictType(value_type=item), dict():
-            for key, below in value.items():
-                _reject_unknown(below, item, fail, f"{path}.{key}")

@@ -16,7 +16,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
-from node_runtime.config import ConfigError
+from node_runtime.strict import ConfigError
 from protocol.rights import common_name
 
 CERTIFICATE = "certificate.pem"

@@ -13,7 +13,8 @@ from contextlib import contextmanager
 
 import threadpoolctl
 
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
+from node_runtime.strict import ConfigError
 
 log = logging.getLogger(__name__)
 

@@ -17,11 +17,12 @@ import zenoh
 from node_runtime import zenoh_log
 from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import punctual
 from node_runtime.session import lease_ms, secure, session_config
+from node_runtime.strict import ConfigError
 from protocol import topics
 
 log = logging.getLogger(__name__)

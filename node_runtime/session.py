@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import zenoh
 
 from node_runtime import clock
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
+from node_runtime.strict import ConfigError
 
 if TYPE_CHECKING:
     from node_runtime.door import Door

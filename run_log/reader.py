@@ -11,7 +11,8 @@ from typing import Any, Generic, TypeVar, cast
 
 from mcap.records import Attachment, Channel, Header, Message, Metadata
 
-from node_runtime.config import Config, ConfigError, from_json
+from node_runtime.config import Config, from_json
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic

@@ -10,10 +10,11 @@ from pathlib import Path
 from lbmpc.plants import get_plant
 from node_runtime import clock
 from node_runtime.bus import Bus, Mailbox, OpenInterrupted
-from node_runtime.config import Config, ConfigError
+from node_runtime.config import Config
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import READER_PRIORITY, GarbageCollection, punctual
+from node_runtime.strict import ConfigError
 from protocol import topics
 from run_log.errors import LogError
 from run_log.parts import PartedLog

@@ -12,9 +12,10 @@ import numpy as np
 from controller_node.core import ControllerCore
 from controller_node.sets import CertifiedSets
 from lbmpc.sets.certificate import CertificateError
-from node_runtime.config import Config, ConfigError, from_json, override
+from node_runtime.config import Config, from_json, override
 from node_runtime.health import versions
 from node_runtime.realtime import one_blas_thread
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic

@@ -328,7 +328,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     command: Command = getattr(parsed, "action", parsed)
-    from node_runtime.config import ConfigError
+    from node_runtime.strict import ConfigError
     from tandem import terminal
 
     try:

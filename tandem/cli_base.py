@@ -43,7 +43,8 @@ class Configured(Command):
 
     def resolve(self) -> tuple[Config, dict[str, Any]]:
         """The configuration: file, then --set, then the command's options. And the tree as it was given."""
-        from node_runtime.config import ConfigError, apply_override, from_tree, load_tree
+        from node_runtime.config import from_tree
+        from node_runtime.strict import ConfigError, apply_override, load_tree
 
         tree = load_tree(self.config)
         origins = {apply_override(tree, text): f"--set {text}" for text in self.set}

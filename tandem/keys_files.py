@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from node_runtime.config import ConfigError
 from node_runtime.credentials import AUTHORITY, CERTIFICATE, KEY, load_certificate, name_of, read_bytes
+from node_runtime.strict import ConfigError
 from protocol.rights import ROLES, common_name
 from tandem.terminal import Refused
 

@@ -25,7 +25,8 @@ from lbmpc.problem import build_problem
 from lbmpc.reference import ReferenceSolver
 from lbmpc.solution import Status
 from lbmpc.solver import Solver
-from node_runtime.config import Config, ConfigError, load, override
+from node_runtime.config import Config, load, override
+from node_runtime.strict import ConfigError
 from protocol import architecture, architectures, topics
 from protocol.architecture import get_architecture
 from protocol.network import NetworkDescription, hash_layers

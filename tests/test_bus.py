@@ -13,9 +13,10 @@ from live import HANG_S, Process, free_endpoint, live_config, wait_for
 
 from node_runtime import clock, router
 from node_runtime.bus import Bus, OpenInterrupted, session_config
-from node_runtime.config import Config, ConfigError, override
+from node_runtime.config import Config, override
 from node_runtime.mailbox import Delivery, Mailbox
 from node_runtime.router import Router
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 

@@ -8,17 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.config import (
-    Config,
-    ConfigError,
-    from_json,
-    from_tree,
-    load,
-    override,
-    to_json,
-    to_toml,
-    to_tree,
-)
+from node_runtime.config import Config, from_json, from_tree, load, override, to_json, to_toml, to_tree
+from node_runtime.strict import ConfigError
 from tandem.checks import plant_of
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "compressor.toml"

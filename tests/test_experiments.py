@@ -21,7 +21,7 @@ from experiments.plan import Job, code_version, rows
 from experiments.runner import run_all, wanted
 from experiments.work import Record, read
 from lbmpc.plants import get_plant
-from node_runtime.config import ConfigError
+from node_runtime.strict import ConfigError
 from run_log.reader import read_run
 from run_log.replay import replay
 

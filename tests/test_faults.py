@@ -14,7 +14,8 @@ from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle, PerfectOracle
 from lbmpc.oracles.base import function
 from lbmpc.plants import PlantError, Truth, get_plant
-from node_runtime.config import Config, ConfigError, load
+from node_runtime.config import Config, load
+from node_runtime.strict import ConfigError
 from run_log.reader import Run
 from run_log.replay import replay
 

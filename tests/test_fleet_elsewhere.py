@@ -14,7 +14,8 @@ from live import HANG_S, Process, free_endpoint, live_config, wait_for
 from test_trainer_node import TRAINING, Controller
 
 from node_runtime import credentials
-from node_runtime.config import Config, ConfigError, from_json, load, override, to_json, to_toml
+from node_runtime.config import Config, from_json, load, override, to_json, to_toml
+from node_runtime.strict import ConfigError
 from protocol.messages import Health
 from tandem import keys_files
 from trainer_node.main import main

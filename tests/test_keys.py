@@ -13,7 +13,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from node_runtime import credentials
-from node_runtime.config import ConfigError
+from node_runtime.strict import ConfigError
 from protocol import rights, topics
 from tandem.cli import main
 from tandem.keys_files import found

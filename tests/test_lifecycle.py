@@ -16,11 +16,12 @@ from live import HANG_S, Ear, health_of, live_config, wait_for
 
 from node_runtime import clock
 from node_runtime.bus import Bus
-from node_runtime.config import Config, ConfigError, override
+from node_runtime.config import Config, override
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
 from node_runtime.realtime import GarbageCollection, awake, core_for, on_core, punctual, quick_handover
 from node_runtime.router import Router
+from node_runtime.strict import ConfigError
 from protocol import messages as m
 from protocol import topics
 

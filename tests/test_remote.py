@@ -18,10 +18,11 @@ from live import HANG_S, Process, free_endpoint, live_config, wait_for
 from node_runtime import access, clock, credentials
 from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus, Mailbox
-from node_runtime.config import Config, ConfigError, override
+from node_runtime.config import Config, override
 from node_runtime.knock import knock
 from node_runtime.router import Router, open_to_all
 from node_runtime.session import session_config
+from node_runtime.strict import ConfigError
 from node_runtime.zenoh_log import Refusals
 from protocol import rights, topics
 from protocol.topics import Topic

@@ -14,7 +14,8 @@ import pytest
 
 from controller_node.core import ControllerCore
 from experiments.lockstep import simulate
-from node_runtime.config import Config, ConfigError, override
+from node_runtime.config import Config, override
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic

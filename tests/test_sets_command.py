@@ -18,7 +18,8 @@ from experiments.lockstep import simulate
 from lbmpc.plants import PLANTS
 from lbmpc.sets import construct as construction
 from lbmpc.sets.certificate import CertificateError, model_of
-from node_runtime.config import Config, ConfigError, load
+from node_runtime.config import Config, load
+from node_runtime.strict import ConfigError
 from protocol import topics
 from run_log.errors import LogError
 from run_log.reader import read_run

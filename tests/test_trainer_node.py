@@ -295,7 +295,7 @@ def test_a_controller_that_refuses_is_asked_what_it_holds(
 def test_a_thief_under_its_name_does_not_silence_a_trainer(
     config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int
 ) -> None:
-    """A stranger's sets are adopted, which is known at once; or a later one is only heard, and versions must pass it."""
+    """A stranger's sets are adopted, which is known at once; or one is only heard, and versions must pass it."""
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", patience)
     patient = msgspec.structs.replace(
         config, bus=msgspec.structs.replace(config.bus, follow_silence=2 * PATIENCE)

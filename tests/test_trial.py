@@ -16,7 +16,8 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import OracleState
 from lbmpc.oracles.dnn import IN_USE, NEWEST
 from lbmpc.oracles.trial import TRIED, Finding, Trial, empty, had, newest, remember, tried
-from node_runtime.config import Config, ConfigError, load, override
+from node_runtime.config import Config, load, override
+from node_runtime.strict import ConfigError
 from protocol.network import hash_layers
 from run_log.replay import replay
 from run_log.summary import Summary, summarise

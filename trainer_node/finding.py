@@ -14,8 +14,9 @@ import msgspec
 import zenoh
 
 from node_runtime import clock
-from node_runtime.config import PLANT_NAME, Config, ConfigError, PlantPlace
+from node_runtime.config import PLANT_NAME, Config, PlantPlace
 from node_runtime.session import OpenInterrupted, secure
+from node_runtime.strict import ConfigError
 from protocol import topics
 from protocol.topics import Topic
 from trainer_node.plant_bus import Sessions

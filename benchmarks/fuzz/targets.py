@@ -20,9 +20,10 @@ from controller_node.outbox import Outbox
 from controller_node.sets import CertifiedSets, Found
 from lbmpc.sets.certificate import CertificateError
 from node_runtime.bad_messages import BadMessages
-from node_runtime.config import Config, ConfigError, from_json, from_tree, to_json, to_toml
+from node_runtime.config import Config, from_json, from_tree, to_json, to_toml
 from node_runtime.gathering import separate
 from node_runtime.mailbox import Delivery
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
