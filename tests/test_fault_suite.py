@@ -7,6 +7,7 @@ import itertools
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -229,21 +230,54 @@ def outcome(index: int, facts: Facts | None = CALM, **more: Any) -> Outcome:
 
 
 def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    path, made = tmp_path / "results.jsonl", []
+    path = tmp_path / "results.jsonl"
 
-    def make() -> Outcome:
-        made.append(1)
-        return outcome(0, None if len(made) == 1 else CALM, error="the machine was too slow")
+    def find() -> Outcome | None:
+        return Results(path).find(ALL[0].name, "usual", 0, 0)
 
-    for expected in (1, 2, 2):
-        Results(path).get(make, ALL[0].name, "usual", 0, 0)
-        assert len(made) == expected
+    assert find() is None
+    for made in (outcome(0, None, error="the machine was too slow"), outcome(0, CALM)):
+        Results(path).put(made)
+        assert find() == made
     # A line that was being written when the suite was killed.
     path.write_bytes(path.read_bytes() + b'{"fault": "kil')
-    assert Results(path).find(ALL[0].name, "usual", 0, 0) is not None
+    assert find() == outcome(0, CALM)
     path.write_bytes(b'{"fault": "of another version"}\n')
     with pytest.raises(suite.ResultsError, match="--fresh"):
         Results(path)
+
+
+@pytest.mark.live
+@pytest.mark.skipif(not link.available(), reason="links to network namespaces need root")
+def test_a_suite_that_is_told_to_stop_leaves_nothing_behind(tmp_path: Path) -> None:
+    words = ["--runs", "1", "--only", "SIGSTOP of the controller", "--jobs", "2", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "tests.faults", *words]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        try:
+            # Two runs at a time, each with its processes and its link.
+            wait_for(lambda: len(list(tmp_path.glob("*/plant.txt"))) == 2)
+            assert len(of_runs_in(tmp_path)) >= 2
+            process.terminate()
+            said, _ = process.communicate(timeout=HANG_S)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert "goes on from" in said
+    assert "Traceback" not in said
+    assert of_runs_in(tmp_path) == []
+
+
+def of_runs_in(folder: Path) -> list[str]:
+    """The command lines of the processes whose configuration lies below this folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            words = process.read_bytes().decode(errors="replace").split("\0")
+            if "tests.faults" not in words and any(word.startswith(str(folder)) for word in words):
+                found.append(" ".join(words))
+    return found
 
 
 def test_the_table_names_what_did_not_hold(tmp_path: Path) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 import shutil
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -26,13 +25,12 @@ from rich.progress import (
 
 from benchmarks.marks import DocumentError
 from node_runtime import machine
-from node_runtime.config import RealtimeConfig
-from node_runtime.realtime import READER_PRIORITY, punctual
 
 from . import link, table
 from .faults import ALL, Fault, Stage
-from .suite import Outcome, Results, ResultsError, judged, run
+from .suite import Outcome, Results, ResultsError, judged
 from .table import Pair
+from .workers import Task, workers
 
 START_AND_STOP_S = 8.0
 """Of a run, beside its seconds: processes start and stop, the log is replayed."""
@@ -44,6 +42,8 @@ class Suite:
 
     runs: int = 20
     """Of each fault."""
+    jobs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
+    """At a time. Each takes about one core at its busiest, and what they cost each other is in their figures."""
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
     """Faults whose name contains one of these; all by default."""
     seconds: float | None = None
@@ -73,6 +73,9 @@ def main(settings: Suite) -> int:
     if not chosen:
         console.print(f"no fault has a name with {' or '.join(settings.only)} in it; --list names them")
         return 2
+    if settings.jobs < 1:
+        console.print("--jobs must be at least 1")
+        return 2
     if settings.show:
         for fault in chosen:
             console.print(
@@ -90,8 +93,7 @@ def main(settings: Suite) -> int:
         results = Results(settings.out / "results.jsonl")
         # Ended politely by whatever way: namespaces, mounts and processes must not stay behind.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with punctual(min(READER_PRIORITY, RealtimeConfig().priority), silent=True):
-            pairs = _measure(settings, chosen, results, console)
+        pairs = _measure(settings, chosen, results, console)
         text = table.markdown(pairs, chosen, _head(settings))
         sys.stdout.write(text + "\n")
         table.MARKS.put(settings.document, text)
@@ -133,9 +135,8 @@ def _measure(
     settings: Suite, faults: list[Fault], results: Results, console: Console
 ) -> dict[str, list[Pair]]:
     plan = list(_plan(faults, settings.runs))
-    console.print(
-        f"{len(plan)} runs, about {minutes(total(faults, settings.runs))}; Ctrl-C and the same command go on"
-    )
+    duration = minutes(total(faults, settings.runs) / settings.jobs)
+    console.print(f"{len(plan)} runs, about {duration}; Ctrl-C and the same command go on")
     pairs: dict[str, list[Pair]] = {}
     calm: dict[str, Outcome] = {}
     columns = (
@@ -145,28 +146,27 @@ def _measure(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as bar:
+    with workers(settings.jobs, results.put) as crew, Progress(*columns, console=console) as bar:
         task = bar.add_task("", total=len(plan))
+        begun: list[Outcome | Future[Outcome]] = []
         for index, fault, stage in plan:
             name = "" if fault is None else fault.name
-            bar.update(task, description=(name or f"no fault, {stage.name}")[:40])
-            folder = settings.out / f"{name or stage.name}-{index}".replace(" ", "-").replace(":", "")
-            outcome = results.get(
-                partial(run, stage, fault, index, settings.seed, folder, settings.set),
-                name,
-                stage.name,
-                index,
-                settings.seed,
-            )
+            known = results.find(name, stage.name, index, settings.seed)
+            wanted = Task(name, stage, index, settings.seed, settings.out, tuple(settings.set))
+            # A run without facts is made again.
+            begun.append(known if known is not None and known.facts is not None else crew.begin(wanted))
+        for (_index, fault, stage), made in zip(plan, begun, strict=True):
+            bar.update(task, description=("no fault, " + stage.name if fault is None else fault.name)[:40])
+            outcome = made.result() if isinstance(made, Future) else made
             if fault is None:
                 calm[stage.name] = outcome
                 _say(bar, outcome, [outcome.error] if outcome.error else [])
             elif (without := calm[stage.name].facts) is not None:
                 outcome = judged(outcome, fault, without)
-                pairs.setdefault(name, []).append(Pair(outcome, without))
+                pairs.setdefault(fault.name, []).append(Pair(outcome, without))
                 _say(bar, outcome, outcome.not_held)
             if not outcome.not_held and not outcome.error:
-                shutil.rmtree(folder, ignore_errors=True)
+                shutil.rmtree(outcome.folder(settings.out), ignore_errors=True)
             bar.advance(task)
     return pairs
 
@@ -188,6 +188,4 @@ def _head(settings: Suite) -> list[str]:
 
 
 if __name__ == "__main__":
-    # What the suite's own bus has to say of dead routers and bad messages is no news here.
-    logging.disable(logging.WARNING)
     sys.exit(main(tyro.cli(Suite)))

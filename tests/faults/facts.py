@@ -15,8 +15,8 @@ from rich.console import Console
 
 from benchmarks import stalls
 from lbmpc.plants import Plant, get_plant
-from node_runtime.config import ConfigError
 from node_runtime.mailbox import Delivery
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic

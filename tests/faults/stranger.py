@@ -22,9 +22,10 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509 import load_pem_x509_certificate
 
 from node_runtime import access, clock, credentials
-from node_runtime.config import Config, ConfigError, load
+from node_runtime.config import Config, load
 from node_runtime.knock import knock
 from node_runtime.session import session_config
+from node_runtime.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from tandem import keys_files

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -12,6 +11,7 @@ import numpy as np
 
 from node_runtime import clock
 from node_runtime.config import Config, override
+from node_runtime.realtime import READER_PRIORITY, punctual
 from run_log.errors import LogError
 
 from .facts import Facts, gather
@@ -41,6 +41,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Why there are no facts."""
     not_held: list[str] = []
 
+    def folder(self, out: Path) -> Path:
+        """Where its run's files are, below the suite's folder."""
+        return folder_of(out, self.fault or self.stage, self.index)
+
 
 def moment(fault: Fault, index: int, seed: int) -> float:
     """When the fault comes in its `index`-th run, seconds after the first command."""
@@ -48,10 +52,14 @@ def moment(fault: Fault, index: int, seed: int) -> float:
     return float(rng.uniform(EARLIEST_S, SETTLED_S))
 
 
-def run(
-    stage: Stage, fault: Fault | None, index: int, seed: int, folder: Path, settings: list[str]
-) -> Outcome:
-    """One run with a fault, or one without; its folder is kept only where something did not hold."""
+def folder_of(out: Path, name: str, index: int) -> Path:
+    """The folder of one run of a fault or, without one, of a stage."""
+    return out / f"{name}-{index}".replace(" ", "-").replace("/", "-").replace(":", "")
+
+
+def run(stage: Stage, fault: Fault | None, index: int, seed: int, out: Path, settings: list[str]) -> Outcome:
+    """One run with a fault, or one without, in a folder of its own below `out`."""
+    folder = folder_of(out, stage.name if fault is None else fault.name, index)
     began = clock.now()
     at = 0.0 if fault is None else moment(fault, index, seed)
     config = override(Config(seed=seed + index), [*stage.settings, *settings])
@@ -79,7 +87,8 @@ def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: 
     with scene(folder) as around:
         places: dict[str, Place] = {"plant": stage.plant, "trainer": stage.trainer}
         rig = Rig(folder, config, places, around=around, seed=config.seed)
-        extra = _hurt(rig, stage, fault, at)
+        with punctual(min(READER_PRIORITY, config.realtime.priority), silent=True):
+            extra = _hurt(rig, stage, fault, at)
         # While the log's disk is still there.
         return gather(rig, stage.seconds, extra)
 
@@ -135,13 +144,8 @@ class Results:
                 return outcome
         return None
 
-    def get(self, make: Callable[[], Outcome], fault: str, stage: str, index: int, seed: int) -> Outcome:
-        """From the file, or made and put there. A run without facts is kept, but made again next time."""
-        found = self.find(fault, stage, index, seed)
-        if found is not None and found.facts is not None:
-            return found
-        made = make()
-        self.outcomes = [outcome for outcome in self.outcomes if outcome is not found] + [made]
+    def put(self, made: Outcome) -> None:
+        """In the file from now on, in the place of an earlier one of the same run."""
+        self.outcomes.append(made)
         with self.path.open("ab") as file:
             file.write(msgspec.json.encode(made) + b"\n")
-        return made
