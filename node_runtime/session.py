@@ -26,6 +26,12 @@ log = logging.getLogger(__name__)
 OBEYING = ("controller", "plant")
 PATIENT_LEASE_MS = 10_000
 """A reader that is silent for less than this has only been without a core; the messages wait for it meanwhile."""
+AT_ONCE: Mapping[str, Any] = {
+    "transport/unicast/open_timeout": 500,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 250, "period_increase_factor": 2.0},
+}
+"""How those who obey look for their router, in ms: on a cut link an attempt's first packet is lost, and TCP repeats it
+only after a second. Another attempt is made before that, so that control is back within one."""
 GIVE_UP_US = 1_000_000
 """For as long the router holds everybody's bulk messages back where a reader's link is full; then it cuts that link."""
 ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
@@ -138,9 +144,11 @@ def connect(
 def _connect(config: Config, stop: threading.Event, process: str, door: Door | None) -> zenoh.Session:
     """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
     endpoint = config.bus.endpoint
-    client = session_config(
-        "client", endpoint, lease_ms(config, process), more=None if door is None else door.settings
-    )
+    # A handshake with certificates takes its time, and who is refused need not be refused four times a second.
+    more: Mapping[str, Any] = AT_ONCE if process in OBEYING else {}
+    if door is not None:
+        more = door.settings
+    client = session_config("client", endpoint, lease_ms(config, process), more=more)
     result: Future[zenoh.Session] = Future()
 
     def open_session() -> None:
