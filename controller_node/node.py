@@ -196,6 +196,9 @@ class ControllerNode:
                 detail = f"version {weights.seq} of {weights.run_id} is for {weights.for_run}"
                 self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "for another run", detail)
                 continue
+            if self._weights is not None:
+                detail = f"version {self._weights.seq} by version {weights.seq} of {weights.run_id}"
+                self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "superseded", detail)
             self._weights = weights
 
     # -- the step and what follows from it ---------------------------------------------------------------

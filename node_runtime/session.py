@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 OBEYING = ("controller", "plant")
 PATIENT_LEASE_MS = 10_000
 """A reader that is silent for less than this has only been without a core; the messages wait for it meanwhile."""
-AT_ONCE: Mapping[str, Any] = {
-    "transport/unicast/open_timeout": 500,
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 250, "period_increase_factor": 2.0},
-}
-"""How those who obey look for their router, in ms: on a cut link an attempt's first packet is lost, and TCP repeats it
-only after a second. Another attempt is made before that, so that control is back within one."""
+OPEN_MS = 500
+"""After so long those who obey give up an attempt to reach their router: on a cut link its first packet is lost, and
+TCP repeats it only after a second. Another attempt is made before that, so that control is back within one."""
+RETRY_MS, RETRY_SECURE_MS = 100, 1000
+"""Between two attempts, at most. What is said before a recorder is back is in no log; but who is refused need not be
+refused ten times a second."""
 GIVE_UP_US = 1_000_000
 """For as long the router holds everybody's bulk messages back where a reader's link is full; then it cuts that link."""
 ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
@@ -80,7 +80,11 @@ def session_config(
             "listen/endpoints": [],
             "connect/endpoints": [endpoint],
             "connect/timeout_ms": -1,
-            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2.0},
+            "connect/retry": {
+                "period_init_ms": RETRY_MS,
+                "period_max_ms": RETRY_SECURE_MS if secure(endpoint) else RETRY_MS,
+                "period_increase_factor": 2.0,
+            },
         }
     else:
         settings |= {
@@ -144,9 +148,9 @@ def connect(
 def _connect(config: Config, stop: threading.Event, process: str, door: Door | None) -> zenoh.Session:
     """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
     endpoint = config.bus.endpoint
-    # A handshake with certificates takes its time, and who is refused need not be refused four times a second.
-    more: Mapping[str, Any] = AT_ONCE if process in OBEYING else {}
+    more: Mapping[str, Any] = {"transport/unicast/open_timeout": OPEN_MS} if process in OBEYING else {}
     if door is not None:
+        # A handshake with certificates takes its time.
         more = door.settings
     client = session_config("client", endpoint, lease_ms(config, process), more=more)
     result: Future[zenoh.Session] = Future()

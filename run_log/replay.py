@@ -102,9 +102,9 @@ def replay(
             ranges = ", ".join(f"{min(r.ticks)} to {r.last}" for r in recorded)
             raise LogError(f"{run.path}: there is no tick {from_tick}; the log has {ranges}")
         recorded = inside
-    starts = [_start(run, r, from_tick) for r in recorded]
-    total = sum(r.last - start for r, start in zip(recorded, starts, strict=True))
     comparison = _Comparison()
+    starts = [_start(run, r, from_tick, comparison) for r in recorded]
+    total = sum(r.last - start for r, start in zip(recorded, starts, strict=True))
     for r, start in zip(recorded, starts, strict=True):
         config = override(r.config, list(overrides)) if overrides else r.config
         with one_blas_thread():
@@ -288,21 +288,24 @@ def _collect(run: Run, run_id: str) -> _Recorded:
     )
 
 
-def _start(run: Run, recorded: _Recorded, from_tick: int | None) -> int:
-    """The keyframe to begin at."""
+def _start(run: Run, recorded: _Recorded, from_tick: int | None, comparison: _Comparison) -> int:
+    """The keyframe to begin at. From the start: the first one that the log has, and a word on what comes before it."""
     wanted = 0 if from_tick is None else from_tick
     before = [seq for seq in recorded.keyframes if seq < wanted]
     if before:
         return max(before)
-    if from_tick is None and run.part > 1 and recorded.keyframes:
-        # What comes before its first keyframe is in the part before this one as well.
-        return min(recorded.keyframes)
-    later = sorted(seq for seq in recorded.keyframes if seq < recorded.last)
-    way = f"; the first one is after tick {later[0]}: use --from-tick {later[0] + 1}" if later else ""
-    raise LogError(
-        f"{run.path}: no keyframe before tick {wanted} of {recorded.run_id} is in the log: the controller's "
-        f"memory is not known there{way}{_unreadable(run)}"
-    )
+    later = min((seq for seq in recorded.keyframes if seq < recorded.last), default=None)
+    unknown = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log: the controller's memory is not known there"
+    if from_tick is not None:
+        way = "" if later is None else f"; the first one is after tick {later}: use --from-tick {later + 1}"
+        raise LogError(f"{run.path}: {unknown}{way}{_unreadable(run)}")
+    start = recorded.last if later is None else later
+    # What comes before the first keyframe of a part is in the part before this one as well.
+    if run.part == 1 or later is None:
+        way = "none of it can be replayed" if later is None else f"replay begins at tick {later + 1}"
+        comparison.lost += sum(seq <= start for seq in recorded.ticks)
+        comparison.gaps.append(f"{unknown}; {way}{_unreadable(run)}")
+    return start
 
 
 def _parts(run: Run, recorded: _Recorded, start: int, comparison: _Comparison) -> list[tuple[int, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -348,9 +349,30 @@ def test_a_log_that_begins_late_says_from_where_it_can_be_replayed(run: Run) -> 
     """The recorder was started after the controller."""
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME):
         run.streams[topic.name] = [e for e in run.entries(topic) if e.message.seq >= 30]
-    with pytest.raises(LogError, match=r"no keyframe before tick 0.*use --from-tick 50"):
-        replay(run)
-    assert replay(run, 50).ticks == 40
+    found = replay(run)
+    assert (found.equal, found.first_tick, found.ticks, found.lost_ticks) == (True, 50, STEPS - 50, 20)
+    (note,) = (note for note in found.notes if "memory" in note)
+    assert note.startswith(f"no keyframe before tick 0 of {RUN} is in the log")
+    assert note.endswith("replay begins at tick 50")
+    with pytest.raises(LogError, match=r"no keyframe before tick 40.*use --from-tick 50"):
+        replay(run, 40)
+    assert replay(run, 50).lost_ticks == 0
+
+
+def test_a_run_without_a_keyframe_does_not_keep_the_others_from_being_replayed(run: Run) -> None:
+    """A controller came back while its router was away, and died again before its next keyframe."""
+    second, sums = "controller-second", {}
+    for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.RUN_INFO["controller"]):
+        for entry in run.entries(topic)[:10]:
+            again = msgspec.structs.replace(entry.message, run_id=second)
+            if topic is topics.TICK:
+                sums[again.seq] = zlib.crc32(codec.encode(again))
+            elif topic is topics.RESULT:
+                again = msgspec.structs.replace(again, tick_crc32=sums[again.seq])
+            run.streams[topic.name].append(Entry(entry.log_time, codec.encode(again), again))
+    found = replay(run)
+    assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS, 10)
+    assert any(second in note and "none of it can be replayed" in note for note in found.notes)
 
 
 def test_a_stranger_does_not_spoil_the_log(run: Run) -> None:

@@ -36,6 +36,8 @@ COMMANDING = ("router", "controller")
 APART_S = 0.5
 BACK = ("goes on", "is back", "is over")
 """How events end that say that something is whole again."""
+EMPTY = "nothing in it"
+"""Of a log whose recorder was killed before it had written its first half second."""
 SETTLE_S = 0.25
 """After control is back the process that was hurt may still be late for this long."""
 
@@ -79,11 +81,11 @@ class Facts(msgspec.Struct, kw_only=True):
     samples_held: int | None
     """Of them, how many the trainer held in the end."""
     readable_gap: float | None
-    """From the last message of the log that can be read to the moment its recorder was killed."""
+    """From the last message of the log that can be read to the moment its recorder was killed; None: no log can be."""
     log_missing: int
     """Ticks that the controller made while the recorder was well and that are not in the log."""
     replay: str
-    """"exact", "exact, but 12 ticks are not in the log", "DIFFERS: ...", "no replay: ..."."""
+    """"exact", "exact, but 12 ticks are not in the log", "nothing in it", "DIFFERS: ...", "no replay: ..."."""
     forged_adopted: int
     """Sets of hidden weights of the attacker that were adopted."""
     rolled_back: int
@@ -327,6 +329,8 @@ def _log(rig: Rig) -> tuple[Run | None, str]:
         run = read_run(rig.log)
     except (LogError, FileNotFoundError) as error:
         return None, f"no replay: {error}".replace(str(rig.folder), "")
+    if not run.ticks:
+        return run, EMPTY
     try:
         found = replay(run)
     except (LogError, ConfigError) as error:
@@ -355,12 +359,12 @@ def _log_time_off(log: Run | None) -> float | None:
 def _readable_gap(rig: Rig, witness: Witness, log: Run | None) -> float | None:
     """From the last state in the log to the last one before the recorder was hurt, as the suite heard them."""
     hurt = _recorder_hurt(rig)
-    if not math.isfinite(hurt) or log is None or not log.plant_states:
+    if not math.isfinite(hurt) or log is None:
         return None
     written = {state.seq for state in log.plant_states}
     before = [(at, state.seq) for at, state in witness.of(topics.PLANT_STATE) if at < hurt]
     logged = [at for at, seq in before if seq in written]
-    return before[-1][0] - logged[-1] if logged else None
+    return before[-1][0] - (logged[-1] if logged else before[0][0]) if before else None
 
 
 def _missing(rig: Rig, witness: Witness, log: Run | None) -> int:

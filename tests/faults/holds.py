@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable
 
-from .facts import Facts
+from .facts import EMPTY, Facts
 
 Held = Callable[[Facts, Facts], str | None]
 """(the run, the run with the same seed and no fault) -> why it does not hold."""
@@ -87,7 +87,7 @@ def readable(run: Facts, calm: Facts) -> str | None:
         return f"the last {run.readable_gap:.2f} s before the kill cannot be read"
     if run.log_missing:
         return f"{run.log_missing} ticks before the last second are not in the log"
-    return None if run.replay.startswith("exact") else run.replay
+    return None if run.replay.startswith(("exact", EMPTY)) else run.replay
 
 
 def replays(run: Facts, calm: Facts) -> str | None:
@@ -113,8 +113,9 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
             if name.startswith(f"{process} bad {topic}:")
         }
         bad = sum(reasons.values())
-        # What the run's own trainer sent may be refused too.
-        surely = bad - sum(reasons.get(reason, 0) for reason in ("refused", "for another run"))
+        # What the run's own trainer sent may be refused too, or give way to a stranger's.
+        own = ("refused", "for another run", "superseded")
+        surely = bad - sum(reasons.get(reason, 0) for reason in own)
         # A flood makes room in a full mailbox by dropping the oldest, whosever it was.
         dropped = found.get(f"{process} overflow {topic}", 0)
         if not surely <= sent <= bad + dropped:
