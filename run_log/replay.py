@@ -295,7 +295,8 @@ def _start(run: Run, recorded: _Recorded, from_tick: int | None, comparison: _Co
     if before:
         return max(before)
     later = min((seq for seq in recorded.keyframes if seq < recorded.last), default=None)
-    unknown = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log: the controller's memory is not known there"
+    missing = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log"
+    unknown = f"{missing}: the controller's memory is not known there"
     if from_tick is not None:
         way = "" if later is None else f"; the first one is after tick {later}: use --from-tick {later + 1}"
         raise LogError(f"{run.path}: {unknown}{way}{_unreadable(run)}")
