@@ -1,13 +1,16 @@
 """What becomes of the true plant when its controller falls silent: `python -m benchmarks.outage`, decision 0025.
 
-Lock-step runs from the paper's x0. After each tick of the first four seconds the controller is taken away for good, and
-the plant is followed for three seconds, the length of a plan, and for six, with what it has: the rest of the plan, or
-the backup policy; after their end a constant safe input, or one with feedback.
+Lock-step runs from the paper's x0, in which commands act some time after their samples. After each tick of the first
+four seconds the controller is taken away for good, and the plant is followed for three seconds, the length of a plan,
+and for six, with what it has: the rest of the plan, or the backup policy; after their end a constant safe input, or one
+with feedback.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +21,8 @@ from rich.console import Console
 
 from benchmarks.marks import Marks
 from controller_node.core import ControllerCore
-from experiments.lockstep import CONTROLLER, PLANT, simulate
+from experiments.faults import Faults
+from experiments.lockstep import CONTROLLER, PLANT, follow
 from lbmpc.plants import Plant, PlantError
 from node_runtime.config import Config, load
 from plant_sim.plant import PlantSim
@@ -26,9 +30,9 @@ from protocol import messages as m
 
 STEPS = 80
 SHORT, LONG = 3.0, 6.0
-DELAY = 0.002
+DELAYS = (0.002, 0.010)
 """Seconds from a sample until its command acts."""
-MARGINS = (0.0, 0.005, 0.0075, 0.0125)
+MARGINS = (0.0, 0.005, 0.0075, 0.0125, 0.02)
 OUTSIDE = 1e-9
 
 
@@ -42,21 +46,27 @@ class Silence(NamedTuple):
 def measure(seeds: range) -> dict[str, list[Silence]]:
     """Every case's outages, over all seeds and ticks."""
     found: dict[str, list[Silence]] = {}
-    for seed in seeds:
+    for seed, delay in product(seeds, DELAYS):
         config = load(None, [f"seed={seed}"])
-        run = simulate(config, STEPS)
+        run = follow(config, STEPS, Faults(command_seconds=delay)).run
         cores = {margin: ControllerCore(_with(config, margin), CONTROLLER) for margin in MARGINS}
         for tick in run.ticks:
             said = {margin: _said(core, tick) for margin, core in cores.items()}
             command = said[MARGINS[0]][0]
-            plant = cores[MARGINS[0]].plant
-            constant = replace(plant, safe_gain=None)
-            _add(found, "plan, then constant input", _follow(config, constant, tick, command, None))
-            _add(found, "plan, then feedback", _follow(config, plant, tick, command, None))
-            for margin in MARGINS:
-                name = f"policy, margin {100 * margin:g} %, then feedback"
-                _add(found, name, _follow(config, plant, tick, command, said[margin][1]))
+            backups = {margin: backup for margin, (_command, backup) in said.items()}
+            for what, plant, backup in _followed(cores[MARGINS[0]].plant, backups):
+                silence = _silence(config, plant, tick, command, delay, backup)
+                found.setdefault(f"{1e3 * delay:g} ms: {what}", []).append(silence)
     return found
+
+
+def _followed(
+    plant: Plant, backups: dict[float, m.Backup | None]
+) -> Iterator[tuple[str, Plant, m.Backup | None]]:
+    yield "plan, then constant input", replace(plant, safe_gain=None), None
+    yield "plan, then feedback", plant, None
+    for margin, backup in backups.items():
+        yield f"policy, margin {100 * margin:g} %, then feedback", plant, backup
 
 
 def _with(config: Config, margin: float) -> Config:
@@ -71,18 +81,14 @@ def _said(core: ControllerCore, tick: m.Tick) -> tuple[m.Command, m.Backup | Non
     return command, core.backup(command)
 
 
-def _add(found: dict[str, list[Silence]], name: str, silence: Silence) -> None:
-    found.setdefault(name, []).append(silence)
-
-
-def _follow(
-    config: Config, plant: Plant, tick: m.Tick, command: m.Command, backup: m.Backup | None
+def _silence(
+    config: Config, plant: Plant, tick: m.Tick, command: m.Command, delay: float, backup: m.Backup | None
 ) -> Silence:
     """The true plant from this tick's sample on, with its last command and nothing after it."""
     assert tick.state is not None
     sim = PlantSim(plant, config.period, np.array(tick.state.x), config.plant.plan_patience, PLANT)
     sim.sample(0.0)
-    sim.command(msgspec.structs.replace(command, state_seq=0), DELAY)
+    sim.command(msgspec.structs.replace(command, state_seq=0), delay)
     if backup is not None:
         sim.backup(backup)
     half = 0.5 * (plant.x_max - plant.x_min)

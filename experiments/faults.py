@@ -37,6 +37,8 @@ class Drift(Section, frozen=True):
 class Faults(Section, frozen=True):
     """None by default."""
 
+    command_seconds: NonNegative = 0.0
+    """From a sample until the command that answers it acts, as live; less than a period."""
     training_seconds: NonNegative = 0.0
     """How long a training takes; none begins while one goes on."""
     trainer_dies_at: NonNegative | None = None

@@ -1,7 +1,7 @@
 """Lock-step simulation: the real controller, trainer and plant in one process, on a virtual clock.
 
 Deterministic for a seed: a tick's state is the plant's sample at exactly that time, its command acts from that time
-on, a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
+on and a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
 """
 
 from __future__ import annotations
@@ -90,6 +90,10 @@ class _LockStep:
         self.plant = PlantSim(self.core.plant, config.period, x0, config.plant.plan_patience, PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
+        if faults.command_seconds >= config.period:
+            raise ConfigError(
+                f"faults.command_seconds = {faults.command_seconds:g} is not less than a period, {config.period:g} s"
+            )
         self.draws = np.random.default_rng([config.seed, 0x4015E])
         self.trainer = self._trainer() if config.trainer.enabled else None
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
@@ -169,7 +173,7 @@ class _LockStep:
             lateness_ms=0.0,
             state_age_ms=(stepped - started) * 1e3,
         )
-        self.plant.command(outputs.command, t)
+        self.plant.command(outputs.command, t + self.faults.command_seconds)
         for topic, message in (
             (topics.TICK, tick),
             (topics.COMMAND, outputs.command),

@@ -14,6 +14,10 @@ from z_0, the state to which the command that was just given leads. Its solution
 
 which takes no more than the plant's own sensors. K is stiffer than the model's: what the plan does not know must not
 add up. Nothing of this is certified: h_hat is what was learned so far.
+
+The margin is room for what h_hat does not know, and where the way to x = 0 leads along a bound it can cost the way
+itself. So a plan that touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, is not followed: the problem
+is solved again with less of it, as long as that ends nearer.
 """
 
 from __future__ import annotations
@@ -38,8 +42,18 @@ STEPS = 2
 """Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
+SHARES = (1.0, 1.0 / 3.0, 0.0)
+"""Of the margin, tried in this order until a plan leads back."""
+NEARER = 0.9
+"""Of |z_0|_P: where a plan that leads back ends at most. And of another plan's end, to be better than that."""
+TOUCHES = 1e-3
+"""Nearer than this share of the half-width to a margin's edge, the plan may be held up by it."""
 STIFFNESS = 25.0
 """Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
+
+
+Plan = tuple[np.ndarray, np.ndarray]
+"""Inputs v, (N, m), and the states z_1 .. z_N that they lead to, (N, d)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +64,8 @@ class Policy:
     gain: np.ndarray
     states: np.ndarray
     """z_0 .. z_{N-1}, which it expects, (N, d)."""
+    margin: float
+    """By how much they stay inside X, as a share of its half-widths."""
 
 
 class BackupPlanner:
@@ -57,7 +73,7 @@ class BackupPlanner:
 
     Args:
         problem: what the controller solves; its cost, oracle, horizon and U are taken over.
-        margin: by how much X shrinks, as a share of its half-widths; room for what h_hat does not know.
+        margin: by how much X shrinks, as a share of its half-widths, where a plan that leads back is left.
         realise: what turns a CasADi function into the one that is called.
     """
 
@@ -69,11 +85,7 @@ class BackupPlanner:
     ):
         self.problem = problem
         model, oracle, n = problem.model, problem.oracle, problem.horizon
-        plain = state_set(model)
-        inside = margin * 0.5 * (plain.upper - plain.lower)
-        shares = np.minimum(np.arange(1, n + 1) / RAMP, 1.0)
-        states = tuple(plain.minus(share * inside, share * inside) for share in shares)
-        self._rows = Rows(replace(problem, states=states, soft=True, guard=None))
+        self._rows = {share * margin: _rows(problem, share * margin) for share in SHARES}
         self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
         self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
         self._gain = tracking_gain(model)
@@ -89,23 +101,42 @@ class BackupPlanner:
         Returns:
             None when the numbers are unusable.
         """
-        best, least = None, np.inf
-        v = self._rows.clip(np.asarray(plan, dtype=float))
+        found, margin, least = None, 0.0, np.inf
+        v = np.asarray(plan, dtype=float)
         with np.errstate(all="ignore"):
-            for step in range(STEPS + 1):
-                merit = self._linearise(s, theta, v)
-                if not np.isfinite(merit):
+            for share, rows in self._rows.items():
+                best = self._best(rows, s, theta, v, STEPS if found is None else 1)
+                if best is None or (end := self._distance(best[1][-1])) >= NEARER * least:
                     break
-                if merit < least:
-                    best, least = (v, self._sweep.outputs["z"].T.copy()), merit
-                if step == STEPS or (target := self._subproblem(v.shape)) is None:
+                found, margin, least, v = best, share, end, best[0]
+                if end < NEARER * self._distance(s) or not _touches(rows, *best):
                     break
-                v = target
-        return None if best is None else self._with_feedback(s, *best)
+        return None if found is None else self._with_feedback(s, *found, margin)
 
-    def _linearise(self, s: np.ndarray, theta: np.ndarray, v: np.ndarray) -> float:
+    def _distance(self, s: np.ndarray) -> float:
+        """|x|_P of a state, with its past or without."""
+        model = self.problem.model
+        x = s[: model.d]
+        return float(np.sqrt(x @ model.P @ x))
+
+    def _best(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray, steps: int) -> Plan | None:
+        """The best of what the steps from v, (N, m), pass; None when its numbers are unusable."""
+        best, least = None, np.inf
+        v = rows.clip(v)
+        for step in range(steps + 1):
+            merit = self._linearise(rows, s, theta, v)
+            if not np.isfinite(merit):
+                break
+            if merit < least:
+                best, least = (v, self._sweep.outputs["z"].T.copy()), merit
+            if step == steps or (target := self._subproblem(rows, v.shape)) is None:
+                break
+            v = target
+        return best
+
+    def _linearise(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray) -> float:
         """Linearise at v, (N, m); its cost, with the penalty of what leaves the rows."""
-        sweep, rows = self._sweep, self._rows
+        sweep = self._sweep
         sweep.inputs["x"][:, 0] = s
         sweep.inputs["theta"][:, 0] = theta
         sweep.inputs["v"][:] = v.T
@@ -115,9 +146,9 @@ class BackupPlanner:
             violation(values, rows.lower, rows.upper)
         )
 
-    def _subproblem(self, shape: tuple[int, ...]) -> np.ndarray | None:
+    def _subproblem(self, rows: Rows, shape: tuple[int, ...]) -> np.ndarray | None:
         """The minimiser of the linearised problem, (N, m)."""
-        rows, outputs = self._rows, self._sweep.outputs
+        outputs = self._sweep.outputs
         values = rows.values(outputs["vs"], outputs["zs"])
         if not np.isfinite(values).all():
             return None
@@ -131,10 +162,26 @@ class BackupPlanner:
         free = outputs["vs"].T
         return rows.clip(free + (slopes[: free.size] @ nearest.w).reshape(shape))
 
-    def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray) -> Policy:
+    def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray, margin: float) -> Policy:
         gain, d = self._gain, self.problem.model.d
         states = np.vstack([s[:d], z[:-1]])
-        return Policy(v - states @ gain.T, gain, states)
+        return Policy(v - states @ gain.T, gain, states, margin)
+
+
+def _rows(problem: Problem, margin: float) -> Rows:
+    """The rows of the learned states inside (1 - margin) X."""
+    plain = state_set(problem.model)
+    inside = margin * 0.5 * (plain.upper - plain.lower)
+    shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
+    states = tuple(plain.minus(share * inside, share * inside) for share in shares)
+    return Rows(replace(problem, states=states, soft=True, guard=None))
+
+
+def _touches(rows: Rows, v: np.ndarray, z: np.ndarray) -> bool:
+    """Whether a state comes to its bounds anywhere."""
+    values, near = rows.values(v.T, z.T), TOUCHES * rows.penalty.scale
+    near_one = (values < rows.lower + near) | (values > rows.upper - near)
+    return bool(near_one[rows.count_inputs :].any())
 
 
 def tracking_gain(model: Model) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,8 +12,9 @@ from science import compressor, describe, oracle_named
 
 from controller_node.core import ControllerCore
 from experiments.lockstep import simulate
-from lbmpc.backup import RAMP, BackupPlanner, Policy
-from lbmpc.model import Model
+from lbmpc.backup import RAMP, STEPS, BackupPlanner, Policy
+from lbmpc.least_distance import Nearest, least_distance
+from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.plants import Truth
 from lbmpc.problem import Problem, build_problem
@@ -54,7 +56,7 @@ def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
     """With h known the backup problem's constraints are the true plant's; the nominal plan's are not."""
     oracle, truth = PerfectOracle(MODEL), Truth(PLANT)
     nominal = Solver(problem(oracle)).solve(X0, np.zeros(oracle.parameters), np.zeros((N, 1)))
-    blind = followed(X0, Policy(nominal.v, np.zeros((1, 4)), np.zeros((N, 4))), truth)
+    blind = followed(X0, Policy(nominal.v, np.zeros((1, 4)), np.zeros((N, 4)), 0.0), truth)
     assert max(map(outside, blind)) > 0.02
     policy = BackupPlanner(problem(oracle), 0.0).policy(X0, np.zeros(oracle.parameters), nominal.v)
     assert policy is not None
@@ -70,6 +72,47 @@ def test_the_margin_is_kept_once_it_has_grown() -> None:
     policy = BackupPlanner(problem(oracle), 0.05).policy(x, np.zeros(oracle.parameters), np.zeros((N, 1)))
     assert policy is not None
     assert max(map(outside, policy.states[RAMP + 4 :])) < -0.05 + 1e-4
+
+
+@pytest.mark.parametrize(("margin", "kept"), [(0.02, 0.02), (0.06, 0.02), (0.15, 0.0)])
+def test_a_margin_that_would_cost_the_way_back_is_given_up(margin: float, kept: float) -> None:
+    """From the paper's x0 the flow recovers only while the pressure is near its bound: with 6 % it falls to a half."""
+    oracle = PerfectOracle(MODEL)
+    policy = BackupPlanner(problem(oracle), margin).policy(X0, np.zeros(0), np.zeros((N, 1)))
+    assert policy is not None
+    assert policy.margin == pytest.approx(kept)
+    states = followed(X0, policy, Truth(PLANT))
+    assert max(map(outside, states)) < 1e-4 - kept
+    assert states[-1][0] > X0[0]
+
+
+@pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-9), np.array([-0.1, -0.4, 0.0, 0.0])])
+def test_a_margin_that_costs_nothing_is_kept(x: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing is solved a second time, at rest neither, where no plan ends nearer."""
+    solved = []
+
+    def counted(*arguments: Any) -> Nearest | None:
+        solved.append(arguments)
+        return least_distance(*arguments)
+
+    monkeypatch.setattr("lbmpc.backup.least_distance", counted)
+    oracle = PerfectOracle(MODEL)
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, np.zeros(0), np.zeros((N, 1)))
+    assert policy is not None
+    assert policy.margin == 0.05
+    assert len(solved) == STEPS
+
+
+def test_a_margin_is_not_given_up_for_nothing() -> None:
+    """A valve that hardly moves: no plan leads back, and none without a margin ends nearer."""
+    stuck = replace(PLANT, u_min=PLANT.u_e - 1e-6, u_max=PLANT.u_e + 1e-6)
+    model = build_model(stuck, MODEL.period)
+    policy = BackupPlanner(problem(PerfectOracle(model), model), 0.05).policy(
+        X0, np.zeros(0), np.zeros((N, 1))
+    )
+    assert policy is not None
+    assert model.P @ policy.states[-1] @ policy.states[-1] > model.P @ X0 @ X0
+    assert policy.margin == 0.05
 
 
 def test_without_learning_it_is_the_solution_of_the_judge() -> None:

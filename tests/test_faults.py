@@ -118,6 +118,17 @@ def test_noise_is_in_what_is_measured_and_not_in_the_truth() -> None:
     assert replay(run).equal
 
 
+def test_a_command_that_takes_its_time_acts_later_and_is_known_to() -> None:
+    run = follow(config("controller.oracle=linear"), 20, Faults(command_seconds=0.01)).run
+    pieces = [[piece.seconds for piece in tick.state.pieces] for tick in run.ticks[2:] if tick.state]
+    assert len(pieces) == 18
+    for seconds in pieces:
+        assert seconds == pytest.approx([0.01, 0.04])
+    assert replay(run).equal
+    with pytest.raises(ConfigError, match=r"command_seconds = 0.05 is not less than a period, 0.05 s"):
+        follow(config("controller.oracle=linear"), 1, Faults(command_seconds=0.05))
+
+
 def test_a_late_trainer_is_late_and_trains_once_at_a_time() -> None:
     run = follow(config(), 60, Faults(training_seconds=1.0)).run
     arrived = [tick.seq for tick in run.ticks if tick.weights is not None]
