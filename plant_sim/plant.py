@@ -13,7 +13,7 @@ from lbmpc.plants import Plant, Truth
 from plant_sim.watchdog import Orders, Standby
 from protocol.messages import Backup, Command, InputSource, Piece, PlantState
 
-CommandVerdict = Literal["ok", "wrong period", "foreign", "stale"]
+CommandVerdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +63,8 @@ class PlantSim:
         """Let `command` act from time t on, or from the last sample if t lies before it.
 
         It must have the plant's dimensions (`check_dimensions`). It is refused when its period is not the
-        plant's, when it answers another plant's sample or, while held, none, and when it answers a sample so
-        old that the plan had to take over already.
+        plant's, when it answers another plant's sample or, while held, none, as a controller's first one may, and
+        when it answers a sample so old that the plan had to take over already.
         """
         if not math.isclose(command.period, self.period, rel_tol=1e-6):
             return "wrong period"
@@ -75,7 +75,7 @@ class PlantSim:
             if age > (1.0 + self._patience) * self.period:
                 return "stale"
         elif not self.moving and not self._pending:
-            return "foreign"
+            return "answers no sample"
         at = max(t, self._t, self._pending[-1].arrived if self._pending else -math.inf)
         self._pending.append(Orders(self.plant, command, at, self._patience))
         return "ok"

@@ -262,7 +262,7 @@ def test_what_must_not_be_obeyed_is_refused() -> None:
     sim.sample(0.0)
     assert sim.command(command(0, U, run_id="plant-b"), 0.0) == "foreign"
     assert sim.command(command(0, U, answers=1), 0.0) == "foreign"
-    assert sim.command(command(0, U, answers=-1, run_id=""), 0.0) == "foreign"
+    assert sim.command(command(0, U, answers=-1, run_id=""), 0.0) == "answers no sample"
     assert sim.command(command(0, U, period=3000.0), 0.0) == "wrong period"
     assert not sim.sample(PERIOD).command_seq >= 0
     assert sim.command(command(0, U, answers=1), PERIOD) == "ok"

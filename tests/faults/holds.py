@@ -113,8 +113,9 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
             if name.startswith(f"{process} bad {topic}:")
         }
         bad = sum(reasons.values())
-        # What the run's own trainer sent may be refused too, or give way to a stranger's.
-        own = ("refused", "for another run", "superseded")
+        # What the run's own trainer sent may be refused too, or give way to a stranger's. And the controller's first
+        # command may come before it has heard the plant.
+        own = ("refused", "for another run", "superseded", "answers no sample")
         surely = bad - sum(reasons.get(reason, 0) for reason in own)
         # A flood makes room in a full mailbox by dropping the oldest, whosever it was.
         dropped = found.get(f"{process} overflow {topic}", 0)
