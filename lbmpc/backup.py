@@ -16,13 +16,14 @@ which takes no more than the plant's own sensors. K is stiffer than the model's:
 add up. Nothing of this is certified: h_hat is what was learned so far.
 
 The margin is room for what h_hat does not know, and where the way to x = 0 leads along a bound it can cost the way
-itself. So a plan that touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, is not followed: the problem
-is solved again with less of it, as long as that ends nearer.
+itself. So where the plan touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, the problem is solved
+again without one, and if that ends nearer a third time, with as much of it as should lead back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -42,8 +43,6 @@ STEPS = 2
 """Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
-SHARES = (1.0, 1.0 / 3.0, 0.0)
-"""Of the margin, tried in this order until a plan leads back."""
 NEARER = 0.9
 """Of |z_0|_P: where a plan that leads back ends at most. And of another plan's end, to be better than that."""
 TOUCHES = 1e-3
@@ -85,7 +84,8 @@ class BackupPlanner:
     ):
         self.problem = problem
         model, oracle, n = problem.model, problem.oracle, problem.horizon
-        self._rows = {share * margin: _rows(problem, share * margin) for share in SHARES}
+        self._margin = margin
+        self._kept, self._plain = _rows(problem, margin), _rows(problem, 0.0)
         self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
         self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
         self._gain = tracking_gain(model)
@@ -101,17 +101,33 @@ class BackupPlanner:
         Returns:
             None when the numbers are unusable.
         """
-        found, margin, least = None, 0.0, np.inf
-        v = np.asarray(plan, dtype=float)
         with np.errstate(all="ignore"):
-            for share, rows in self._rows.items():
-                best = self._best(rows, s, theta, v, STEPS if found is None else 1)
-                if best is None or (end := self._distance(best[1][-1])) >= NEARER * least:
-                    break
-                found, margin, least, v = best, share, end, best[0]
-                if end < NEARER * self._distance(s) or not _touches(rows, *best):
-                    break
-        return None if found is None else self._with_feedback(s, *found, margin)
+            kept = self._best(self._kept, s, theta, np.asarray(plan, dtype=float), STEPS)
+            if kept is None:
+                return None
+            share, found = self._less(s, theta, kept) if self._is_in_the_way(s, kept) else (1.0, kept)
+        return self._with_feedback(s, *found, share * self._margin)
+
+    def _is_in_the_way(self, s: np.ndarray, kept: Plan) -> bool:
+        return self._end(s, kept) >= NEARER and _touches(self._kept, *kept)
+
+    def _less(self, s: np.ndarray, theta: np.ndarray, kept: Plan) -> tuple[float, Plan]:
+        """The share of the margin, and the plan, that leads back, or else what ends nearer, if anything does.
+
+        Where a plan ends is taken for linear in the margin.
+        """
+        free = self._best(self._plain, s, theta, kept[0], 1)
+        if free is None or (end := self._end(s, free)) >= NEARER * self._end(s, kept):
+            return 1.0, kept
+        if end >= NEARER:
+            return 0.0, free
+        share = (NEARER - end) / (self._end(s, kept) - end)
+        between = self._best(_between(self._plain, self._kept, share), s, theta, free[0], 1)
+        return (0.0, free) if between is None else (share, between)
+
+    def _end(self, s: np.ndarray, plan: Plan) -> float:
+        """|z_N|_P of |z_0|_P."""
+        return self._distance(plan[1][-1]) / max(self._distance(s), np.finfo(float).tiny)
 
     def _distance(self, s: np.ndarray) -> float:
         """|x|_P of a state, with its past or without."""
@@ -175,6 +191,14 @@ def _rows(problem: Problem, margin: float) -> Rows:
     shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
     states = tuple(plain.minus(share * inside, share * inside) for share in shares)
     return Rows(replace(problem, states=states, soft=True, guard=None))
+
+
+def _between(plain: Rows, kept: Rows, share: float) -> Rows:
+    """The rows with this share of the margin, in (0, 1)."""
+    rows = copy(kept)
+    both = (plain.lower, kept.lower), (plain.upper, kept.upper)
+    rows.lower, rows.upper = ((1.0 - share) * without + share * with_it for without, with_it in both)
+    return rows
 
 
 def _touches(rows: Rows, v: np.ndarray, z: np.ndarray) -> bool:

@@ -42,6 +42,11 @@ def outside(x: np.ndarray) -> float:
     return float(np.max(np.abs(x + PLANT.x_e - 0.5 * (PLANT.x_min + PLANT.x_max)) / HALF)) - 1.0
 
 
+def distance(x: np.ndarray) -> float:
+    """In the norm of the terminal cost."""
+    return float(np.sqrt(x @ MODEL.P @ x))
+
+
 def followed(x: np.ndarray, policy: Policy, truth: Truth) -> list[np.ndarray]:
     """The true plant's deviations under the policy."""
     states = []
@@ -74,21 +79,36 @@ def test_the_margin_is_kept_once_it_has_grown() -> None:
     assert max(map(outside, policy.states[RAMP + 4 :])) < -0.05 + 1e-4
 
 
-@pytest.mark.parametrize(("margin", "kept"), [(0.02, 0.02), (0.06, 0.02), (0.15, 0.0)])
-def test_a_margin_that_would_cost_the_way_back_is_given_up(margin: float, kept: float) -> None:
-    """From the paper's x0 the flow recovers only while the pressure is near its bound: with 6 % it falls to a half."""
+@pytest.mark.parametrize(
+    ("flow", "margin", "least", "most"),
+    [
+        (0.15, 0.02, 0.02, 0.02),  # leads back with all of it
+        (0.15, 0.06, 0.02, 0.04),  # with all of it the flow falls to a half
+        (0.14, 0.02, 0.003, 0.01),
+        (0.13, 0.06, 0.0, 0.0),  # too late, but nearer
+    ],
+)
+def test_as_much_of_the_margin_is_kept_as_leads_back(
+    flow: float, margin: float, least: float, most: float
+) -> None:
+    """From the paper's x0 and below the flow recovers only while the pressure is near its bound."""
     oracle = PerfectOracle(MODEL)
-    policy = BackupPlanner(problem(oracle), margin).policy(X0, np.zeros(0), np.zeros((N, 1)))
+    x = np.array([flow - PLANT.x_e[0], *X0[1:]])
+    policy = BackupPlanner(problem(oracle), margin).policy(x, np.zeros(0), np.zeros((N, 1)))
     assert policy is not None
-    assert policy.margin == pytest.approx(kept)
-    states = followed(X0, policy, Truth(PLANT))
-    assert max(map(outside, states)) < 1e-4 - kept
-    assert states[-1][0] > X0[0]
+    assert least <= policy.margin <= most
+    states = followed(x, policy, Truth(PLANT))
+    if policy.margin > 0.0:
+        assert max(map(outside, states)) < 1e-3 - policy.margin
+        assert distance(states[-1]) < 0.95 * distance(x)
 
 
-@pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-9), np.array([-0.1, -0.4, 0.0, 0.0])])
-def test_a_margin_that_costs_nothing_is_kept(x: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And nothing is solved a second time, at rest neither, where no plan ends nearer."""
+@pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-4), np.array([-0.1, -0.4, 0.0, 0.0])])
+@pytest.mark.parametrize("oracle", [PerfectOracle(MODEL), oracle_named("dnn", MODEL)])
+def test_a_margin_that_costs_nothing_is_kept(
+    x: np.ndarray, oracle: Oracle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing is solved a second time, at rest neither, where what was learned says that it will move away."""
     solved = []
 
     def counted(*arguments: Any) -> Nearest | None:
@@ -96,8 +116,8 @@ def test_a_margin_that_costs_nothing_is_kept(x: np.ndarray, monkeypatch: pytest.
         return least_distance(*arguments)
 
     monkeypatch.setattr("lbmpc.backup.least_distance", counted)
-    oracle = PerfectOracle(MODEL)
-    policy = BackupPlanner(problem(oracle), 0.05).policy(x, np.zeros(0), np.zeros((N, 1)))
+    theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
     assert policy is not None
     assert policy.margin == 0.05
     assert len(solved) == STEPS
@@ -111,7 +131,7 @@ def test_a_margin_is_not_given_up_for_nothing() -> None:
         X0, np.zeros(0), np.zeros((N, 1))
     )
     assert policy is not None
-    assert model.P @ policy.states[-1] @ policy.states[-1] > model.P @ X0 @ X0
+    assert distance(policy.states[-1]) > distance(X0)
     assert policy.margin == 0.05
 
 
