@@ -74,7 +74,7 @@ class BackupConfig(Section, frozen=True):
     enabled: bool = True
     """Up to 100 Hz; in a faster loop there is no time for it, and the plan is what the plant follows."""
     margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.0075
-    """By how much X shrinks for it, as a share of its half-widths."""
+    """By how much X shrinks for it, as a share of its half-widths; less where that would cost the way back."""
 
 
 class ControllerConfig(Section, frozen=True):
