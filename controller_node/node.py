@@ -33,6 +33,9 @@ SAMPLES_BATCH = 5
 SAMPLES_WAIT = 0.1
 # A state older than this share of a period belongs to an earlier slot.
 OLDEST_STATE = 0.8
+# Seconds that all states were older than that: no backlog lasts so long, so the plant's clock, or ours, has leapt, or
+# the way is longer now. How long a command took on it the plant judges by its own clock.
+FORGIVES_S = 5.0
 # How long a slot waits for its state, as a share of a period.
 STATE_PATIENCE = 0.25
 LONGEST_PHASE = 0.5
@@ -141,7 +144,7 @@ class ControllerNode:
     # -- before the step ---------------------------------------------------------------------------------
 
     def _find_plant(self, stop: threading.Event) -> bool:
-        """Wait for a state and put the next slot `phase` behind its arrival; False when told to stop.
+        """Wait for a state young enough and put the next slot `phase` behind its arrival; False when told to stop.
 
         After an outage longer than the plan there is nothing left to say, so the loop comes back here.
         """
@@ -149,14 +152,28 @@ class ControllerNode:
             return False
         self._send_samples()
         self._health.set("ready", "no plant: waiting for its states")
+        old_since = None
         while not stop.is_set():
             self._first = self._states.wait(0.1)
-            if self._first is not None:
+            if self._first is None:
+                old_since = None
+                continue
+            now = clock.now()
+            age = self._states.age(self._first, now)
+            if age <= OLDEST_STATE * self._period:
                 self._missing = 0
                 self._followed = self._first.message.run_id
                 self._grid.reanchor(self._states.undelayed(self._first) + self._phase)
                 self._health.set("running")
                 return True
+            self._health.set("ready", "no plant: its states come too late to act on")
+            old_since = now if old_since is None else old_since
+            if now - old_since > FORGIVES_S:
+                text = (
+                    "the plant's states have been %.3g s late for %g s; what comes now is taken for punctual"
+                )
+                log.warning(text, age, FORGIVES_S)
+                self._states.forget_ages()
         return False
 
     def _latch(self, slot: Slot) -> Latched:
@@ -223,7 +240,9 @@ class ControllerNode:
         outputs = self._core.step(tick)
         self._bus.publish(topics.COMMAND, outputs.command)
         sent = clock.now()
-        if self._backs_up and (backup := self._core.backup(outputs.command)) is not None:
+        # The plant obeys no command that answers none of its samples, and no policy that belongs to one.
+        obeyed = latched.verdict == "fresh"
+        if self._backs_up and obeyed and (backup := self._core.backup(outputs.command)) is not None:
             self._bus.publish(topics.BACKUP, backup)
         timing = m.TickTiming(
             run_id=self._run_id,

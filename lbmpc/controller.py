@@ -8,7 +8,6 @@ in, then the problem is solved.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import Literal, Protocol
 
 import numpy as np
@@ -150,6 +149,11 @@ class Solves(Protocol):
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
 
 
+ABSURD = 1e6
+"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Its square,
+in plant units, where X has no bounds. Finite alone is not enough: what is learned from 1e307 is not."""
+
+
 class Controller:
     """LBMPC with an oracle that learns.
 
@@ -164,6 +168,9 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self.oracle = problem.oracle
+        plant = self.model.plant
+        half = 0.5 * (plant.x_max - plant.x_min)
+        self._absurd = np.where(np.isfinite(half), ABSURD * half, ABSURD**2)
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -190,7 +197,7 @@ class Controller:
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        if seen.x is not None and not isfinite(sum(seen.x.tolist())):
+        if seen.x is not None and not (np.abs(seen.x) <= self._absurd).all():
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
         rolled_back = ""

@@ -42,10 +42,13 @@ class Follower:
         """The incarnation followed now, None before the first."""
         return self._run_id
 
+    def silent(self, now: float) -> bool:
+        """Whether nobody is followed, or none of its messages was accepted for so long that anybody may take over."""
+        return self._run_id is None or now - self._last > self._silence
+
     def accept(self, run_id: str, seq: int, now: float) -> FollowVerdict:
         """Judge one message that arrived at `now`, seconds on any monotonic clock."""
-        silent = self._run_id is None or now - self._last > self._silence
-        if not silent:
+        if not self.silent(now):
             if run_id != self._run_id:
                 return "foreign"
             if seq <= self._seq:
@@ -64,7 +67,7 @@ class AgeEstimate:
     """
 
     # Quartz clocks disagree by tens of parts per million.
-    def __init__(self, drift: float = 1e-4, implausible: float = 60.0):
+    def __init__(self, drift: float = 1e-4, implausible: float = 1.0):
         self._drift = drift
         self._implausible = implausible
         self._offset: float | None = None
@@ -75,7 +78,10 @@ class AgeEstimate:
         self._offset = None
 
     def plausible(self, sent: float, arrived: float) -> bool:
-        """False when the sender's clock seems to have leapt ahead: all that follows would look old."""
+        """False when the sender's clock seems to have leapt ahead: all that follows would look old.
+
+        Or the messages so far were all late, by more than that; either shows in what follows.
+        """
         return self._offset is None or arrived - sent > self._offset - self._implausible
 
     def observe(self, sent: float, arrived: float) -> None:
@@ -149,11 +155,18 @@ class Inbox(Generic[M]):
                 return None
             newest = self._check(delivery)
             newest = self.take() or newest
+            if clock.now() >= deadline:
+                # Also where what must not be obeyed never ends.
+                break
         return newest
 
     def age(self, received: Received[M], now: float) -> float:
         """Seconds since the message was sent, beyond the shortest delay seen from this sender."""
         return 0.0 if received.sent is None else self._ages.age(received.sent, now)
+
+    def forget_ages(self) -> None:
+        """Take the next message for as quick as any: who reads them knows that the shortest delay was none."""
+        self._ages.reset()
 
     def undelayed(self, received: Received[M]) -> float:
         """When the message would have arrived with the shortest delay seen from its sender; seconds."""
@@ -170,7 +183,9 @@ class Inbox(Generic[M]):
             return None
         sent = None if self._sent is None else self._sent(message)
         followed = self.follower.run_id
-        if sent is not None and message.run_id == followed and not self._ages.plausible(sent, arrived):
+        leapt = sent is not None and message.run_id == followed and not self._ages.plausible(sent, arrived)
+        # After silence it is taken for what the sender's clock says now: it must not be shut out for ever.
+        if leapt and not self.follower.silent(arrived):
             self._bad.count(self.topic.name, "implausible time", f"sent at {sent} s by {message.run_id}")
             return None
         verdict = self.follower.accept(message.run_id, message.seq, arrived)

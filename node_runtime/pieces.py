@@ -24,6 +24,8 @@ MARK = b"\xc1"
 HEADER = 512
 """Bytes, at most, around the data of a piece."""
 TEXT = 128
+PARTIAL = 1024
+"""Messages that may be in pieces at once; a fleet's trainer hears one writer a plant."""
 
 
 class Piece(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -88,7 +90,8 @@ class Assembler:
     """Puts messages together, those of each writer one at a time. Any thread may call; nothing is raised.
 
     Args:
-        limit: bytes held at most, of all messages that are not whole yet; the oldest gives way.
+        limit: bytes held at most, of all messages that are not whole yet; the oldest gives way. As it does when there
+            are more than `PARTIAL` of them.
         bad: where pieces that do not fit, and messages that never became whole, are counted.
     """
 
@@ -145,7 +148,7 @@ class Assembler:
             del self._partial[at]
             self._held -= partial.held
             return partial.whole()
-        while self._held > self.limit:
+        while self._held > self.limit or len(self._partial) > PARTIAL:
             self._forget(next(iter(self._partial)))
         return None
 

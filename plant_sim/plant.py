@@ -63,19 +63,19 @@ class PlantSim:
         """Let `command` act from time t on, or from the last sample if t lies before it.
 
         It must have the plant's dimensions (`check_dimensions`). It is refused when its period is not the
-        plant's, when it answers another plant's sample or, while held, none, as a controller's first one may, and
-        when it answers a sample so old that the plan had to take over already.
+        plant's, when it answers another plant's sample or none, and when it answers a sample so old that the plan had
+        to take over already. A controller that hears no states goes on with a plan that keeps only the nominal model
+        in X; the backup policy that the plant has is better, and it has its own sensors.
         """
         if not math.isclose(command.period, self.period, rel_tol=1e-6):
             return "wrong period"
-        if command.state_seq >= 0:
-            if command.state_run_id != self.run_id or command.state_seq > self._seq or self._first is None:
-                return "foreign"
-            age = t - (self._first + command.state_seq * self.period)
-            if age > (1.0 + self._patience) * self.period:
-                return "stale"
-        elif not self.moving and not self._pending:
+        if command.state_seq < 0:
             return "answers no sample"
+        if command.state_run_id != self.run_id or command.state_seq > self._seq or self._first is None:
+            return "foreign"
+        age = t - (self._first + command.state_seq * self.period)
+        if age > (1.0 + self._patience) * self.period:
+            return "stale"
         at = max(t, self._t, self._pending[-1].arrived if self._pending else -math.inf)
         self._pending.append(Orders(self.plant, command, at, self._patience))
         return "ok"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from science import compressor, describe
 
 from lbmpc.controller import Controller, ControllerState, HiddenSet, Observation, same_memory
@@ -135,6 +138,32 @@ def test_without_a_state_the_plan_goes_on_and_without_both_the_equilibrium() -> 
     _, result = CONTROLLER.step(CONTROLLER.initial_state(0), seen(np.full(4, np.nan), 0, None))
     assert result.mode == "feedback"
     np.testing.assert_array_equal(result.plan, np.zeros((15, 1)))
+
+
+@pytest.mark.parametrize("absurd", [1.7e308, 1e307, -1e160, 3e6])
+def test_a_number_that_is_no_measurement_is_no_state(absurd: float) -> None:
+    """Finite, but what would be learned from it is not, and what is not finite stays in the memory for good."""
+    state = CONTROLLER.initial_state(0)
+    for i in range(3):
+        state, _ = CONTROLLER.step(state, late(X, i, 0.1, 0.004, 0.1))
+    wrong = late(np.array([X[0], absurd, *X[2:]]), 3, 0.1, 0.004, 0.1)
+    after, result = CONTROLLER.step(state, wrong)
+    assert result.mode == "shifted_plan"
+    assert result.label is None
+    without, _ = CONTROLLER.step(state, replace(wrong, x=None))
+    assert same_memory(after, without) is None
+    _, result = CONTROLLER.step(after, late(X_NEXT, 4, 0.1, 0.004, 0.1))
+    assert result.mode == "solver"
+
+
+def test_what_is_learned_from_a_wild_measurement_is_finite() -> None:
+    state = CONTROLLER.initial_state(0)
+    half = 0.5 * (MODEL.plant.x_max - MODEL.plant.x_min)
+    for i in range(4):
+        x = 9e5 * half if i == 2 else X
+        state, result = CONTROLLER.step(state, late(x, i, 0.1, 0.004, 0.1))
+        assert all(np.isfinite(array).all() for array in state.to_arrays().values())
+    assert result.mode == "solver"
 
 
 def test_the_feedback_is_clipped_to_U() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import msgspec
@@ -336,6 +336,42 @@ def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
         assert counters[f"bad plant/state: {reason}"] >= 15, reason
         assert process.said.count(f"bad plant/state: {reason}") == 1
     assert counters["states missing"] >= 15
+
+
+@pytest.mark.live
+def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None:
+    """The plant's clock has lost five seconds: no ticks without a state meanwhile, and control afterwards."""
+    config = live_config(*SETTINGS)
+    with Router(config), Bus(config, "recorder", "recorder-a") as bus:
+        ear = Ear(bus)
+        script = Script(config)
+
+        def played(behind: float, until: Callable[[], bool]) -> None:
+            end = clock.now() + HANG_S
+            while not until() and clock.now() < end:
+                script.period(config)
+                script.bus.publish(topics.PLANT_STATE, script.state(t=clock.now() - behind))
+                script.seq += 1
+
+        def fresh() -> list[m.Tick]:
+            return [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"]
+
+        with Process("controller_node.node", config) as process:
+            ear.until(health_of("controller", status="ready", note="no plant: waiting for its states"))
+            wait_for(lambda: script.bus.matched(topics.PLANT_STATE))
+            played(0.0, lambda: len(fresh()) > 10)
+            before = len(fresh())
+            played(5.0, lambda: len(fresh()) > before + 10)
+            process.signal(signal.SIGTERM)
+            assert process.end() == 0
+        script.close()
+    notes = [health.note for health in ear.of(topics.HEALTH["controller"])]
+    assert notes.count("no plant: its states come too late to act on") >= 1
+    assert "taken for punctual" in process.said
+    late = [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "stale"]
+    # The length of the plan, and nothing after it.
+    assert len(late) <= config.controller.horizon
+    assert len(fresh()) > before + 10
 
 
 @pytest.mark.live

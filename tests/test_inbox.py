@@ -16,6 +16,7 @@ from live import HANG_S, live_config, wait_for
 from node_runtime import clock
 from node_runtime.bus import Bus, session_config
 from node_runtime.inbox import AgeEstimate, BadMessages, Follower, Inbox
+from node_runtime.mailbox import Delivery
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
@@ -210,6 +211,45 @@ def test_garbage_behind_a_good_message_does_not_hide_it(buses: tuple[Bus, zenoh.
     assert received is not None
     assert received.message.seq == 1
     assert sender.inbox.take() is None
+
+
+@pytest.mark.live
+def test_a_senders_clock_that_leapt_is_believed_after_silence(buses: tuple[Bus, zenoh.Session]) -> None:
+    """A machine that was suspended must not be shut out for ever."""
+    sender = Sender(buses)
+    sender.inbox.follower = Follower(silence=0.2)
+    seqs, heard = itertools.count(), []
+
+    def hears(ahead: float) -> bool:
+        sender.send(state(next(seqs), t=clock.now() + ahead))
+        heard.extend(sender.inbox.take_all())
+        return bool(heard) and heard[-1].message.t > clock.now() + ahead - 50.0
+
+    wait_for(lambda: hears(0.0))
+    wait_for(lambda: hears(100.0))
+    assert sender.counted()["bad plant/state: implausible time"] >= 1
+    assert sender.inbox.age(heard[-1], heard[-1].arrived) < 0.05
+
+
+class Endless:
+    """A mailbox that never runs out of garbage."""
+
+    def drain(self) -> list[Delivery]:
+        return [self.get(0.0)]
+
+    def get(self, timeout_s: float) -> Delivery:
+        return Delivery("plant/state", b"junk", clock.now_ns())
+
+
+@pytest.mark.live
+def test_garbage_without_end_does_not_keep_anybody_waiting(
+    buses: tuple[Bus, zenoh.Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender = Sender(buses)
+    monkeypatch.setattr(sender.inbox, "_mailbox", Endless())
+    began = clock.now()
+    assert sender.inbox.wait(0.05) is None
+    assert 0.05 <= clock.now() - began < HANG_S
 
 
 def _waiting(sender: Sender) -> int:

@@ -14,7 +14,7 @@ from live import HANG_S, live_config, wait_for
 from node_runtime.bad_messages import BadMessages
 from node_runtime.bus import Bus, session_config
 from node_runtime.config import Config
-from node_runtime.pieces import HEADER, MARK, PIECE, Assembler, Piece, split
+from node_runtime.pieces import HEADER, MARK, PARTIAL, PIECE, Assembler, Piece, split
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
@@ -109,6 +109,16 @@ def test_a_message_that_is_not_what_was_sent_is_not_used() -> None:
     assert receiver.take(altered(parts[0], data=bytes(PIECE)), *parts[1:]) == []
     assert receiver.bad.counters() == {"bad x: pieces do not make the message": 1}
     assert receiver.take(parts[0], altered(parts[1], crc32=zlib.crc32(b"")), *parts[1:]) == [MESSAGE]
+
+
+def test_strangers_under_many_names_cannot_fill_it_either() -> None:
+    """With a byte each the bytes held are few."""
+    receiver, small = Receiver(), altered(pieces()[0], size=PIECE + 1, index=1, data=b"x")
+    for k in range(PARTIAL + 500):
+        receiver.take(altered(small, writer=f"stranger-{k}"))
+    assert receiver.assembler.held == PARTIAL
+    assert receiver.bad.counters() == {"bad x: pieces lost": 500}
+    assert receiver.take(*pieces()) == [MESSAGE]
 
 
 def test_strangers_cannot_fill_the_memory() -> None:

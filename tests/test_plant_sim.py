@@ -266,7 +266,10 @@ def test_what_must_not_be_obeyed_is_refused() -> None:
     assert sim.command(command(0, U, period=3000.0), 0.0) == "wrong period"
     assert not sim.sample(PERIOD).command_seq >= 0
     assert sim.command(command(0, U, answers=1), PERIOD) == "ok"
-    assert sim.command(command(1, U, answers=-1, run_id=""), PERIOD) == "ok"
+    assert sim.sample(2 * PERIOD).source == "command"
+    # Nor when it moves: the plan of a controller that hears no states is worse than the policy that the plant has.
+    assert sim.command(command(1, U, answers=-1, run_id=""), PERIOD) == "answers no sample"
+    assert sim.sample(3 * PERIOD).command_seq == 0
 
 
 def test_old_commands_in_a_burst_are_refused() -> None:
