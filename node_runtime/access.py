@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from node_runtime.bus import LARGEST_QUESTION
 from node_runtime.credentials import Credentials
 from protocol import topics
 from protocol.rights import ROLES, common_name, rights_of
 
 SECURE = ["tls", "quic"]
 PLAIN = ["tcp"]
-LARGEST_QUESTION = 4096
 MESSAGES = [
     "put",
     "delete",

@@ -36,6 +36,8 @@ BULK_MESSAGES = 2000
 BULK_BYTES = 256 * 1024 * 1024
 PENDING_QUERIES = 32
 LARGEST = max(topic.max_bytes for topic in topics.ALL)
+LARGEST_QUESTION = 4096
+"""Characters of its parameters."""
 
 Handler = Callable[[dict[str, str]], list[bytes]]
 Payload = bytes | list[Gathered]
@@ -313,6 +315,11 @@ class Bus:
         key = f"{topics.PREFIX}/{self.config.name}/{name}"
 
         def arrived(query: zenoh.Query) -> None:
+            # A router's limits are for payloads, and a question has none.
+            if len(str(query.parameters)) > LARGEST_QUESTION:
+                self.bad.count(name, "oversized question")
+                query.drop()
+                return
             try:
                 self._queries.put_nowait((query, key, handler))
             except queue.Full:

@@ -28,7 +28,7 @@ from node_runtime.choices import (
 from node_runtime.strict import ConfigError, Fail, apply_override, convert, failing, load_tree
 from protocol.architecture import BOUNDED, Activation, get_architecture
 from protocol.codec import first_non_finite
-from protocol.network import Width
+from protocol.network import LAYERS, Width
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -108,7 +108,9 @@ class NetworkConfig(Section, frozen=True):
     """k, the pairs (x, u) that the network sees, the present one included; None: the architecture's own."""
     options: dict[str, int] = msgspec.field(default_factory=dict)
     """The architecture's own settings, where they are not its defaults."""
-    hidden: list[Width] = msgspec.field(default_factory=lambda: [64, 64])
+    hidden: Annotated[list[Width], msgspec.Meta(max_length=LAYERS)] = msgspec.field(
+        default_factory=lambda: [64, 64]
+    )
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
     output_scale: Positive = 0.2

@@ -79,7 +79,11 @@ def read(folder: str | Path) -> Credentials:
             be read by others than its owner.
     """
     place = Path(folder).absolute()
-    if not place.is_dir():
+    try:
+        there = place.is_dir()
+    except OSError as error:
+        raise ConfigError(f"bus.tls.keys = {str(folder)!r}: cannot be read: {error.strerror}") from error
+    if not there:
         raise ConfigError(
             f"bus.tls.keys = {str(folder)!r}: no such folder; `tandem keys create` makes one for every role"
         )

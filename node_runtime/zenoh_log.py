@@ -14,6 +14,7 @@ import os
 import re
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Iterator
 
 import zenoh
@@ -62,7 +63,7 @@ class Refusals:
     def __init__(self, bad: BadMessages):
         self._bad = bad
         self._wondering: set[str] = set()
-        self._names: dict[str, str] = {}
+        self._names: OrderedDict[str, str] = OrderedDict()
 
     def hear(self, line: str) -> bool:
         """Whether `line` was one of Zenoh's log."""
@@ -77,8 +78,12 @@ class Refusals:
             return True
         if not module.endswith("access_control"):
             return False
-        if (named := _NAMED.match(text)) is not None and len(self._names) < MAX_NAMES:
+        if (named := _NAMED.match(text)) is not None:
+            # Every session has a new one; health checks alone open one every few seconds.
             self._names[named["zid"]] = named["name"]
+            self._names.move_to_end(named["zid"])
+            if len(self._names) > MAX_NAMES:
+                self._names.popitem(last=False)
         if _STRANGER.match(text):
             self._bad.count("TLS link", "a certificate without rights here", text)
         elif _WONDERING in text:

@@ -29,7 +29,11 @@ __all__ = [
 ]
 
 Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
+Length = Annotated[int, msgspec.Meta(ge=1, le=128)]
+Window = Annotated[int, msgspec.Meta(ge=1, le=64)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+LAYERS = 32
+"""Hidden layers at most: a description comes from elsewhere, and memory is taken by it."""
 # Fields that came later are left out of the hash at these values: weights in older logs keep their network's hash.
 _FIRST: dict[str, Any] = {"architecture": "mlp", "window": 1, "options": {}}
 
@@ -37,9 +41,9 @@ _FIRST: dict[str, Any] = {"architecture": "mlp", "window": 1, "options": {}}
 class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Sizes, activations and scaling of one network. Two processes agree when their `sha256` agree."""
 
-    states: Width
-    inputs: Width
-    hidden: list[Width]
+    states: Length
+    inputs: Length
+    hidden: Annotated[list[Width], msgspec.Meta(max_length=LAYERS)]
     """Neurons of each hidden layer, input side first."""
     activations: list[Activation]
     """One for each hidden layer; the last must be bounded."""
@@ -51,7 +55,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Largest Frobenius norm of a hidden layer that a controller accepts."""
     architecture: str = "mlp"
     """A file of `protocol/architectures`."""
-    window: Width = 1
+    window: Window = 1
     """k, the pairs (x, u) that the network sees: the present one and k - 1 before it."""
     options: dict[str, int] = {}
     """The architecture's own settings, all of them."""

@@ -241,6 +241,23 @@ def test_a_wrong_question_is_counted_on_both_sides(plant: Bus, controller: Bus) 
     assert plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"]
 
 
+def test_an_oversized_question_is_dropped_unread(plant: Bus, controller: Bus) -> None:
+    """A router's limits of size are for payloads; the parameters of a question may be of any size."""
+    asked: list[dict[str, str]] = []
+
+    def handler(parameters: dict[str, str]) -> list[bytes]:
+        asked.append(parameters)
+        return [b"fine"]
+
+    controller.serve(topics.OUTBOX_QUERY, handler)
+    wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"])
+    asked.clear()
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "1" * 100_000}, HANG_S) == []
+    assert controller.counters()["bad controller/outbox: oversized question"] == 1
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "2"}, HANG_S) == [b"fine"]
+    assert asked == [{"since": "2"}]
+
+
 def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controller: Bus) -> None:
     release = threading.Event()
     controller.serve("controller/slow", lambda _: [b"late"] if release.wait(HANG_S) else [])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import ExitStack
 from typing import Any, cast
 
 import numpy as np
@@ -20,7 +21,7 @@ from protocol.topics import Topic
 from trainer_node import finding
 from trainer_node.descent import Problem, descend_together
 from trainer_node.finding import Heard, OneRouter
-from trainer_node.fleet import SAY_EVERY, Fleet, seed_of
+from trainer_node.fleet import SAY_EVERY, Fleet, _Followed, seed_of
 from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
 from trainer_node.plant_bus import Sessions
 from trainer_node.training import Draw, Trainer, use_one_thread
@@ -145,6 +146,23 @@ def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pyte
     for now in (0.0, 1.0, SAY_EVERY - 1.0, SAY_EVERY + 1.0):
         fleet.turn(now)
     assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
+
+
+def test_a_plant_that_was_away_between_two_looks_is_taken_in_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a round of training that took longer than the renewal of its certificate."""
+
+    class Renewed(Nobody):
+        def present(self, now: float) -> list[str]:
+            return ["jet1"]
+
+    ended: list[str] = []
+    taken: list[str] = []
+    fleet, end = Fleet(Renewed()), ExitStack()
+    end.callback(ended.append, "jet1")
+    fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Sessions, "those before"), end)
+    monkeypatch.setattr(Fleet, "_take_in", lambda _fleet, name: taken.append(name))
+    fleet._gather(0.0)
+    assert (ended, taken) == (["jet1"], ["jet1"])
 
 
 def test_the_seed_is_the_name_and_not_the_order() -> None:

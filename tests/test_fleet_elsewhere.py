@@ -18,7 +18,9 @@ from node_runtime.config import Config, from_json, load, override, to_json, to_t
 from node_runtime.strict import ConfigError
 from protocol.messages import Health
 from tandem import keys_files
+from trainer_node.finding import OwnRouters
 from trainer_node.main import main
+from trainer_node.node import TrainerNode
 
 pytestmark = pytest.mark.live
 
@@ -104,6 +106,39 @@ def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_rele
         # Its folder is copied there at last.
         kept.rename(right)
         second.until(published, tick=True)
+
+
+def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.fleet.SHUNNED_S", 0.5)
+    listen, failed = TrainerNode.listen, []
+
+    def fails_once(node: TrainerNode, now: float) -> None:
+        if node._config.name == "jet1" and not failed:
+            failed.append(now)
+            raise MemoryError("a network for a larger machine")
+        listen(node, now)
+
+    monkeypatch.setattr(TrainerNode, "listen", fails_once)
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    with ExitStack() as stack:
+        for one in sites:
+            stack.enter_context(routing(one))
+        plants = [stack.enter_context(Controller(one, f"controller-{k}")) for k, one in enumerate(sites)]
+        stack.enter_context(training(fleet(tmp_path, *sites)))
+        for plant in reversed(plants):
+            plant.until(published, tick=True)
+    assert failed
+    assert any("jet1 is left alone" in text for text in caplog.messages)
+
+
+def test_no_plant_is_told_of_the_others(tmp_path: Path) -> None:
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    config = fleet(tmp_path, *sites)
+    said = to_json(OwnRouters(config, config.trainer.fleet, threading.Event()).config("jet1"))
+    assert sites[0].bus.remote in said
+    assert sites[1].bus.remote not in said
 
 
 def test_a_pattern_chooses_from_the_list(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

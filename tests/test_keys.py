@@ -167,6 +167,8 @@ def test_keys_that_do_not_fit_are_named(keys: Path, tmp_path: Path):
             credentials.of_process(str(mine), role, plant)
     with pytest.raises(ConfigError, match=r"bus\.tls\.keys is missing"):
         credentials.of_process(None, "trainer", "jet1")
+    with pytest.raises(ConfigError, match="cannot be read: File name too long"):
+        credentials.read(mine / ("x" * 300))
     (mine / "key.pem").chmod(0o640)
     with pytest.raises(ConfigError, match="others can read it"):
         credentials.read(mine)

@@ -23,7 +23,7 @@ from node_runtime.knock import knock
 from node_runtime.router import Router, open_to_all
 from node_runtime.session import session_config
 from node_runtime.strict import ConfigError
-from node_runtime.zenoh_log import Refusals
+from node_runtime.zenoh_log import MAX_NAMES, Refusals
 from protocol import rights, topics
 from protocol.topics import Topic
 from tandem import keys_files
@@ -441,3 +441,22 @@ def test_zenoh_s_questions_to_itself_are_no_denials():
         "bad from trainer.jet1: denied, put elsewhere": 1,
     }
     assert not refusals.hear("a line of somebody else")
+
+
+def test_who_was_denied_is_known_after_any_number_of_sessions():
+    """A health check alone opens one every few seconds."""
+    bad = BadMessages()
+    refusals = Refusals(bad)
+    head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
+    who = "+CertCommonName({})+Transport(Tls)+a6 is {}authorized to "
+    for k in range(MAX_NAMES + 500):
+        refusals.hear(
+            head
+            + f"{k:x} on Interface(lo)"
+            + who.format("operator.jet1", "")
+            + "Put (ingress) on tandem/jet1/x"
+        )
+    last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
+    refusals.hear(last + "Put (ingress) on tandem/jet1/controller/command")
+    assert bad.counters() == {"bad from trainer.jet1: denied, put controller/command": 1}
+    assert len(refusals._names) == MAX_NAMES

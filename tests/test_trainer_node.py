@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
@@ -34,7 +35,7 @@ from protocol.messages import (
     Sample,
     Samples,
 )
-from protocol.network import NetworkDescription, hash_layers, initial_hidden
+from protocol.network import LAYERS, NetworkDescription, hash_layers, initial_hidden
 from trainer_node import node as trainer_module
 from trainer_node.main import main
 from trainer_node.node import NAMES, TrainerNode
@@ -407,6 +408,22 @@ def test_a_snapshot_that_cannot_be_right_is_not_used(config: Config) -> None:
         assert trainer.node.trainer is None
         controller.claimed = ""
         controller.until(joined)
+
+
+def test_a_network_that_nobody_could_hold_takes_no_memory(config: Config) -> None:
+    """A stolen controller's certificate must not end the trainer of all plants."""
+    with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
+        huge = msgspec.structs.replace(
+            controller.description, hidden=[4096] * LAYERS, activations=["tanh"] * LAYERS
+        )
+        controller.description = huge
+        tracemalloc.start()
+        try:
+            controller.until(lambda h: h.counters.get("bad controller/hidden: unusable", 0) >= 1)
+            assert tracemalloc.get_traced_memory()[1] < 2**28
+        finally:
+            tracemalloc.stop()
+        assert trainer.node.trainer is None
 
 
 def process(config: Config) -> subprocess.Popen[bytes]:

@@ -165,7 +165,9 @@ class OwnRouters:
         place, bus = self._places[plant], self._config.bus
         tls = msgspec.structs.replace(bus.tls, keys=place.keys or bus.tls.keys)
         bus = msgspec.structs.replace(bus, endpoint=place.endpoint, tls=tls)
-        return msgspec.structs.replace(self._config, name=plant, bus=bus)
+        # The other plants are none of its business.
+        trainer = msgspec.structs.replace(self._config.trainer, fleet=[])
+        return msgspec.structs.replace(self._config, name=plant, bus=bus, trainer=trainer)
 
     def sessions(self, plant: str) -> Sessions:
         return self._reached[plant]
@@ -192,6 +194,9 @@ class OwnRouters:
                 return
             except (ConfigError, zenoh.ZError) as error:
                 log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN)
+                self._leaving.wait(TRY_AGAIN)
+            except Exception:
+                log.exception("%s: trying again every %g s", name, TRY_AGAIN)
                 self._leaving.wait(TRY_AGAIN)
 
 

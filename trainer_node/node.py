@@ -21,7 +21,7 @@ from node_runtime.health import HealthPublisher
 from node_runtime.inbox import Inbox
 from protocol import codec, topics
 from protocol import messages as m
-from protocol.network import NetworkDescription, hash_layers
+from protocol.network import NetworkDescription, hash_layers, why_unacceptable
 from protocol.topics import Topic
 from trainer_node.descent import Descent, descend_together, shape_of
 from trainer_node.training import Draw, Trainer
@@ -219,6 +219,9 @@ class TrainerNode:
             if hash_layers(layers) != snapshot.hidden_sha256:
                 raise ValueError("sha256 does not match the layers")
             description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
+            # Before any memory is taken for it.
+            if (reason := why_unacceptable(description, layers)) is not None:
+                raise ValueError(reason)
             if trainer is not None and trainer.description == description:
                 trainer.resume(layers, version)
             else:
