@@ -35,19 +35,19 @@ test: $(READY)  ## all tests
 	$(BIN)/pytest $(ARGS)
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
-	$(BIN)/pytest -x -s -o pythonpath=tests tests/compose/live_compose.py $(ARGS)
+	$(BIN)/pytest -x -s tests/compose/live_compose.py $(ARGS)
 
 remote-test: $(READY)  ## docs/remote.md to the letter, the trainer in another network namespace: 2 minutes; needs root
 	$(BIN)/pytest -x -s tests/remote/live_remote.py $(ARGS)
 
 faults: $(READY)  ## kill, freeze, cut off and attack real processes, into docs/faults.md: hours; root; ARGS=--list names them
-	$(BIN)/python -m tests.faults --document docs/faults.md $(ARGS)
+	$(BIN)/python -m verification.faults --document docs/faults.md $(ARGS)
 
 fuzz: $(READY)  ## 10 million bad payloads through everything that reads bytes, into docs/faults.md: minutes
-	$(BIN)/python -m benchmarks.fuzz --document docs/faults.md $(ARGS)
+	$(BIN)/python -m verification.fuzz --document docs/faults.md $(ARGS)
 
 soak: $(READY)  ## 30 minutes live at 50 Hz: memory and lateness, into docs/faults.md; ARGS="--minutes 1" for a look
-	$(BIN)/python -m benchmarks.soak --document docs/faults.md $(ARGS)
+	$(BIN)/python -m verification.soak --document docs/faults.md $(ARGS)
 
 lint: $(READY)  ## style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -1,1 +1,1 @@
-"""The real-time controller: a thin shell around `lbmpc.controller`."""
+"""The real-time controller: a thin shell around `lbmpc.controller.step`."""

@@ -8,21 +8,21 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from lbmpc.backup import BackupPlanner
-from lbmpc.controller import Controller
+from lbmpc.controller.backup_policy import BackupPlanner
+from lbmpc.controller.step import Controller
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
-from lbmpc.oracles.dnn import Refit
-from lbmpc.oracles.trial import Trial
+from lbmpc.oracles.dnn.oracle import Refit
+from lbmpc.oracles.dnn.trial import Trial
 from lbmpc.plants import Plant, get_plant
-from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
-from lbmpc.sets.polytope import EmptySetError
-from lbmpc.solver import Solver
-from node_runtime.config import Config
-from node_runtime.strict import ConfigError
-from protocol.architecture import get_architecture
-from protocol.network import NetworkDescription
+from lbmpc.sets.geometry.polytope import EmptySetError
+from lbmpc.solver.gauss_newton import Solver
+from lbmpc.solver.problem import Problem, build_problem
+from network_model.description import NetworkDescription
+from network_model.operations import get_architecture
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 
 Realise = Callable[[ca.Function], ca.Function]
 SHORTEST_WATCH = 8

@@ -21,18 +21,18 @@ import msgspec
 import numpy as np
 
 from controller_node.build import build_backup, build_controller, model_for
-from controller_node.compile import Compiler
-from controller_node.sets import CertifiedSets, find_sets
-from lbmpc.backup import BackupPlanner
-from lbmpc.controller import ControllerState, HiddenSet, Observation, Solves, StepResult
+from controller_node.certified_sets import CertifiedSets, find_sets
+from controller_node.codegen.compiler import Compiler
+from lbmpc.controller.backup_policy import BackupPlanner
+from lbmpc.controller.step import ControllerState, HiddenSet, Observation, Solves, StepResult
 from lbmpc.oracles import DnnOracle
-from lbmpc.oracles.dnn import IN_USE, NEWEST
-from lbmpc.rows import Box
-from lbmpc.solution import Solution
-from node_runtime.config import Config, to_json
+from lbmpc.oracles.dnn.oracle import IN_USE, NEWEST
+from lbmpc.solver.rows import Box
+from lbmpc.solver.solution import Solution
+from network_model.description import hash_layers
+from node_runtime.config.sections import Config, to_json
 from protocol import messages as m
 from protocol.codec import encode
-from protocol.network import hash_layers
 
 WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")

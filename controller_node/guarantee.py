@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from controller_node.build import model_for
-from controller_node.sets import CertifiedSets, find_sets, start_of
+from controller_node.certified_sets import CertifiedSets, find_sets, start_of
 from lbmpc.sets.guard import Guard
-from node_runtime.config import Config
+from node_runtime.config.sections import Config
 
 
 def guarantee(config: Config, sets: CertifiedSets | None = None) -> str:

@@ -14,15 +14,22 @@ from controller_node.checkpoint import CheckpointWriter, Memory, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
-from node_runtime import clock
-from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config
+from node_runtime.bus.inbox import Inbox, Received
+from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
-from node_runtime.inbox import Inbox, Received
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.pacer import Grid, Pacer, Slot
-from node_runtime.realtime import GarbageCollection, core_for, on_core, one_blas_thread, punctual, said_of
-from node_runtime.strict import ConfigError
+from node_runtime.realtime import clock
+from node_runtime.realtime.pacer import Grid, Pacer, Slot
+from node_runtime.realtime.scheduling import (
+    GarbageCollection,
+    core_for,
+    on_core,
+    one_blas_thread,
+    punctual,
+    said_of,
+)
 from protocol import codec, topics
 from protocol import messages as m
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 
-from lbmpc.bound import Bound
+from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.base import Plant
 from lbmpc.pole_placement import place
 

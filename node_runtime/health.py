@@ -12,9 +12,9 @@ from types import TracebackType
 
 import msgspec
 
-from node_runtime import config as configuration
-from node_runtime.bus import Bus
-from node_runtime.config import Config
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config import sections as configuration
+from node_runtime.config.sections import Config
 from protocol import topics
 from protocol.messages import Health, ProcessStatus, RunInfo
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from node_runtime import clock
+from node_runtime.realtime import clock
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

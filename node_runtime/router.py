@@ -14,15 +14,15 @@ import threading
 
 import zenoh
 
-from node_runtime import zenoh_log
-from node_runtime.bad_messages import BadMessages
-from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config
+from node_runtime.bus.session import lease_ms, secure, session_config
+from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.realtime import punctual
-from node_runtime.session import lease_ms, secure, session_config
-from node_runtime.strict import ConfigError
+from node_runtime.realtime.scheduling import punctual
+from node_runtime.rejected import BadMessages
+from node_runtime.tls import zenoh_log
 from protocol import topics
 
 log = logging.getLogger(__name__)
@@ -59,10 +59,10 @@ class Router:
             )
         settings = None
         if remote(self.config):
-            from node_runtime import access, credentials
+            from node_runtime.tls import access_control, credentials
 
             own = credentials.of_process(bus.tls.keys, "router", self.config.name)
-            settings = access.router_settings(own, self.config.name)
+            settings = access_control.router_settings(own, self.config.name)
         routing = session_config(
             "router", bus.endpoint, lease_ms(self.config, "router"), bus.remote or None, settings
         )

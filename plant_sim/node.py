@@ -9,16 +9,16 @@ import threading
 import numpy as np
 
 from lbmpc.plants import PlantError, get_plant
-from node_runtime import clock
-from node_runtime.bus import Bus, OpenInterrupted
-from node_runtime.config import Config
+from node_runtime.bus.inbox import Inbox
+from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
-from node_runtime.inbox import Inbox
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
-from node_runtime.pacer import Grid, Pacer
-from node_runtime.realtime import GarbageCollection, core_for, on_core, punctual, said_of
-from node_runtime.strict import ConfigError
-from plant_sim.plant import PlantSim
+from node_runtime.realtime import clock
+from node_runtime.realtime.pacer import Grid, Pacer
+from node_runtime.realtime.scheduling import GarbageCollection, core_for, on_core, punctual, said_of
+from plant_sim.simulator import PlantSim
 from protocol import topics
 from protocol.messages import Backup, Command, InputSource
 

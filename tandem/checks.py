@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from lbmpc.plants import Plant, get_plant
-from node_runtime.config import Config
-from node_runtime.strict import ConfigError
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 
 
 def plant_of(config: Config) -> Plant:

@@ -18,10 +18,10 @@ from typing import Annotated, Any, get_args
 import tyro
 from tyro.conf import Positional, Suppress, UseAppendAction, arg, subcommand
 
-from node_runtime.choices import OracleName, ProcessName, TighteningName
-from tandem.cli_base import FROM_CONFIG, Command, Configured
-from tandem.cli_keys import KeysCommand
-from tandem.cli_sets import SetsCommand
+from node_runtime.config.literals import OracleName, ProcessName, TighteningName
+from tandem.commands.base import FROM_CONFIG, Command, Configured
+from tandem.commands.keys_arguments import KeysCommand
+from tandem.commands.sets.arguments import SetsCommand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,9 @@ class Run(Configured):
 
     def run(self) -> int:
         config, given = self.resolve()
-        from tandem import run_command
+        from tandem.commands import run
 
-        return run_command.run(
+        return run.run(
             config, self.seconds, "endpoint" in given.get("bus", {}), self.json, trainer=not self.no_trainer
         )
 
@@ -97,9 +97,9 @@ class Simulate(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.simulate(config, self.steps, self.adapt_only, self.log, self.json)
+        return various.simulate(config, self.steps, self.adapt_only, self.log, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +114,9 @@ class Replay(Command):
     """Replay with another value than the log's configuration has."""
 
     def run(self) -> int:
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.replay(self.file, self.from_tick, self.set, self.json)
+        return various.replay(self.file, self.from_tick, self.set, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +129,9 @@ class Report(Command):
     """Where the pictures go."""
 
     def run(self) -> int:
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.report(self.file, self.output, self.json)
+        return various.report(self.file, self.output, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,9 +146,9 @@ class Recover(Command):
     """Where the whole log goes."""
 
     def run(self) -> int:
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.recover(self.file, self.output, self.json)
+        return various.recover(self.file, self.output, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,9 +157,9 @@ class Router(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.router(config, self.json)
+        return various.router(config, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,9 +168,9 @@ class Controller(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.controller(config, self.json)
+        return various.controller(config, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +183,9 @@ class Trainer(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.trainer(config, self.plants, self.json)
+        return various.trainer(config, self.plants, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,9 +194,9 @@ class Plant(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.plant(config, self.json)
+        return various.plant(config, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,9 +211,9 @@ class Record(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.record(config, self.json)
+        return various.record(config, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +227,7 @@ class Health(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import health
+        from tandem.commands import health
 
         return health.run(config, self.process, self.seconds, self.json)
 
@@ -238,9 +238,9 @@ class ConfigShow(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
-        from tandem import commands
+        from tandem.commands import various
 
-        return commands.config_show(config, self.json)
+        return various.config_show(config, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,9 +261,9 @@ class BenchSolver(Command):
     """Rewrite the figures between the marks in this Markdown file, and the picture beside it."""
 
     def run(self) -> int:
-        from tandem import bench
+        from benchmarks.solver import command
 
-        return bench.solver(self.quick, self.document, self.json)
+        return command.solver(self.quick, self.document, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,13 +282,14 @@ class Experiment(Command):
     """One group of the experiment."""
 
     def run(self) -> int:
-        from tandem import experiment_command, terminal
+        from tandem import terminal
+        from tandem.commands import experiment
 
         if self.what == "list":
-            return experiment_command.show_list(self.json)
+            return experiment.show_list(self.json)
         if self.out is None:
             raise terminal.Refused("--out DIR is missing: where should the report go?")
-        return experiment_command.run(self.what, self.out, self.quick, self.jobs, self.only, self.json)
+        return experiment.run(self.what, self.out, self.quick, self.jobs, self.only, self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,7 +329,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     command: Command = getattr(parsed, "action", parsed)
-    from node_runtime.strict import ConfigError
+    from node_runtime.config.strict import ConfigError
     from tandem import terminal
 
     try:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch.optim.adam import adam
 
-from protocol.network import NetworkDescription
+from network_model.description import NetworkDescription
 from trainer_node.network import ACTIVATIONS, BACKWARD, Network, build_loss
 
 CACHED_ROWS = 2048

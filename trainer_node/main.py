@@ -6,13 +6,13 @@ import fnmatch
 import logging
 import threading
 
-from node_runtime.config import Config
+from node_runtime.bus.session import OpenInterrupted
+from node_runtime.config.sections import Config
 from node_runtime.lifecycle import stopped_by_signals
-from node_runtime.realtime import quick_handover
-from node_runtime.session import OpenInterrupted
-from trainer_node.finding import OneRouter, OwnRouters
-from trainer_node.fleet import Fleet
-from trainer_node.plant_bus import Sessions
+from node_runtime.realtime.scheduling import quick_handover
+from trainer_node.fleet.discovery import OneRouter, OwnRouters
+from trainer_node.fleet.fleet import Fleet
+from trainer_node.fleet.plant_bus import Sessions
 from trainer_node.training import TrainerError, pick_device, use_one_thread
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The network of protocol/network.py in torch, for training its hidden layers under a fixed output layer.
+"""The network of network_model/description.py in torch, for training its hidden layers under a fixed output layer.
 
 A layer is (1 + n_{i-1}, n_i) with its bias as the first row. All layers lie one behind the other in a single
 parameter. The gradient of dense layers is written out by hand: with layers of this size nearly all the time of a
@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import torch
 
-from protocol.architecture import Activation, get_architecture
-from protocol.network import NetworkDescription
+from network_model.description import NetworkDescription
+from network_model.operations import Activation, get_architecture
 
 # torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
 ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
@@ -37,7 +37,7 @@ BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]]
 
 
 class _Tensors:
-    """The operations of `protocol.architecture`: a value is (M, n), a layer its bias (n,) and weights (n_a, n)."""
+    """The operations of `network_model.operations`: a value is (M, n), a layer its bias (n,) and weights (n_a, n)."""
 
     def affine(self, layer: tuple[torch.Tensor, torch.Tensor], a: torch.Tensor) -> torch.Tensor:
         return torch.addmm(layer[0], a, layer[1])

@@ -14,14 +14,14 @@ from typing import TypeVar
 
 import msgspec
 
-from node_runtime import clock
-from node_runtime.bus import Bus
-from node_runtime.config import Config, TrainerConfig
+from network_model.description import NetworkDescription, hash_layers, why_unacceptable
+from node_runtime.bus.inbox import Inbox
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import Config, TrainerConfig
 from node_runtime.health import HealthPublisher
-from node_runtime.inbox import Inbox
+from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
-from protocol.network import NetworkDescription, hash_layers, why_unacceptable
 from protocol.topics import Topic
 from trainer_node.descent import Descent, descend_together, shape_of
 from trainer_node.training import Draw, Trainer

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from node_runtime.config import TrainerConfig
+from network_model.description import NetworkDescription, hash_layers, why_unacceptable
+from node_runtime.config.sections import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
-from protocol.network import NetworkDescription, hash_layers, why_unacceptable
 from trainer_node.descent import Descent, Problem, descend
 from trainer_node.network import Network
 from trainer_node.replay_buffer import ReplayBuffer

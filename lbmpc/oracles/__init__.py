@@ -1,7 +1,7 @@
 """Estimates of the unknown h behind one contract; their parameters are data."""
 
 from lbmpc.oracles.base import LinearOracle, Oracle, OracleState
-from lbmpc.oracles.dnn import DnnOracle
+from lbmpc.oracles.dnn.oracle import DnnOracle
 from lbmpc.oracles.l2nw import L2nwOracle
 from lbmpc.oracles.perfect import PerfectOracle
 

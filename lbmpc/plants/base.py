@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from lbmpc.bound import Bound
+from lbmpc.casadi_buffers import Bound
 
 INTEGRATION_TOLERANCE = 1e-12
 Rhs = Callable[[Any, Any], list[Any]]

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from lbmpc.model import Model
-from lbmpc.sets.polytope import SetError
+from lbmpc.sets.geometry.polytope import SetError
 
 Kind = Literal["box", "hull", "regions", "given", "extension"]
 FORMAT = 1

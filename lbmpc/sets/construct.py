@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 
 from lbmpc.model import Model
-from lbmpc.sets.bounds import input_set, state_set
 from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
-from lbmpc.sets.control_invariant import Stage, Uncertain, iterate, predecessor
-from lbmpc.sets.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
-from lbmpc.sets.operations import Body, body, body_of
-from lbmpc.sets.regions import Link, chain
+from lbmpc.sets.constraint_sets import input_set, state_set
+from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
+from lbmpc.sets.geometry.operations import Body, body, body_of
+from lbmpc.sets.invariance.regions import Link, chain
+from lbmpc.sets.invariance.robust_control import Stage, Uncertain, iterate, predecessor
 
 Wanted = Literal["given", "box", "hull", "regions", "extension"]
 Saved = MutableMapping[str, dict[str, np.ndarray]]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbmpc.sets.certificate import Certificate
-from lbmpc.sets.linear_program import linprog, load
+from lbmpc.sets.geometry.linear_program import linprog, load
 
 # Rounding of a row's value must not put a state outside that was steered onto its facet. Scaled lengths.
 HAIR = 1e-10

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from project import Project
+
+from tests.compose.project import Project
 
 
 @pytest.hookimpl(hookwrapper=True)

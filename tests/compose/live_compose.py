@@ -15,15 +15,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from live import Ear, health_of, wait_for
-from project import BASE, Project, docker, limits
 
-from node_runtime import clock
-from node_runtime.bus import Bus
-from node_runtime.config import Config, override
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import Config, override
+from node_runtime.realtime import clock
 from protocol import messages as m
 from protocol import topics
-from tandem import keys_files
+from tandem import certificate_authority
+from tests.compose.project import BASE, Project, docker, limits
+from tests.helpers.live import Ear, health_of, wait_for
 
 MAIN, TEST = "docker-compose.yml", "tests/compose/docker-compose.test.yml"
 REMOTE = "docker-compose.remote.yml"
@@ -330,7 +330,7 @@ def gateway() -> str:
 def keys(gateway: str, tmp_path: Path) -> Path:
     """As `tandem keys create` makes them, then given to the containers' user; `mine` is a copy for this test."""
     made = tmp_path / "keys"
-    keys_files.create("jet1", [gateway], made, days=2)
+    certificate_authority.create("jet1", [gateway], made, days=2)
     shutil.copytree(made / "operator", tmp_path / "mine")
     docker(
         "run", "--rm", "--network=none", "-v", f"{made}:/keys", BASE, "chown", "-R", "10001:10001", "/keys"

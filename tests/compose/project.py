@@ -10,10 +10,10 @@ import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+
+from tests.helpers.paths import ROOT
 
 BASE = "python:3.11-slim"
-ROOT = Path(__file__).resolve().parents[2]
 KILL_ALL = "import os, signal; os.kill(-1, signal.SIGKILL)"
 
 

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from run_log.reader import read_run
-from run_log.summary import summarise
+from run_log.reading.reader import read_run
+from run_log.reporting.summary import summarise
+from tests.helpers.paths import DOCS
 
-PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
+PAGE = DOCS / "remote.md"
 PLANT, TRAINER = "10.0.0.5", "10.0.0.6"
 SCP = f"""#!/bin/sh
 # In place of scp, for there is one file system: `scp -rp FOLDER {TRAINER}:NAME` is a copy into the trainer's home.

@@ -1,0 +1,1 @@
+"""Live runs: how punctual they are and what they take of the machine."""

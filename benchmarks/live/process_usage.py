@@ -1,0 +1,55 @@
+"""The processes of a `tandem run`, seen from outside: their memory and the time they take of the cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+NAMES = {"record": "recorder"}
+PAGE = os.sysconf("SC_PAGE_SIZE")
+TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+
+
+def of(supervisor: int) -> Iterator[tuple[str, Path]]:
+    """(name, folder in /proc) of `tandem run`, by its pid, and of what it has started."""
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+            parent = int(_fields(entry)[1])
+        except (OSError, IndexError):
+            continue
+        if int(entry.name) == supervisor:
+            yield "supervisor", entry
+        elif parent == supervisor and b"tandem.live.child" in words:
+            command = words[words.index(b"tandem.live.child") + 2].decode()
+            yield NAMES.get(command, command), entry
+
+
+def resident(supervisor: int) -> dict[str, int]:
+    """Resident memory, kB, by process."""
+    found = {}
+    for name, entry in of(supervisor):
+        try:
+            found[name] = int((entry / "statm").read_text().split()[1]) * PAGE // 1024
+        except (OSError, IndexError):
+            continue
+    return found
+
+
+def busy(supervisor: int) -> dict[str, float]:
+    """Seconds of a core that each has taken so far, by process."""
+    found = {}
+    for name, entry in of(supervisor):
+        try:
+            found[name] = sum(map(int, _fields(entry)[11:13])) * TICK_S
+        except (OSError, IndexError):
+            continue
+    return found
+
+
+def _fields(entry: Path) -> list[str]:
+    """Of /proc/PID/stat, from the state on: what stands before it may have spaces in it."""
+    return (entry / "stat").read_text().rpartition(")")[2].split()

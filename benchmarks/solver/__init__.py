@@ -1,0 +1,1 @@
+"""The solver beside others, on the same recorded states, in one run."""

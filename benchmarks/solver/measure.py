@@ -1,0 +1,286 @@
+"""`tandem bench solver`: every candidate on every recorded state, in turn, in one process."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import casadi as ca
+import msgspec
+import numpy as np
+
+from benchmarks.solver import memory, rivals
+from benchmarks.solver.candidates import Build, Candidate, Converged, Other, Part, RealTime, WholeTick
+from benchmarks.solver.recording import SEED, Case, Recording, build_case, record
+from controller_node.build import Realise
+from controller_node.codegen.compiler import Compiler
+from lbmpc.solver.gauss_newton import Solver
+from node_runtime import provenance
+from node_runtime.config.literals import OracleName
+from node_runtime.realtime.scheduling import GarbageCollection, punctual
+
+Progress = Callable[[str, int, int], None]
+"""Told what is going on, and how many steps of how many are done."""
+ORACLES: tuple[OracleName, ...] = ("linear", "l2nw", "dnn")
+CENTRE, WIDTH = 60, 32
+"""The horizon and the width at which everything is compared."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is measured."""
+
+    ticks: int = 60
+    rounds: int = 3
+    """How often each tick is repeated by what is quick."""
+    horizons: tuple[int, ...] = (10, 20, 60, 100, 200)
+    """With networks of width 32."""
+    widths: tuple[int, ...] = (16, 32, 64, 128, 256)
+    """With the horizon 60."""
+    oracles: tuple[OracleName, ...] = ORACLES
+    rival_horizons: tuple[int, ...] = (20, 60, 100)
+    rival_every: int = 6
+    """Ticks between two runs of a rival."""
+    compile: bool = True
+    memory: bool = True
+    centre: int = CENTRE
+
+
+QUICK = Plan(
+    ticks=20, rounds=2, horizons=(20, 60), widths=(32,), rival_horizons=(60,), rival_every=5, memory=False
+)
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One candidate's figures. Times in milliseconds."""
+
+    solver: str
+    """"tandem", or a rival: "ipopt" has soft state bounds as the problem has, "ipopt-hard" hard ones."""
+    mode: str
+    """"converged", "preparation", "feedback"; "tick" and "real_time_tick": from the latched sample to bytes."""
+    oracle: str
+    N: int
+    width: int | None
+    """Neurons in each of the two hidden layers; None where there is no network."""
+    compiled: bool
+    median_ms: float
+    p99_ms: float
+    max_ms: float
+    cold_median_ms: float
+    """Of runs that found the caches full of something else."""
+    iterations: float
+    """Mean."""
+    error: float
+    """Largest distance of the first input from the tight optimum, input units."""
+    solves: int
+    failures: int
+    """Solves that ended otherwise than they should, at the iteration limit for instance."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """All of one run."""
+
+    rows: list[Row]
+    memory_mb: dict[str, float]
+    """Peak resident memory of a process that does this and nothing else."""
+    machine: dict[str, str]
+    versions: dict[str, str]
+    notes: list[str]
+    load: float
+    """Processes that wanted a core meanwhile, on average: more than there are cores make times too long."""
+
+    def find(
+        self, solver: str, mode: str, oracle: str, N: int, width: int | None, compiled: bool
+    ) -> Row | None:
+        """The row of that name, if it was measured."""
+        wanted = (solver, mode, oracle, N, width, compiled)
+        same = (
+            row
+            for row in self.rows
+            if (row.solver, row.mode, row.oracle, row.N, row.width, row.compiled) == wanted
+        )
+        return next(same, None)
+
+
+@dataclass
+class _Taken:
+    """What was measured of one candidate's one mode."""
+
+    seconds: list[float] = field(default_factory=list)
+    first_seconds: list[float] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    error: float = 0.0
+    failures: int = 0
+
+
+def measure(
+    plan: Plan, progress: Progress = lambda _what, _done, _of: None, cache: Path | None = None
+) -> Report:
+    """Build everything, warm it up, then go through the ticks.
+
+    Each tick is given to every candidate before the next tick begins, in an order drawn anew each round, so that
+    whatever else the machine does falls on all alike. A turn is the same work twice: the first run finds the caches
+    full of the candidate before (`cold_median_ms`), the second is the one that counts. Garbage is collected between
+    ticks.
+
+    Args:
+        plan: what to measure.
+        progress: told how far it is.
+        cache: where compiled functions are kept; None: the usual place.
+    """
+    used = memory.measure() if plan.memory else {}
+    with punctual(0):
+        compiler = Compiler(cache) if plan.compile else None
+        recording = record(plan.ticks, compiler)
+        candidates, notes = _build(plan, recording, compiler, progress)
+        taken = _run(plan, candidates, progress)
+    rows = [
+        _row(candidate, mode, figures)
+        for candidate, modes in zip(candidates, taken, strict=True)
+        for mode, figures in modes.items()
+    ]
+    if compiler is not None:
+        notes.append(compiler.note)
+    return Report(rows, used, provenance.describe(), provenance.versions(), notes, provenance.load())
+
+
+def _build(
+    plan: Plan, recording: Recording, compiler: Compiler | None, progress: Progress
+) -> tuple[list[Candidate], list[str]]:
+    shapes = _shapes(plan)
+    candidates: list[Candidate] = []
+    notes: list[str] = []
+    for done, (oracle, horizon, width) in enumerate(shapes):
+        progress("building", done, len(shapes))
+        case = build_case(recording, oracle, horizon, width, compiler or _as_it_is)
+        if case.unsure:
+            notes.append(
+                f"{oracle}, N = {horizon}: the tight reference stopped above its tolerance at {case.unsure} ticks"
+            )
+        for build in _builders(plan, case, recording, compiler):
+            candidate = build()
+            if candidate.compiled and compiler is not None and compiler.note.startswith("not compiled"):
+                # It would be the virtual machine under another name.
+                continue
+            candidates.append(candidate)
+    return candidates, notes
+
+
+def _shapes(plan: Plan) -> list[tuple[OracleName, int, int | None]]:
+    """Every problem, once."""
+    shapes: list[tuple[OracleName, int, int | None]] = [
+        (oracle, horizon, WIDTH if oracle == "dnn" else None)
+        for horizon in plan.horizons
+        for oracle in plan.oracles
+    ]
+    if "dnn" in plan.oracles:
+        shapes += [("dnn", plan.centre, width) for width in plan.widths]
+    return list(dict.fromkeys(shapes))
+
+
+def _builders(plan: Plan, case: Case, recording: Recording, compiler: Compiler | None) -> Iterator[Build]:
+    ways: list[tuple[bool, Realise]] = [(False, _as_it_is)]
+    if compiler is not None:
+        ways.insert(0, (True, compiler))
+    for compiled, realise in ways:
+        yield partial(_converged, case, compiled, realise)
+        yield partial(_real_time, case, compiled, realise)
+    central = case.horizon == plan.centre and case.width in (None, WIDTH)
+    if central:
+        for mode in ("converged", "real_time"):
+            yield partial(_tick, case, recording, mode, compiler is not None)
+    if case.horizon in plan.rival_horizons and case.width in (None, WIDTH):
+        every = plan.rival_every
+        for soft, gauss_newton, name in (
+            (True, False, "ipopt"),
+            (False, False, "ipopt-hard"),
+            (False, True, "ipopt-hard-gauss-newton"),
+        ):
+            if case.oracle == "l2nw" or (case.oracle == "linear" and gauss_newton):
+                continue
+            yield partial(_ipopt, case, name, soft, gauss_newton, every)
+        if case.oracle == "dnn":
+            for qp in rivals.QP_SOLVERS:
+                yield partial(_sqpmethod, case, qp, every)
+
+
+def _converged(case: Case, compiled: bool, realise: Realise) -> Candidate:
+    return Candidate("tandem", case, compiled, Converged(case, Solver(case.problem, realise=realise)))
+
+
+def _real_time(case: Case, compiled: bool, realise: Realise) -> Candidate:
+    return Candidate("tandem", case, compiled, RealTime(case, Solver(case.problem, realise=realise)))
+
+
+def _tick(case: Case, recording: Recording, mode: str, compiled: bool) -> Candidate:
+    return Candidate("tandem", case, compiled, WholeTick(case, recording, mode, compiled))
+
+
+def _ipopt(case: Case, name: str, soft: bool, gauss_newton: bool, every: int) -> Candidate:
+    rival = rivals.ipopt(case.problem, soft, gauss_newton)
+    return Candidate(name, case, False, Other(case, rival), every, once=True)
+
+
+def _sqpmethod(case: Case, qp: str, every: int) -> Candidate:
+    runs = Other(case, rivals.sqpmethod(case.problem, qp))
+    return Candidate(f"sqpmethod-{qp}", case, False, runs, every, once=True)
+
+
+def _as_it_is(function: ca.Function) -> ca.Function:
+    return function
+
+
+def _run(plan: Plan, candidates: list[Candidate], progress: Progress) -> list[dict[str, _Taken]]:
+    taken: list[dict[str, _Taken]] = [defaultdict(_Taken) for _ in candidates]
+    order = np.random.default_rng(SEED)
+    garbage = GarbageCollection(every=1)
+    garbage.begin()
+    for tick in range(plan.ticks):
+        progress("measuring", tick, plan.ticks)
+        for round_ in range(plan.rounds):
+            for index in order.permutation(len(candidates)):
+                candidate = candidates[index]
+                if tick % candidate.every or (candidate.once and round_):
+                    continue
+                first, parts = candidate.runs.run(tick), candidate.runs.run(tick)
+                # The first tick warms up: nothing had a plan to go on from.
+                if tick:
+                    _note(taken[index], first, parts, candidate.case.tight[tick].v[0])
+        for candidate in candidates:
+            candidate.runs.keep()
+        garbage.idle()
+    progress("measuring", plan.ticks, plan.ticks)
+    return taken
+
+
+def _note(taken: dict[str, _Taken], first: list[Part], parts: list[Part], tight: np.ndarray) -> None:
+    for before, part in zip(first, parts, strict=True):
+        figures = taken[part.mode]
+        figures.first_seconds.append(before.seconds)
+        figures.seconds.append(part.seconds)
+        figures.iterations.append(part.iterations)
+        figures.error = max(figures.error, float(np.abs(part.v0 - tight).max()))
+        figures.failures += not part.succeeded
+
+
+def _row(candidate: Candidate, mode: str, figures: _Taken) -> Row:
+    case, ms = candidate.case, np.array(figures.seconds) * 1e3
+    return Row(
+        candidate.solver,
+        mode,
+        case.oracle,
+        case.horizon,
+        case.width,
+        candidate.compiled,
+        float(np.median(ms)),
+        float(np.percentile(ms, 99)),
+        float(ms.max()),
+        float(np.median(figures.first_seconds) * 1e3),
+        float(np.mean(figures.iterations)),
+        figures.error,
+        len(ms),
+        figures.failures,
+    )

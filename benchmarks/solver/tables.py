@@ -1,0 +1,81 @@
+"""What follows from the rows: ratios, and tables for a terminal and for a document."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rich.table import Table
+
+from benchmarks.solver.measure import CENTRE, WIDTH, Report, Row
+
+COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
+    ("solver", lambda row: row.solver),
+    ("mode", lambda row: row.mode),
+    ("oracle", lambda row: row.oracle),
+    ("N", lambda row: str(row.N)),
+    ("width", lambda row: "-" if row.width is None else str(row.width)),
+    ("compiled", lambda row: "yes" if row.compiled else "no"),
+    ("median ms", lambda row: milliseconds(row.median_ms)),
+    ("p99 ms", lambda row: milliseconds(row.p99_ms)),
+    ("max ms", lambda row: milliseconds(row.max_ms)),
+    ("cold ms", lambda row: milliseconds(row.cold_median_ms)),
+    ("iterations", lambda row: f"{row.iterations:.1f}"),
+    ("error", lambda row: f"{row.error:.0e}"),
+    ("stopped", lambda row: f"{row.failures} of {row.solves}" if row.failures else "-"),
+)
+TEXT = 3
+"""So many columns from the left are words, the rest numbers."""
+
+
+def milliseconds(value: float) -> str:
+    """Three digits at most, and no more than microseconds."""
+    return f"{value:.3f}" if value < 1 else f"{value:.3g}"
+
+
+def ratios(report: Report, N: int = CENTRE) -> dict[str, float]:
+    """Medians over medians at the horizon N with a 5-32-32-4 network, by name; without what was not measured."""
+    compiled = any(row.compiled for row in report.rows)
+
+    def ours(mode: str, oracle: str) -> float | None:
+        row = report.find("tandem", mode, oracle, N, WIDTH if oracle == "dnn" else None, compiled)
+        return row.median_ms if row else None
+
+    def theirs(solver: str, oracle: str) -> float | None:
+        row = report.find(solver, "converged", oracle, N, WIDTH if oracle == "dnn" else None, False)
+        return row.median_ms if row else None
+
+    def iteration(oracle: str) -> float | None:
+        parts = [ours("preparation", oracle), ours("feedback", oracle)]
+        return sum(part for part in parts if part is not None) if None not in parts else None
+
+    converged, feedback = ours("converged", "dnn"), ours("feedback", "dnn")
+    pairs = {}
+    for solver in ("ipopt", "ipopt-hard", "ipopt-hard-gauss-newton", "sqpmethod-daqp", "sqpmethod-qrqp"):
+        pairs[f"{solver} / converged, both dnn"] = (theirs(solver, "dnn"), converged)
+        pairs[f"{solver} / feedback, both dnn"] = (theirs(solver, "dnn"), feedback)
+    for solver in ("ipopt", "ipopt-hard"):
+        pairs[f"{solver} linear / converged dnn"] = (theirs(solver, "linear"), converged)
+    pairs["dnn / linear, converged"] = (converged, ours("converged", "linear"))
+    pairs["dnn / linear, real-time iteration"] = (iteration("dnn"), iteration("linear"))
+    pairs["dnn / linear, feedback alone"] = (feedback, ours("feedback", "linear"))
+    return {name: a / b for name, (a, b) in pairs.items() if a is not None and b is not None and b > 0}
+
+
+def table(report: Report) -> Table:
+    """All rows, for a terminal."""
+    shown = Table(box=None, pad_edge=False, header_style="bold")
+    for index, (name, _) in enumerate(COLUMNS):
+        shown.add_column(name, justify="left" if index < TEXT else "right", no_wrap=True)
+    for row in report.rows:
+        shown.add_row(*(text(row) for _, text in COLUMNS))
+    return shown
+
+
+def ratio_table(report: Report) -> Table:
+    """The ratios, for a terminal."""
+    shown = Table(box=None, pad_edge=False, header_style="bold")
+    shown.add_column(f"ratio of medians, N = {CENTRE}")
+    shown.add_column("", justify="right")
+    for name, value in ratios(report).items():
+        shown.add_row(name, f"{value:.3g}")
+    return shown

@@ -1,0 +1,279 @@
+"""Certified sets on disk: the file that `tandem sets compute` writes, the cache, and which of them is in force.
+
+A file is one JSON object, gzipped where its name ends in .gz. Its sha256 is that of everything else in it, and only
+one spelling of it is accepted, so that any edited byte is seen. It tells damage, not forgery: `tandem sets check`
+proves the claim again.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import io
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
+from lbmpc.sets.certificate import require_match as require_model
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
+
+CONSTRUCTION = 2
+"""Counts up when the construction finds other sets for the same arguments."""
+SLACK = 3e-4
+SHIPPED = Path(__file__).resolve().parent.parent / "configs" / "sets"
+Kind = Literal["given", "box", "hull", "regions"]
+PREFERRED: tuple[Kind, ...] = ("regions", "hull", "box")
+"""What is looked for where no file is named: the largest first."""
+LARGEST = 256 * 1024 * 1024
+"""Bytes of sets, unpacked: a small file may say that it is any size."""
+GZIPPED = b"\x1f\x8b"
+
+
+class Found(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the construction and the checker found out about the sets, for people."""
+
+    volume_fraction: float
+    """Of X."""
+    invariance_margin: float
+    """The smallest room left beyond W, as a share of X's half-widths."""
+    contains_x0: bool
+    seconds: float
+    """That the construction took."""
+
+
+class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    sha256: str
+    found: Found
+    certificate: msgspec.Raw
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedSets:
+    """A certificate with what was found out about it; `sha256` is of both."""
+
+    sha256: str
+    found: Found
+    certificate: Certificate
+
+    @classmethod
+    def of(cls, certificate: Certificate, found: Found) -> CertifiedSets:
+        return cls(_hash(found, encode(certificate)), found, certificate)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> CertifiedSets:
+        """Raises `CertificateError`: not such a file, edited, or inconsistent."""
+        if data.startswith(GZIPPED):
+            try:
+                with gzip.open(io.BytesIO(data)) as file:
+                    data = file.read(LARGEST + 1)
+            except (OSError, EOFError, zlib.error) as error:
+                raise CertificateError(f"a damaged gzip file: {error}") from error
+            if len(data) > LARGEST:
+                raise CertificateError(
+                    f"more than {LARGEST / 1e6:.0f} MB when unpacked; no such sets are known"
+                )
+        try:
+            content = msgspec.json.decode(data, type=_Content)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise CertificateError(f"not a file of certified sets, or a damaged one: {error}") from error
+        actual = _hash(content.found, bytes(content.certificate))
+        if actual != content.sha256:
+            raise CertificateError(
+                f"its content has sha256 {actual[:12]}, and it says {content.sha256[:12]}: it was edited or damaged"
+            )
+        sets = cls(content.sha256, content.found, decode(bytes(content.certificate)))
+        if sets.to_bytes().strip() != data.strip():
+            raise CertificateError("its bytes are not those that were written: it was edited")
+        return sets
+
+    def to_bytes(self) -> bytes:
+        content = _Content(self.sha256, self.found, msgspec.Raw(encode(self.certificate)))
+        return msgspec.json.encode(content) + b"\n"
+
+    @property
+    def facets(self) -> list[int]:
+        """Of each set."""
+        return [len(piece.g) for piece in self.certificate.pieces]
+
+
+def _hash(found: Found, certificate: bytes) -> str:
+    return hashlib.sha256(msgspec.json.encode(found) + b"\n" + certificate).hexdigest()
+
+
+def read_sets(path: Path) -> CertifiedSets:
+    """Raises `CertificateError`, naming the file."""
+    try:
+        return CertifiedSets.from_bytes(path.read_bytes())
+    except OSError as error:
+        raise CertificateError(f"{path}: cannot be read: {error.strerror}") from error
+    except CertificateError as error:
+        raise CertificateError(f"{path}: {error}") from error
+
+
+def write_sets(sets: CertifiedSets, path: Path) -> None:
+    """Whole or not at all. Raises `OSError`."""
+    data = sets.to_bytes()
+    # Without a time of writing in it, so that the same sets are the same file.
+    _write(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+# -- the cache ----------------------------------------------------------------------------------
+
+
+def default_cache() -> Path:
+    """The user's; XDG_CACHE_HOME moves it."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "sets"
+
+
+@dataclass(frozen=True)
+class Work:
+    """One construction: what it depends on, and where its results lie."""
+
+    key: str
+    sets: Path
+    """The finished ones."""
+    folder: Path
+    """Work in progress. Shared by `hull` and `regions`, which begin with the same sets."""
+
+    @classmethod
+    def of(
+        cls, model: Model, kind: Kind, start: np.ndarray, W: np.ndarray | None, slack: float, cache: Path
+    ) -> Work:
+        """`start` (d,) in deviation coordinates, W (d,) as of `construct`."""
+        given = (model.plant.W * model.period if W is None else W).tolist() if kind == "given" else None
+        base = {
+            "model": hashes(model_of(model)),
+            "kind": "hull" if kind == "regions" else kind,
+            "W": given,
+            "slack": slack,
+            "construction": [FORMAT, CONSTRUCTION],
+        }
+        whole = _key(base | {"kind": kind, "start": start.tolist()})
+        return cls(whole, cache / f"{whole}.json", cache / _key(base))
+
+
+def _key(parts: object) -> str:
+    return hashlib.sha256(msgspec.json.encode(parts, order="sorted")).hexdigest()[:24]
+
+
+class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
+    """Named sets of arrays in a folder, one .npz each. What cannot be read counts as not there."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def __getitem__(self, name: str) -> dict[str, np.ndarray]:
+        try:
+            with np.load(self._path(name), allow_pickle=False) as saved:
+                return {key: saved[key] for key in saved.files}
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise KeyError(name) from error
+
+    def __setitem__(self, name: str, arrays: dict[str, np.ndarray]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}.")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, self._path(name))
+
+    def __delitem__(self, name: str) -> None:
+        try:
+            self._path(name).unlink()
+        except FileNotFoundError as error:
+            raise KeyError(name) from error
+
+    def __iter__(self) -> Iterator[str]:
+        return (path.stem for path in sorted(self.folder.glob("*.npz")))
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npz"
+
+
+# -- which sets are in force ------------------------------------------------------------------
+
+
+def find_sets(config: Config, model: Model, cache: Path | None = None) -> CertifiedSets:
+    """The file that `controller.sets` names, or what the cache or this installation has for this very model.
+
+    Raises:
+        ConfigError: there is none, it was edited, or it is about another model.
+    """
+    named = config.controller.sets
+    if named is not None:
+        try:
+            sets = read_sets(Path(named))
+            require_model(sets.certificate, model)
+        except CertificateError as error:
+            raise ConfigError(f"controller.sets: {_with_name(named, str(error))}") from error
+        _require_claim(sets, named)
+        return sets
+    cache = default_cache() if cache is None else cache
+    start = start_of(config, model)
+    for kind in PREFERRED:
+        candidates = [Work.of(model, kind, start, None, SLACK, cache).sets]
+        candidates += sorted(SHIPPED.glob(f"{model.plant.name}-*-{kind}.json*"))
+        for path in candidates:
+            usable = _usable(path, model)
+            if usable is not None:
+                return usable
+    raise ConfigError(
+        "controller.tightening = 'invariant' needs certified sets, and none are there for this plant, rate and bounds: "
+        "`tandem sets compute` with this configuration makes them, or controller.sets = 'FILE' names them"
+    )
+
+
+def start_of(config: Config, model: Model) -> np.ndarray:
+    """x0 of the configuration in deviation coordinates, (d,)."""
+    plant = model.plant
+    x0 = plant.x0 if config.plant.x0 is None else np.array(config.plant.x0, dtype=float)
+    return np.asarray(x0 - plant.x_e)
+
+
+def _usable(path: Path, model: Model) -> CertifiedSets | None:
+    if not path.exists():
+        return None
+    try:
+        sets = read_sets(path)
+        require_model(sets.certificate, model)
+    except CertificateError:
+        return None  # of another model, or a damaged cache: as if it were not there
+    return sets if sets.certificate.certified else None
+
+
+def _require_claim(sets: CertifiedSets, name: str) -> None:
+    if not sets.certificate.certified:
+        raise ConfigError(
+            f"controller.sets: {name}: is a {sets.certificate.kind} and claims nothing; the tightening `invariant` "
+            "needs certified sets"
+        )
+
+
+def _with_name(name: str, text: str) -> str:
+    return text if name in text else f"{name}: {text}"

@@ -1,0 +1,1 @@
+"""CasADi functions as compiled C."""

@@ -1,0 +1,225 @@
+"""What the plant follows when its controller falls silent: an affine policy that keeps X by the learned model.
+
+The plan of (e:LBMPC) keeps the constraints of the *nominal* model, step after step only its first input is certified,
+and each new sample mends what h did. Followed blindly it is no more than a guess. So besides it there is a second
+problem, solved where there is time, with the same cost and the learned states in the place of the nominal ones:
+
+    min over v      |z_N|_P^2 + sum_i |z_i|_Q^2 + |v_i|_R^2
+    subject to      z_{i+1} = A z_i + B v_i + h_hat(z_i, v_i),
+                    v_i in U,   z_{i+1} in (1 - margin) X                                    i = 0 .. N-1
+
+from z_0, the state to which the command that was just given leads. Its solution is followed with feedback,
+
+    u_i = v_i + K (x_i - z_i),
+
+which takes no more than the plant's own sensors. K is stiffer than the model's: what the plan does not know must not
+add up. Nothing of this is certified: h_hat is what was learned so far.
+
+The margin is room for what h_hat does not know, and where the way to x = 0 leads along a bound it can cost the way
+itself. So where the plan touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, the problem is solved
+again without one, and if that ends nearer a third time, with as much of it as should lead back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from lbmpc.casadi_buffers import Bound
+from lbmpc.model import Model
+from lbmpc.oracles.base import remembered
+from lbmpc.sets.constraint_sets import state_set
+from lbmpc.solver.least_distance import NO_ROWS, least_distance, violation
+from lbmpc.solver.problem import Problem
+from lbmpc.solver.riccati import build_rows, build_sweep
+from lbmpc.solver.rows import Rows
+
+STEPS = 2
+"""Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
+RAMP = 4
+"""Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
+NEARER = 0.9
+"""Of |z_0|_P: where a plan that leads back ends at most. And of another plan's end, to be better than that."""
+TOUCHES = 1e-3
+"""Nearer than this share of the half-width to a margin's edge, the plan may be held up by it."""
+STIFFNESS = 25.0
+"""Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
+
+
+Plan = tuple[np.ndarray, np.ndarray]
+"""Inputs v, (N, m), and the states z_1 .. z_N that they lead to, (N, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """u_i = inputs[i] + gain x, deviations, for N periods: inputs (N, m), gain (m, d)."""
+
+    inputs: np.ndarray
+    gain: np.ndarray
+    states: np.ndarray
+    """z_0 .. z_{N-1}, which it expects, (N, d)."""
+    margin: float
+    """By how much they stay inside X, as a share of its half-widths."""
+
+
+class BackupPlanner:
+    """Solves that problem, always with the same number of steps.
+
+    Args:
+        problem: what the controller solves; its cost, oracle, horizon and U are taken over.
+        margin: by how much X shrinks, as a share of its half-widths, where a plan that leads back is left.
+        realise: what turns a CasADi function into the one that is called.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        margin: float,
+        realise: Callable[[ca.Function], ca.Function] = lambda function: function,
+    ):
+        self.problem = problem
+        model, oracle, n = problem.model, problem.oracle, problem.horizon
+        self._margin = margin
+        self._kept, self._plain = _rows(problem, margin), _rows(problem, 0.0)
+        self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
+        self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
+        self._gain = tracking_gain(model)
+
+    def policy(self, s: np.ndarray, theta: np.ndarray, plan: np.ndarray) -> Policy | None:
+        """The policy from the predicted state s, (D,), on.
+
+        Args:
+            s: where the command that was just given leads, with its past where the oracle looks back.
+            theta: the oracle's parameters.
+            plan: the nominal plan from there on, (N, m).
+
+        Returns:
+            None when the numbers are unusable.
+        """
+        with np.errstate(all="ignore"):
+            kept = self._best(self._kept, s, theta, np.asarray(plan, dtype=float), STEPS)
+            if kept is None:
+                return None
+            share, found = self._less(s, theta, kept) if self._is_in_the_way(s, kept) else (1.0, kept)
+        return self._with_feedback(s, *found, share * self._margin)
+
+    def _is_in_the_way(self, s: np.ndarray, kept: Plan) -> bool:
+        return self._end(s, kept) >= NEARER and _touches(self._kept, *kept)
+
+    def _less(self, s: np.ndarray, theta: np.ndarray, kept: Plan) -> tuple[float, Plan]:
+        """The share of the margin, and the plan, that leads back, or else what ends nearer, if anything does.
+
+        Where a plan ends is taken for linear in the margin.
+        """
+        free = self._best(self._plain, s, theta, kept[0], 1)
+        if free is None or (end := self._end(s, free)) >= NEARER * self._end(s, kept):
+            return 1.0, kept
+        if end >= NEARER:
+            return 0.0, free
+        share = (NEARER - end) / (self._end(s, kept) - end)
+        between = self._best(_between(self._plain, self._kept, share), s, theta, free[0], 1)
+        return (0.0, free) if between is None else (share, between)
+
+    def _end(self, s: np.ndarray, plan: Plan) -> float:
+        """|z_N|_P of |z_0|_P."""
+        return self._distance(plan[1][-1]) / max(self._distance(s), np.finfo(float).tiny)
+
+    def _distance(self, s: np.ndarray) -> float:
+        """|x|_P of a state, with its past or without."""
+        model = self.problem.model
+        x = s[: model.d]
+        return float(np.sqrt(x @ model.P @ x))
+
+    def _best(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray, steps: int) -> Plan | None:
+        """The best of what the steps from v, (N, m), pass; None when its numbers are unusable."""
+        best, least = None, np.inf
+        v = rows.clip(v)
+        for step in range(steps + 1):
+            merit = self._linearise(rows, s, theta, v)
+            if not np.isfinite(merit):
+                break
+            if merit < least:
+                best, least = (v, self._sweep.outputs["z"].T.copy()), merit
+            if step == steps or (target := self._subproblem(rows, v.shape)) is None:
+                break
+            v = target
+        return best
+
+    def _linearise(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray) -> float:
+        """Linearise at v, (N, m); its cost, with the penalty of what leaves the rows."""
+        sweep = self._sweep
+        sweep.inputs["x"][:, 0] = s
+        sweep.inputs["theta"][:, 0] = theta
+        sweep.inputs["v"][:] = v.T
+        sweep()
+        values = rows.values(v.T, sweep.outputs["z"])
+        return float(sweep.outputs["cost"][0, 0]) + rows.penalty.cost(
+            violation(values, rows.lower, rows.upper)
+        )
+
+    def _subproblem(self, rows: Rows, shape: tuple[int, ...]) -> np.ndarray | None:
+        """The minimiser of the linearised problem, (N, m)."""
+        outputs = self._sweep.outputs
+        values = rows.values(outputs["vs"], outputs["zs"])
+        if not np.isfinite(values).all():
+            return None
+        for name in "ABKL":
+            self._move.inputs[name][:] = outputs[name]
+        self._move()
+        slopes = self._move.outputs["M"].T
+        nearest = least_distance(values, rows.apply(slopes), rows.lower, rows.upper, rows.penalty, NO_ROWS)
+        if nearest is None:
+            return None
+        free = outputs["vs"].T
+        return rows.clip(free + (slopes[: free.size] @ nearest.w).reshape(shape))
+
+    def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray, margin: float) -> Policy:
+        gain, d = self._gain, self.problem.model.d
+        states = np.vstack([s[:d], z[:-1]])
+        return Policy(v - states @ gain.T, gain, states, margin)
+
+
+def _rows(problem: Problem, margin: float) -> Rows:
+    """The rows of the learned states inside (1 - margin) X."""
+    plain = state_set(problem.model)
+    inside = margin * 0.5 * (plain.upper - plain.lower)
+    shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
+    states = tuple(plain.minus(share * inside, share * inside) for share in shares)
+    return Rows(replace(problem, states=states, soft=True, guard=None))
+
+
+def _between(plain: Rows, kept: Rows, share: float) -> Rows:
+    """The rows with this share of the margin, in (0, 1)."""
+    rows = copy(kept)
+    both = (plain.lower, kept.lower), (plain.upper, kept.upper)
+    rows.lower, rows.upper = ((1.0 - share) * without + share * with_it for without, with_it in both)
+    return rows
+
+
+def _touches(rows: Rows, v: np.ndarray, z: np.ndarray) -> bool:
+    """Whether a state comes to its bounds anywhere."""
+    values, near = rows.values(v.T, z.T), TOUCHES * rows.penalty.scale
+    near_one = (values < rows.lower + near) | (values > rows.upper - near)
+    return bool(near_one[rows.count_inputs :].any())
+
+
+def tracking_gain(model: Model) -> np.ndarray:
+    """K, (m, d), that holds the plant on a trajectory: an LQR with Bryson's weights, in units of the half-widths.
+
+    The model's own K where the Riccati equation has no solution for these weights.
+    """
+    plant = model.plant
+    weights = np.full(model.d, 1e-6)
+    weights[list(plant.performance)] = STIFFNESS
+    Q = np.diag(weights / (0.5 * (plant.x_max - plant.x_min)) ** 2)
+    R = np.diag(1.0 / (0.5 * (plant.u_max - plant.u_min)) ** 2)
+    try:
+        P = solve_discrete_are(model.A, model.B, Q, R)
+    except np.linalg.LinAlgError:
+        return model.K
+    return -np.linalg.solve(R + model.B.T @ P @ model.B, model.B.T @ P @ model.A)

@@ -1,0 +1,329 @@
+"""One control step, pure: the same function live, in lock-step simulation and in replay.
+
+Within a step the order is what makes a swap of hidden weights correct: first the label of the previous input is
+learned with the features it was applied under, phi_j, then hidden weights that disappoint may go and new ones may come
+in, then the problem is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from lbmpc.controller.backup_policy import BackupPlanner, Policy
+from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.model import Model, Pieces
+from lbmpc.oracles.base import OracleState, follow
+from lbmpc.oracles.dnn.oracle import DnnOracle
+from lbmpc.sets.guard import FirstInputs
+from lbmpc.solver.problem import Problem
+from lbmpc.solver.rows import Box
+from lbmpc.solver.solution import Solution
+
+Mode = Literal["solver", "shifted_plan", "feedback"]
+DELAY_GAIN = 0.2
+"""Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenSet:
+    """A trained set of hidden layers on offer."""
+
+    version: int
+    layers: list[np.ndarray]
+    sha256: str
+    """Of the layers."""
+    network_sha256: str
+    """Of the description that they were trained for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What a step may depend on. x (d,) and applied (m,) are deviations; None where there was none."""
+
+    x: np.ndarray | None
+    applied: np.ndarray | None
+    """Mean input over the period that ended with x."""
+    source: int
+    """Which incarnation of the plant sent x; labels never span two."""
+    sequence: int
+    """Its sample number; a label needs two consecutive ones."""
+    hidden: HiddenSet | None
+    pieces: Pieces = ()
+    """The inputs of that period where there were several, deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerState:
+    """All of the controller's memory. Flat, so that it can be frozen into a keyframe and thawed."""
+
+    plan: Plan
+    """Shifted solution: warm start of the next solve and fallback."""
+    pending_x: np.ndarray
+    """x_t whose label is still to come, (d,)."""
+    pending: tuple[int, int]
+    """Its (source, sequence); sequence -1 when none is pending."""
+    predicted: np.ndarray
+    """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
+    delay: float
+    """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
+    oracle: OracleState
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "plan.v": self.plan.v,
+            "plan.left": np.array([self.plan.left], dtype=np.int64),
+            "pending.x": self.pending_x,
+            "pending": np.array(self.pending, dtype=np.int64),
+            "predicted": self.predicted,
+            "delay": np.array([self.delay]),
+            **{f"oracle.{name}": array for name, array in self.oracle.items()},
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
+        """Raises KeyError when an array is missing."""
+        source, sequence = (int(value) for value in arrays["pending"])
+        prefix = "oracle."
+        oracle = {
+            name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
+        }
+        plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
+        return cls(
+            plan,
+            arrays["pending.x"],
+            (source, sequence),
+            arrays["predicted"],
+            float(arrays["delay"][0]),
+            oracle,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """One labelled sample: x_t, the input applied until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
+
+    x: np.ndarray
+    u: np.ndarray
+    h: np.ndarray
+    h_hat: np.ndarray
+    """The oracle's estimate before it learned this sample."""
+    past: np.ndarray
+    """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """What a step decided and found, in deviation coordinates. plan is (N, m) with plan[0] the input for now."""
+
+    plan: np.ndarray
+    mode: Mode
+    solution: Solution | None
+    label: Label | None
+    verdict: str
+    """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
+    rolled_back: str
+    """Why the hidden weights and K from before came back; empty where they did not."""
+    delay: float
+    """Seconds for which the sample was predicted ahead, to when the command acts."""
+    first: FirstInputs | None
+    """What is certified of v_0; None where there are no certified sets, or no state."""
+
+
+class Solves(Protocol):
+    """The seam to the solver: `lbmpc.solver.gauss_newton.Solver`, or whatever stands in its place."""
+
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution: ...
+
+    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None: ...
+
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
+
+
+ABSURD = 1e6
+"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Its square,
+in plant units, where X has no bounds. Finite alone is not enough: what is learned from 1e307 is not."""
+
+
+class Controller:
+    """LBMPC with an oracle that learns.
+
+    Args:
+        problem: the optimisation problem.
+        solver: solves it.
+        real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
+    """
+
+    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False):
+        self.problem, self.solver, self.real_time = problem, solver, real_time
+        self._prepared_for: ControllerState | None = None
+        self.model: Model = problem.model
+        self.oracle = problem.oracle
+        plant = self.model.plant
+        half = 0.5 * (plant.x_max - plant.x_min)
+        self._absurd = np.where(np.isfinite(half), ABSURD * half, ABSURD**2)
+
+    def initial_state(self, seed: int) -> ControllerState:
+        """Nothing known, nothing planned; the oracle's random start from the seed."""
+        oracle = self.oracle.initial_state(np.random.default_rng(seed))
+        plan = empty_plan(self.problem.horizon, self.model.m)
+        nothing = np.zeros(self.model.d)
+        return ControllerState(plan, nothing, (0, -1), self._with_past(oracle, nothing), 0.0, oracle)
+
+    def prepare(self, state: ControllerState) -> None:
+        """Do now what the next step from this state would do first: linearise about the predicted state.
+
+        For the time between two samples. Never needed for the result: a step that finds nothing prepared prepares
+        by itself, with the same numbers.
+        """
+        if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
+            self.solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+            self._prepared_for = state
+
+    def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
+        """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
+        if state.plan.left == 0:
+            return None
+        return planner.policy(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+
+    def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
+        """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
+        if seen.x is not None and not (np.abs(seen.x) <= self._absurd).all():
+            seen = replace(seen, x=None)
+        label, oracle = self._learn(state, seen)
+        rolled_back = ""
+        if label is not None and isinstance(self.oracle, DnnOracle):
+            oracle, rolled_back = self.oracle.confirm(oracle)
+        oracle, verdict = self._adopt(oracle, seen.hidden)
+        delay = self._delay(state.delay, seen)
+        start = self._when_it_acts(oracle, seen, delay)
+        guard = self.problem.guard
+        first = None if guard is None or start is None else guard.first_inputs(start)
+        plan, mode, solution = self._plan(state, oracle, start, first)
+        pending_x, pending = (
+            (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
+        )
+        s = self._with_past(oracle, start) if start is not None else state.predicted
+        x, u = s[: self.model.d], plan.v[0]
+        predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
+        after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
+        return after, StepResult(plan.v, mode, solution, label, verdict, rolled_back, delay, first)
+
+    def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
+        source, sequence = state.pending
+        follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
+        if seen.x is None:
+            return None, state.oracle
+        if seen.applied is None or not follows:
+            # What came before x is not known, at the start and after a gap.
+            acting = _acting(seen)
+            u = np.zeros(self.model.m) if acting is None else acting
+            return None, self.oracle.begin(state.oracle, seen.x, u)
+        x, u = state.pending_x, seen.applied
+        h = self.model.label(x, u, seen.x, seen.pieces)
+        past = self.oracle.past(state.oracle)
+        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u), past)
+        return label, self.oracle.learn(state.oracle, x, u, h)
+
+    def _delay(self, delay: float, seen: Observation) -> float:
+        """The plant reports when the last command took over from the one before; its average, at most half a period."""
+        if len(seen.pieces) < 2:
+            return delay
+        measured = sum(seconds for seconds, _u in seen.pieces[:-1])
+        return min(delay + DELAY_GAIN * (measured - delay), 0.5 * self.model.period)
+
+    def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
+        """The state, (d,), at which the command that is being computed will begin to act.
+
+        Until then the plant goes on under the input it has, which the model knows; without this every millisecond
+        between sample and command would be a disturbance.
+        """
+        acting = _acting(seen)
+        if seen.x is None or acting is None or delay == 0.0:
+            return seen.x
+        drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
+        return self.model.ahead(seen.x, acting, delay) + drift
+
+    def _adopt(self, oracle: OracleState, hidden: HiddenSet | None) -> tuple[OracleState, str]:
+        if hidden is None:
+            return oracle, "none"
+        if not isinstance(self.oracle, DnnOracle):
+            return oracle, f"refused: the oracle {self.oracle.name} has no hidden layers"
+        return self.oracle.adopt(oracle, hidden.version, hidden.layers, hidden.sha256, hidden.network_sha256)
+
+    def _plan(
+        self,
+        state: ControllerState,
+        oracle: OracleState,
+        x: np.ndarray | None,
+        certified: FirstInputs | None,
+    ) -> tuple[Plan, Mode, Solution | None]:
+        horizon, plan = self.problem.horizon, state.plan
+        first = _box(certified)
+        solution = None
+        if x is not None:
+            solution = self._solve(state, oracle, x, first)
+            if solution.usable:
+                return Plan(solution.v, horizon), "solver", solution
+        if plan.left > 0:
+            return _begun_within(plan, first), "shifted_plan", solution
+        if x is None:
+            # Neither a plan nor a state: the equilibrium input is all that is left.
+            return Plan(np.zeros((horizon, self.model.m)), 0), "feedback", solution
+        fed_back = Plan(feedback_plan(self.model, x, horizon), 0)
+        return _begun_within(fed_back, first), "feedback", solution
+
+    def _solve(
+        self, state: ControllerState, oracle: OracleState, x: np.ndarray, first: Box | None
+    ) -> Solution:
+        s = self._with_past(oracle, x)
+        if not self.real_time or state.plan.left == 0:
+            # Without a plan to start from, one step is not enough.
+            return self.solver.solve(s, self.oracle.theta(oracle), state.plan.v, first=first)
+        self.prepare(state)
+        self._prepared_for = None
+        return self.solver.feedback(s, first)
+
+    def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
+        """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
+        return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
+
+    def _shifted(self, plan: Plan, solution: Solution | None) -> Plan:
+        end = solution.zbar[-1] if solution is not None and solution.usable else np.zeros(self.model.d)
+        return shift(plan, self.model.K @ end)
+
+
+def _acting(seen: Observation) -> np.ndarray | None:
+    """The input that the plant has when it is seen, (m,)."""
+    return seen.pieces[-1][1] if seen.pieces else seen.applied
+
+
+def _box(first: FirstInputs | None) -> Box | None:
+    if first is None or first.lower is None or first.upper is None:
+        return None
+    return first.lower, first.upper
+
+
+def _begun_within(plan: Plan, first: Box | None) -> Plan:
+    """The plan with its first input brought inside the bounds: what is certified holds without a solution too."""
+    if first is None:
+        return plan
+    return Plan(np.vstack([np.clip(plan.v[:1], *first), plan.v[1:]]), plan.left)
+
+
+def same_memory(a: ControllerState, b: ControllerState) -> str | None:
+    """Name of the first array that differs between two states, bit for bit, or None."""
+    left, right = a.to_arrays(), b.to_arrays()
+    for name in sorted(left.keys() | right.keys()):
+        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
+            return name
+    return None

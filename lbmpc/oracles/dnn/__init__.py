@@ -1,0 +1,1 @@
+"""The network oracle: its expressions, its law of adaptation, and what new hidden layers must show."""

@@ -1,0 +1,273 @@
+"""Affine forms of the disturbance over boxes, and branch and bound on them.
+
+Each box p = (x, u) in c +- r has the form h(p) in g + G (p - c) with intervals g and G from a validated integration
+(`flow.py`). It gives the maximum of f'h over a region to a tolerance, from above, whenever it is stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.sets.enclosures.flow import Flow
+from lbmpc.sets.enclosures.interval import Interval, up
+from lbmpc.sets.enclosures.interval import product as interval_product
+from lbmpc.sets.enclosures.series import UnsupportedOperation
+
+Progress = Callable[[float], None]
+
+BATCH = 256
+# A region is not cut below this fraction of its width to find out where the plant's equations hold.
+FINEST = 2.0**-12
+
+
+class DisturbanceError(ValueError):
+    """The disturbance cannot be bounded as asked; the text says what, where, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A box of states (d,) and inputs (m,), in deviation coordinates and the plant's units."""
+
+    x_lower: np.ndarray
+    x_upper: np.ndarray
+    u_lower: np.ndarray
+    u_upper: np.ndarray
+
+    @property
+    def lower(self) -> np.ndarray:
+        """(d + m,), of p = (x, u)."""
+        return np.concatenate([self.x_lower, self.u_lower]).astype(float)
+
+    @property
+    def upper(self) -> np.ndarray:
+        """(d + m,)."""
+        return np.concatenate([self.x_upper, self.u_upper]).astype(float)
+
+
+@dataclass(frozen=True, eq=False)
+class Forms:
+    """h(p) in g + G (p - c), |p - c| <= r, for n boxes: c, r (n, q), g (n, d), G (n, d, q)."""
+
+    c: np.ndarray
+    r: np.ndarray
+    g: Interval
+    G: Interval
+    trouble: tuple[str, ...]
+
+    @property
+    def proved(self) -> np.ndarray:
+        return np.array([not t for t in self.trouble], dtype=bool)
+
+    def __getitem__(self, index: np.ndarray) -> Forms:
+        return Forms(
+            self.c[index],
+            self.r[index],
+            self.g[index],
+            self.G[index],
+            tuple(self.trouble[i] for i in np.arange(len(self.trouble))[index]),
+        )
+
+
+class Disturbance:
+    """h of one model, over batches of boxes."""
+
+    def __init__(self, model: Model):
+        self.model = model
+        try:
+            self.flow = Flow.of_plant(model.plant, model.period)
+        except UnsupportedOperation as error:
+            raise DisturbanceError(f"{model.plant.name}: {error}") from error
+        self.e = Interval.of(np.concatenate([model.plant.x_e, model.plant.u_e]))
+        self.AB = Interval.of(np.hstack([model.A, model.B]))
+
+    def forms(self, lower: np.ndarray, upper: np.ndarray) -> Forms:
+        """The affine forms of boxes lower, upper (n, q), in deviation coordinates."""
+        d = self.model.d
+        c = np.clip(0.5 * lower + 0.5 * upper, lower, upper)
+        r = np.where(lower == upper, 0.0, np.maximum(up(upper - c), up(c - lower)))
+        box, centre = Interval(lower, upper) + self.e, Interval.of(c) + self.e
+        flight = self.flow.enclose(box[:, :d], box[:, d:], centre[:, :d], centre[:, d:], r)
+        linear = interval_product(Interval.of(c)[:, None, :], Interval(self.AB.lower.T, self.AB.upper.T))[
+            :, 0
+        ]
+        g = flight.centre - self.e[:d] - linear
+        return Forms(c, r, g, flight.derivative - self.AB, flight.trouble)
+
+
+class Search:
+    """Branch and bound for the maxima of f'h over a region, for all rows f of `directions` (k, d) at once.
+
+    At any time `upper()` holds: every box ever set aside has left its upper bound in `settled`.
+    """
+
+    def __init__(
+        self,
+        disturbance: Disturbance,
+        region: Region,
+        directions: np.ndarray,
+        tolerance: float,
+        floor: np.ndarray,
+    ):
+        self.disturbance, self.region = disturbance, region
+        self.directions = directions
+        self.tolerance, self.floor = tolerance, floor
+        k = len(directions)
+        self.best = np.full(k, -np.inf)
+        self.least = np.full(k, np.inf)
+        self.settled = np.full(k, -np.inf)
+        self.evaluated = 0
+        self.row = np.arange(k)
+        self.lower = np.tile(region.lower, (k, 1))
+        self.upper_corner = np.tile(region.upper, (k, 1))
+        self.bound = np.full(k, np.inf)
+
+    def run(self, budget: int, progress: Progress | None) -> np.ndarray:
+        """Upper bounds of the maxima, (k,); within the tolerance of them if the budget of boxes sufficed."""
+        shown = 0.0
+        first_gap: np.ndarray | None = None
+        while self.row.size and self.evaluated < budget:
+            self._round()
+            self._settle()
+            if progress is not None:
+                gap = np.maximum(self._upper() - self.best, 1e-300) / self._allowed()
+                if first_gap is None and np.isfinite(gap).all():
+                    first_gap = np.maximum(gap, 1.0 + 1e-9)
+                if first_gap is not None:
+                    left = np.log(np.maximum(gap, 1.0)) / np.log(first_gap)
+                    shown = max(shown, float(1.0 - np.clip(left, 0.0, 1.0).mean()))
+                    progress(shown)
+        result = self._upper()
+        if not np.isfinite(result).all():
+            name = self.disturbance.model.plant.name
+            raise DisturbanceError(
+                f"{name}: after {self.evaluated} boxes the flow is still not enclosed in all of the region; take a "
+                "smaller region, a shorter period, or a larger budget"
+            )
+        if progress is not None:
+            progress(1.0)
+        return result
+
+    def _upper(self) -> np.ndarray:
+        result = self.settled.copy()
+        np.maximum.at(result, self.row, self.bound)
+        return result
+
+    def _allowed(self) -> np.ndarray:
+        # The range seen so far is within the true one: what is allowed is never more than was asked for.
+        with np.errstate(invalid="ignore"):
+            seen = self.best - self.least
+        return np.maximum(self.tolerance * np.where(np.isfinite(seen), seen, 0.0), self.floor)
+
+    def _settle(self) -> None:
+        done = self.bound <= self.best[self.row] + self._allowed()[self.row]
+        np.maximum.at(self.settled, self.row[done], self.bound[done])
+        self._keep(~done)
+
+    def _keep(self, which: np.ndarray) -> None:
+        self.row, self.bound = self.row[which], self.bound[which]
+        self.lower, self.upper_corner = self.lower[which], self.upper_corner[which]
+
+    def _round(self) -> None:
+        """Evaluate the most promising boxes, and put what is left of each in its place."""
+        urgency = (self.bound - self.best[self.row]) / self._allowed()[self.row]
+        count = min(BATCH, self.row.size)
+        chosen = np.argpartition(-urgency, count - 1)[:count]
+        rows, lower, upper, parent = (
+            a[chosen] for a in (self.row, self.lower, self.upper_corner, self.bound)
+        )
+        # Different directions often ask for the same box.
+        boxes, place = np.unique(np.hstack([lower, upper]), axis=0, return_inverse=True)
+        place = place.ravel()
+        q = lower.shape[1]
+        forms = self.disturbance.forms(boxes[:, :q], boxes[:, q:])
+        self.evaluated += len(boxes)
+        proved = forms.proved[place]
+        mine = forms[place]
+        f = self.directions[rows]
+        value = interval_product(Interval.of(f)[:, None, :], mine.g[..., None])[:, 0, 0]
+        slope = interval_product(Interval.of(f)[:, None, :], mine.G)[:, 0, :]
+        reach = interval_product(Interval.of(slope.magnitude())[:, None, :], Interval.of(mine.r)[..., None])
+        # A child lies in its parent, whose bound holds for it too.
+        bound = np.where(proved, up(value.upper + reach.upper[:, 0, 0]), np.inf)
+        bound = np.fmin(bound, parent)
+        self._learn(rows[proved], value[proved], slope[proved], mine.r[proved])
+        low, high = _faces(lower, upper, slope, proved)
+        cut = self._cuts(slope, mine.r, lower, upper, low, high, proved, rows)
+        middle = np.clip(0.5 * low + 0.5 * high, low, high)
+        index = np.arange(len(rows))
+        first_high, second_low = high.copy(), low.copy()
+        first_high[index, cut], second_low[index, cut] = middle[index, cut], middle[index, cut]
+        # A box that is a single point has one half, itself.
+        point = (low == high).all(axis=1) & proved
+        settled = (lower == upper).all(axis=1) & proved
+        np.maximum.at(self.settled, rows[settled], bound[settled])
+        keep = np.ones(self.row.size, dtype=bool)
+        keep[chosen] = False
+        self._keep(keep)
+        for first, last, which in ((low, first_high, ~settled), (second_low, high, ~point)):
+            self.row = np.concatenate([self.row, rows[which]])
+            self.bound = np.concatenate([self.bound, bound[which]])
+            self.lower = np.vstack([self.lower, first[which]])
+            self.upper_corner = np.vstack([self.upper_corner, last[which]])
+
+    def _learn(self, rows: np.ndarray, value: Interval, slope: Interval, r: np.ndarray) -> None:
+        """What f'h certainly reaches: in the middle, and in the corner to which the slope points."""
+        m = slope.middle()
+        sure = np.maximum(np.abs(m) - slope.radius(m), 0.0)
+        np.maximum.at(self.best, rows, value.lower + (sure * r).sum(axis=1) * (1 - 1e-12))
+        np.minimum.at(self.least, rows, value.upper - (sure * r).sum(axis=1) * (1 - 1e-12))
+
+    def _cuts(
+        self,
+        slope: Interval,
+        r: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+        proved: np.ndarray,
+        rows: np.ndarray,
+    ) -> np.ndarray:
+        """The coordinate to halve, (n,): the one whose uncertain slope costs most."""
+        width = self.region.upper - self.region.lower
+        relative = (upper - lower) / np.where(width > 0, width, 1.0)
+        if not proved.all():
+            self._explain(lower[~proved], upper[~proved], relative[~proved])
+        with np.errstate(invalid="ignore"):
+            cost = np.where(low == high, -1.0, (slope.upper - slope.lower) * r)
+        return np.where(proved[:, None], cost, relative).argmax(axis=1)
+
+    def _explain(self, lower: np.ndarray, upper: np.ndarray, relative: np.ndarray) -> None:
+        """Go on with boxes (n, q) that are not enclosed only while halving may help: not where a mere point fails."""
+        c = np.clip(0.5 * lower + 0.5 * upper, lower, upper)
+        points = self.disturbance.forms(c, c)
+        for i, trouble in enumerate(points.trouble):
+            if trouble or relative[i].max() <= FINEST:
+                reason = trouble or "the flow is enclosed from points, but from no box that is not tiny"
+                raise DisturbanceError(nowhere(self.disturbance.model, lower[i], upper[i], reason))
+
+
+def _faces(
+    lower: np.ndarray, upper: np.ndarray, slope: Interval, proved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The face of each box (n, q) that holds the maximum: where f'h is monotone, only an end counts."""
+    rising, falling = (slope.lower >= 0) & proved[:, None], (slope.upper <= 0) & proved[:, None]
+    return np.where(rising, upper, lower), np.where(falling & ~rising, lower, upper)
+
+
+def nowhere(model: Model, lower: np.ndarray, upper: np.ndarray, reason: str) -> str:
+    plant = model.plant
+    e = np.concatenate([plant.x_e, plant.u_e])
+    names = plant.states + plant.inputs
+    where = ", ".join(
+        f"{name} in [{low:.6g}, {high:.6g}]"
+        for name, low, high in zip(names, lower + e, upper + e, strict=True)
+    )
+    return (
+        f"{plant.name}: no bound of h for {where} over a period of {model.period:g} s: {reason}. Take a smaller "
+        "region of x and u, or a shorter period"
+    )

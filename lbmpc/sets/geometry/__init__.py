@@ -1,0 +1,1 @@
+"""Polytopes and the operations on them."""

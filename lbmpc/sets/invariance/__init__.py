@@ -1,0 +1,1 @@
+"""Invariant sets: terminal, tube, minimal, robust control invariant, and regions around them."""

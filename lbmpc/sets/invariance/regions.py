@@ -1,0 +1,130 @@
+"""Sets around a way into a control invariant set, with h bounded locally: what is certified reaches further.
+
+In a small cell of states and inputs h is nearly affine, h in slope_x x + slope_u u + W with W of second order in the
+cell's size. Backwards along a way from a state x_0 into the set C, with S_n = C,
+
+    S_i = cell_i with X with {x : there is u in cell_i with (A + slope_x) x + (B + slope_u) u + W in S_{i+1}},
+
+so from every state of S_i the plant is brought into S_{i+1}, and in the end into C, whatever w in W. The family
+C, S_{n-1}, ..., S_0 is robust control invariant, a union of polytopes, and holds x_0 if S_0 does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.sets.constraint_sets import input_set, state_set
+from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_affine
+from lbmpc.sets.geometry.operations import Body, body, body_of
+from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
+from lbmpc.sets.invariance.approach import Way, find_way
+from lbmpc.sets.invariance.robust_control import Uncertain, predecessor
+
+REMAINDERS = (1e-3, 5e-4)
+"""What a cell's W may be, as a share of X's half-widths, tried in turn."""
+SPARE = 2e-5
+"""How much each step promises beyond W, as a share of X's half-widths: room for the checker's rounding."""
+LARGEST = 0.4
+"""A cell's half-width at most, as a share of that of X and U."""
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """S_i with the cell in which its bound of h holds."""
+
+    set: Body
+    bound: DisturbanceBound
+
+
+def chain(
+    model: Model, start: np.ndarray, goal: Body, progress: Callable[[float], None] = lambda done: None
+) -> list[Link]:
+    """The sets S_{n-1}, ..., S_0 from next to `goal` back to `start`, (d,); S_0 holds `start`.
+
+    Raises:
+        SetError: none was found; the text says how far it came.
+    """
+    way = find_way(model, start, goal)
+    if way is None:
+        raise SetError(
+            "no way of the true plant from the given state into the invariant set was found that stays inside X"
+        )
+    trouble = ""
+    for remainder in REMAINDERS:
+        try:
+            return _along(model, way, goal, remainder, progress)
+        except EmptySetError as error:
+            trouble = str(error)
+    raise SetError(
+        f"a way into the invariant set exists, but no certified sets around it were found: {trouble}"
+    )
+
+
+def _along(
+    model: Model, way: Way, goal: Body, remainder: float, progress: Callable[[float], None]
+) -> list[Link]:
+    size = cell_size(model, way.x[0], way.u[0], remainder)
+    regions = [_region(model, x, u, size) for x, u in zip(way.x[:-1], way.u, strict=True)]
+    bounds = bound_affine(model, regions)
+    links: list[Link] = []
+    target = goal
+    for i in reversed(range(len(way.u))):
+        target = _one_step_into(model, target, bounds[i], f"the set {len(way.u) - i} steps before the goal")
+        if not target.contains(way.x[i]).all():
+            raise EmptySetError(f"the set {len(way.u) - i} steps before the goal misses the way")
+        links.append(Link(target, bounds[i]))
+        progress(len(links) / len(way.u))
+    return links
+
+
+def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: str) -> Body:
+    """The states of the bound's cell, inside X, from which an input of the cell leads into the target."""
+    region = bound.region
+    X = body_of(state_set(model), "X")
+    inputs = Polytope.box(region.u_lower, region.u_upper, model.plant.inputs)
+    plant = Uncertain(model.A + bound.slope_x, model.B + bound.slope_u, bound, inputs)
+    G, g = predecessor(target, plant, SPARE, X.scale)
+    cell = Polytope.box(region.x_lower, region.x_upper, model.plant.states)
+    G_cell, g_cell = cell.one_sided()
+    return body(np.vstack([X.G, G_cell, G]), np.concatenate([X.g, g_cell, g]), what, X.scale).reduced()
+
+
+def cell_size(model: Model, x: np.ndarray, u: np.ndarray, remainder: float) -> np.ndarray:
+    """Half-widths (d + m,) of a cell about (x, u) in which h is affine to `remainder` of X's half-widths.
+
+    From a large cell, that side is halved, again and again, whose halving takes most off the remainder.
+    """
+    half = _half_widths(model)
+    size, d = LARGEST * half, model.d
+
+    def remainders(sizes: Sequence[np.ndarray]) -> np.ndarray:
+        bounds = bound_affine(model, [_region(model, x, u, s) for s in sizes])
+        return np.array([np.ptp(b.vertices / half[:d], axis=0).max() / 2 for b in bounds])
+
+    now = remainders([size])[0]
+    while now > remainder:
+        halved = [np.where(np.arange(len(size)) == i, 0.5, 1.0) * size for i in range(len(size))]
+        found = remainders(halved)
+        best = int(np.argmin(found))
+        size, now = halved[best], found[best]
+    return size
+
+
+def _region(model: Model, x: np.ndarray, u: np.ndarray, size: np.ndarray) -> Region:
+    """A cell about (x, u), cut to X and U."""
+    X, U, d = state_set(model), input_set(model), model.d
+    return Region(
+        np.maximum(x - size[:d], X.lower),
+        np.minimum(x + size[:d], X.upper),
+        np.maximum(u - size[d:], U.lower),
+        np.minimum(u + size[d:], U.upper),
+    )
+
+
+def _half_widths(model: Model) -> np.ndarray:
+    plant = model.plant
+    return np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2

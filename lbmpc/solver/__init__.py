@@ -1,0 +1,1 @@
+"""The optimisation problem (e:LBMPC) and its solution in real time."""

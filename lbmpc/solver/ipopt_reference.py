@@ -1,0 +1,96 @@
+"""(e:LBMPC) handed to IPOPT: the judge of `lbmpc.solver.gauss_newton`, not a controller."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.oracles.base import follow_symbols, remembered
+from lbmpc.solver.least_distance import violation
+from lbmpc.solver.problem import Problem
+from lbmpc.solver.rows import Rows
+from lbmpc.solver.solution import Solution, Status
+
+
+class ReferenceSolver:
+    """The same problem, written out whole with slacks, exact Hessians, tight tolerances."""
+
+    def __init__(self, problem: Problem, tolerance: float = 1e-10):
+        self.problem = problem
+        self._rows = rows = Rows(problem)
+        model, n = problem.model, problem.horizon
+        d, m = model.d, model.m
+        x, theta = (
+            ca.MX.sym("x", d + remembered(problem.oracle)),
+            ca.MX.sym("theta", problem.oracle.parameters),
+        )
+        v = ca.MX.sym("v", m, n)
+        e = ca.MX.sym("e", int(rows.penalty.soft.sum()) if problem.soft else 0)
+        a, b, q, r, p = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R, model.P))
+        parts = problem.oracle.split(theta)
+        s, nominal, cost = x, x[:d], ca.MX(0)
+        values_v, values_z = [], []
+        for i in range(n):
+            vi, z = v[:, i], s[:d]
+            cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, vi, vi))
+            after = a @ z + b @ vi + problem.oracle.value(ca.vertcat(s, vi), parts)
+            s = follow_symbols(s, vi, after)
+            nominal = a @ nominal + b @ vi
+            values_v.append(ca.DM(rows.input_rows) @ vi)
+            values_z.append(ca.DM(rows.state_rows) @ nominal)
+        cost += 0.5 * ca.bilin(p, s[:d], s[:d])
+        values = ca.vertcat(*values_v, *values_z, ca.DM(rows.terminal_rows) @ nominal)
+        count = rows.count_inputs
+        slack = (
+            ca.DM(rows.penalty.scale[count:]) * e if problem.soft else ca.DM.zeros(values.shape[0] - count)
+        )
+        cost += problem.penalty * ca.sum1(e + 0.5 * e**2)
+        g = ca.vertcat(values[:count], values[count:] - slack, values[count:] + slack)
+        self._lower = np.concatenate(
+            [rows.lower[:count], np.full(len(rows.lower) - count, -np.inf), rows.lower[count:]]
+        )
+        self._upper = np.concatenate(
+            [rows.upper[:count], rows.upper[count:], np.full(len(rows.upper) - count, np.inf)]
+        )
+        options = {
+            "ipopt.print_level": 0,
+            "print_time": False,
+            "ipopt.sb": "yes",
+            "ipopt.tol": tolerance,
+            "ipopt.constr_viol_tol": tolerance,
+            # IPOPT otherwise solves a problem whose bounds it has moved by 1e-8.
+            "ipopt.bound_relax_factor": 0.0,
+            "ipopt.max_iter": 500,
+        }
+        decision = ca.vertcat(ca.vec(v), e)
+        self._solver = ca.nlpsol(
+            "r", "ipopt", {"x": decision, "f": cost, "g": g, "p": ca.vertcat(x, theta)}, options
+        )
+        self._lbx = np.concatenate([np.full(m * n, -np.inf), np.zeros(e.shape[0])])
+
+    def solve(
+        self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray, within: float = np.inf
+    ) -> Solution:
+        """As `lbmpc.solver.gauss_newton.Solver.solve`; `within` keeps every input that close to the warm start.
+
+        A nonconvex problem has several minima, and an interior-point method may leave the one it was started in.
+        """
+        n, m = self.problem.horizon, self.problem.model.m
+        guess = np.concatenate([np.ravel(warm_start), np.full(len(self._lbx) - n * m, 1e-3)])
+        result = self._solver(
+            x0=guess,
+            p=np.concatenate([x, oracle_parameters]),
+            lbg=self._lower,
+            ubg=self._upper,
+            lbx=self._lbx,
+        )
+        v = np.array(result["x"]).ravel()[: n * m].reshape(n, m)
+        zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)[: self.problem.model.d]
+        for i in range(n):
+            state = zbar[i] = self.problem.model.A @ state + self.problem.model.B @ v[i]
+        slack, row = self._rows.slack(
+            violation(self._rows.values(v.T, zbar.T), self._rows.lower, self._rows.upper)
+        )
+        stats = self._solver.stats()
+        status = Status.CONVERGED if stats["success"] else Status.NUMERICAL
+        return Solution(status, v, zbar, float(result["f"]), int(stats["iter_count"]), slack, row)

@@ -1,0 +1,41 @@
+"""The nominal trajectory of given inputs and what its rows say, in one call.
+
+Every solve ends with it, and in a fast loop the dozen small array operations that it stands for would take longer than
+the rest of the feedback.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from lbmpc.solver.problem import Problem
+
+
+def build_nominal(problem: Problem) -> ca.Function:
+    """(x, v, lower, upper) -> (zbar, values, outside, total) for x_t = x (d,) and inputs v (m, n).
+
+    zbar (d, n) are the nominal states zbar_1..n; values (rows,) those of the rows of `solver.rows`; outside (rows,) how
+    far each is beyond its bounds, 0 where it keeps them; total the sum of all values, finite where all are.
+    """
+    model, n = problem.model, problem.horizon
+    a, b = ca.DM(model.A), ca.DM(model.B)
+    x, v = ca.MX.sym("x", model.d), ca.MX.sym("v", model.m, n)
+    states, inputs = [x], ca.horzsplit(v)
+    for entry in inputs:
+        states.append(a @ states[-1] + b @ entry)
+    of_inputs, of_states = problem.inputs[0], problem.states[0]
+    blocks = [entry if of_inputs.is_box else ca.DM(of_inputs.F) @ entry for entry in inputs]
+    blocks += [state if of_states.is_box else ca.DM(of_states.F) @ state for state in states[1:]]
+    # The last step may carry the rows of a terminal set behind those that all steps share.
+    if len(terminal := problem.states[-1].F[len(of_states.F) :]):
+        blocks.append(ca.DM(terminal) @ states[-1])
+    values = ca.vertcat(*blocks)
+    lower, upper = ca.MX.sym("lower", *values.shape), ca.MX.sym("upper", *values.shape)
+    outside = ca.fmax(ca.fmax(lower - values, values - upper), 0)
+    return ca.Function(
+        "nominal",
+        [x, v, lower, upper],
+        [ca.horzcat(*states[1:]), values, outside, ca.sum1(values)],
+        ["x", "v", "lower", "upper"],
+        ["zbar", "values", "outside", "total"],
+    )

@@ -1,0 +1,122 @@
+"""The optimisation problem of learning-based MPC, (e:LBMPC), as data.
+
+    min over v      |z_N - x^r_N|_P^2 + sum_i |z_i - x^r_i|_Q^2 + |v_i - u^r_i|_R^2         (learned trajectory z)
+    subject to      z_{i+1}    = A z_i + B v_i + h_hat(z_i, v_i),       z_0 = x_t
+                    zbar_{i+1} = A zbar_i + B v_i,                      zbar_0 = x_t         (nominal trajectory)
+                    v_i in V_i,   zbar_{i+1} in Z_{i+1}                                      i = 0 .. N-1
+
+in deviation coordinates. Deciding in v and in the paper's c is the same (c_i = v_i - K zbar_i), and far better
+conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.oracles.base import Oracle
+from lbmpc.sets.certificate import Certificate, CertificateError, require_match
+from lbmpc.sets.constraint_sets import disturbance_set, input_set, state_set
+from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
+from lbmpc.sets.guard import Guard
+from lbmpc.sets.invariance.terminal import terminal_set
+from lbmpc.sets.invariance.tube import tighten, tube_margins
+
+Tightening = Literal["none", "first_step", "tube", "invariant"]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """(e:LBMPC) for one model, oracle and horizon.
+
+    `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty
+    `penalty` per unit of violation relative to `scale` of its row, unless a set guarantees that they can be kept.
+    """
+
+    model: Model
+    oracle: Oracle
+    horizon: int
+    tightening: Tightening
+    states: tuple[Polytope, ...]
+    inputs: tuple[Polytope, ...]
+    soft: bool
+    penalty: float
+    guard: Guard | None = None
+    """Bounds v_0 by a certified family of sets; None: nothing is certified."""
+
+    @property
+    def X(self) -> Polytope:
+        return state_set(self.model)
+
+
+def build_problem(
+    model: Model,
+    oracle: Oracle,
+    horizon: int,
+    tightening: Tightening = "first_step",
+    W: np.ndarray | None = None,
+    penalty: float = 1e4,
+    certificate: Certificate | None = None,
+) -> Problem:
+    """Lay out the constraints of the named tightening.
+
+    * `none`: plain X and U.
+    * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows soft.
+    * `tube`: zbar_i in X - R_i, v_i in U - K R_i, zbar_N in Omega - R_N with Omega disturbance invariant; state rows
+      hard, since from every state where they can be met once they can be met for ever.
+    * `invariant`: v_0 bounded so that the next state stays in the sets of `certificate`, hard; later rows, and all rows
+      outside of the sets, as for `first_step`.
+
+    Raises:
+        EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
+        CertificateError: `invariant` without a certificate, or with that of another model.
+    """
+    guard = None
+    if tightening == "invariant":
+        if certificate is None:
+            raise CertificateError(
+                "the tightening `invariant` needs certified sets: tandem sets compute makes them"
+            )
+        require_match(certificate, model)
+        if not certificate.certified:
+            raise CertificateError(
+                f"these sets are an approximation ({certificate.kind}) that claims nothing"
+            )
+        guard = Guard(certificate)
+    x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
+    n = horizon
+    if tightening == "tube":
+        closed, identity = model.closed_loop, np.eye(model.d)
+        states = tighten(x_set, identity, closed, w_set, n, "state")[1:]
+        inputs = tighten(u_set, model.K, closed, w_set, n - 1, "input")
+        states[-1] = _terminal(model, x_set, u_set, w_set, states[-1], n)
+        return Problem(model, oracle, n, tightening, tuple(states), tuple(inputs), False, penalty)
+    states = [x_set] * n
+    if tightening in ("first_step", "invariant"):
+        low = np.array([w_set.support(-row) for row in x_set.F])
+        high = np.array([w_set.support(row) for row in x_set.F])
+        states[0] = x_set.minus(low, high)
+        states[0].require_rows(1, "state")
+    return Problem(model, oracle, n, tightening, tuple(states), (u_set,) * n, True, penalty, guard)
+
+
+def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytope, n: int) -> Polytope:
+    """Omega - R_N together with X - R_N, as the rows of the last step."""
+    omega = terminal_set(model, X, U, W)
+    low, high = tube_margins(omega.F, model.closed_loop, W, n)
+    omega = omega.minus(low[n], high[n])
+    both = Polytope(
+        np.vstack([last.F, omega.F]),
+        np.concatenate([last.lower, omega.lower]),
+        np.concatenate([last.upper, omega.upper]),
+        last.names + omega.names,
+    )
+    if both.interior_point() is None:
+        raise EmptySetError(
+            f"the tightened set is empty at step {n}: the terminal set Omega - R_{n} holds nothing. "
+            f"A smaller W, another K or a shorter horizon would help."
+        )
+    return both

@@ -1,0 +1,224 @@
+"""The two CasADi functions inside the solver: one Gauss-Newton linearisation, whitened by a Riccati sweep.
+
+At an iterate v the Gauss-Newton subproblem in the step dv is a linear-quadratic problem. Its Riccati recursion gives
+gains such that, with
+
+    dv_i = K_i dz_i + k_i + L_i^{-T} w_i,
+
+the cost is a constant plus |w|^2 / 2. The constrained subproblem is then a least-distance problem in w: as close to
+w = 0, the unconstrained minimiser, as the rows allow. `sweep` finds that minimiser; `rows` says how the inputs and
+the nominal states move with w. No Hessian is formed and nothing is factorised but m x m blocks.
+
+The rows look at the nominal states zbar. A backup policy (`controller.backup_policy`) has them look at the learned
+states z instead, of which the recursion holds the linearisation anyway: `constrained`.
+
+Where the oracle looks back, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D: the
+cost sees x alone, and of the Jacobians only the d rows of x+ are stored, since the rest of s+ is a shift. Without a
+look back s is x and D is d.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import casadi as ca
+
+from lbmpc.model import Model
+from lbmpc.oracles.base import Oracle, follow_symbols, remembered
+
+Constrained = Literal["nominal", "learned"]
+"""Whose states the rows look at."""
+
+
+def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
+    """(x, v, theta, xr, ur) -> (cost, vs, zs, A, B, K, L) for a horizon of n.
+
+    Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
+    Outputs: half of psi at v; the subproblem's unconstrained minimiser vs (m, n) and its *nominal* states zbar_1..n, zs
+    (d, n); the Jacobians along the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
+    """
+    d, m, behind = model.d, model.m, remembered(oracle)
+    a, b, q, r = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R))
+    x, v, theta = ca.MX.sym("x", d + behind), ca.MX.sym("v", m, n), ca.MX.sym("theta", oracle.parameters)
+    xr, ur = ca.MX.sym("xr", d, n + 1), ca.MX.sym("ur", m, n)
+    inputs = ca.horzsplit(v)
+    parts = oracle.split(theta)
+
+    stage = _learned_stage(model, oracle, parts)
+    states = [x]
+    for i in range(n):
+        states.append(follow_symbols(states[i], inputs[i], stage(states[i], inputs[i], *parts)))
+    s = ca.horzcat(*states)
+    z = s[:d, :] if behind else s
+    dz, dv = z - xr, v - ur
+    gradient_z, gradient_v = q @ dz[:, :n], r @ dv
+    gradient_end = ca.DM(model.P) @ dz[:, n]
+    cost = 0.5 * (ca.dot(gradient_z, dz[:, :n]) + ca.dot(gradient_v, dv) + ca.dot(gradient_end, dz[:, n]))
+
+    stages = oracle.jacobians(ca.vertcat(s[:, :n], v), parts)
+    linear = ca.horzcat(a, ca.DM(d, behind)) if behind else a
+    a_i = [linear + jacobian[:, : d + behind] for jacobian in stages]
+    b_i = [b + jacobian[:, d + behind :] for jacobian in stages]
+
+    riccati = _riccati_stage_behind(d, m, behind, q, r) if behind else _riccati_stage(d, m, q, r)
+    p_matrix, p_vector = _padded(ca.DM(model.P), behind), ca.vertcat(gradient_end, ca.DM(behind, 1))
+    gains: list[ca.MX] = [ca.MX()] * n
+    offsets: list[ca.MX] = [ca.MX()] * n
+    inverses: list[ca.MX] = [ca.MX()] * n
+    columns_z, columns_v = ca.horzsplit(gradient_z), ca.horzsplit(gradient_v)
+    for i in reversed(range(n)):
+        p_matrix, p_vector, gains[i], offsets[i], inverses[i] = riccati(
+            p_matrix, p_vector, a_i[i], b_i[i], columns_z[i], columns_v[i]
+        )
+
+    step, nominal = ca.MX.zeros(d + behind), x[:d] if behind else x
+    minimiser, nominal_states, learned_states = [], [], []
+    for i in range(n):
+        move = gains[i] @ step + offsets[i]
+        step = follow_symbols(step, move, a_i[i] @ step + b_i[i] @ move)
+        minimiser.append(inputs[i] + move)
+        nominal = a @ nominal + b @ minimiser[i]
+        nominal_states.append(nominal)
+        learned_states.append(z[:, i + 1] + step[:d])
+    blocks = {"vs": minimiser, "zs": nominal_states, "A": a_i, "B": b_i, "K": gains, "L": inverses}
+    if constrained == "learned":
+        blocks |= {"zs": learned_states, "z": ca.horzsplit(z[:, 1:])}
+    return ca.Function(
+        "sweep" if constrained == "nominal" else "backup_sweep",
+        [x, v, theta, xr, ur],
+        [cost, *(ca.densify(ca.horzcat(*parts)) for parts in blocks.values())],
+        ["x", "v", "theta", "xr", "ur"],
+        ["cost", *blocks],
+    )
+
+
+def build_rows(model: Model, n: int, behind: int = 0, constrained: Constrained = "nominal") -> ca.Function:
+    """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n): how v_0..n-1, then zbar_1..n, move with w; transposed.
+
+    `behind`: D - d. With `learned`, z_1..n instead of zbar_1..n.
+    """
+    return _propagation(model, n, behind, follow_state=False, constrained=constrained)
+
+
+def build_tangent(model: Model, n: int, behind: int = 0) -> ca.Function:
+    """`build_rows`, and besides Y' (D, (m + d) n): how v_0..n-1, then zbar_1..n, follow s_0 when w stays."""
+    return _propagation(model, n, behind, follow_state=True)
+
+
+def _propagation(
+    model: Model, n: int, behind: int, follow_state: bool, constrained: Constrained = "nominal"
+) -> ca.Function:
+    """Forward sensitivities, one row a direction: the blocks of all stages then lie side by side in memory."""
+    d, m, length = model.d, model.m, model.d + behind
+    a, b = ca.DM(model.A).T, ca.DM(model.B).T
+    a_all, b_all = ca.MX.sym("A", d, length * n), ca.MX.sym("B", d, m * n)
+    k_all, l_all = ca.MX.sym("K", m, length * n), ca.MX.sym("L", m, m * n)
+    a_i, b_i = ca.horzsplit(a_all, length), ca.horzsplit(b_all, m)
+    k_i, l_i = ca.horzsplit(k_all, length), ca.horzsplit(l_all, m)
+    # Directions: those of s_0, where they are followed, then all of w.
+    before = length if follow_state else 0
+    rows = before + m * n
+    start = (
+        ca.densify(ca.vertcat(ca.DM.eye(before), ca.DM(m * n, length)))
+        if before
+        else ca.DM.zeros(rows, length)
+    )
+    step, nominal = ca.MX(start), ca.MX(start[:, :d])
+    moves, states = [], []
+    for i in range(n):
+        # w_i begins to act at stage i.
+        own = ca.vertcat(ca.MX(before + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
+        move = step @ k_i[i].T + own
+        after = step @ a_i[i].T + move @ b_i[i].T
+        step = ca.horzcat(after, step[:, 2 * d + m :], step[:, :d], move) if behind else after
+        nominal = nominal @ a + move @ b
+        moves.append(move)
+        states.append(nominal if constrained == "nominal" else step[:, :d])
+    everything = ca.densify(ca.horzcat(*moves, *states))
+    outputs, names = (
+        ([everything[:before, :], everything[before:, :]], ["Y", "M"]) if before else ([everything], ["M"])
+    )
+    name = "tangent" if follow_state else "rows" if constrained == "nominal" else "backup_rows"
+    return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
+
+
+def _learned_stage(model: Model, oracle: Oracle, parts: list[ca.MX]) -> ca.Function:
+    """(s, v, parts...) -> A z + B v + h_hat(s, v), with z the first d entries of s."""
+    s, v = ca.MX.sym("z", model.d + remembered(oracle)), ca.MX.sym("v", model.m)
+    z = s if oracle.pairs == 1 else s[: model.d]
+    symbols = [ca.MX.sym(f"part{i}", *part.shape) for i, part in enumerate(parts)]
+    learned = ca.DM(model.A) @ z + ca.DM(model.B) @ v + oracle.value(ca.vertcat(s, v), symbols)
+    return ca.Function("stage", [s, v, *symbols], [learned])
+
+
+def _riccati_stage(d: int, m: int, q: ca.DM, r: ca.DM) -> ca.Function:
+    """One step back: (P, p, A, B, q, r) -> (P-, p-, K, k, L^{-T})."""
+    p_matrix, p_vector = ca.SX.sym("P", d, d), ca.SX.sym("p", d)
+    a, b = ca.SX.sym("A", d, d), ca.SX.sym("B", d, m)
+    gradient_z, gradient_v = ca.SX.sym("q", d), ca.SX.sym("r", m)
+    pb = p_matrix @ b
+    # ca.chol gives the upper factor U with U'U = S; L' = U.
+    upper = ca.chol(r + b.T @ pb)
+    inverse = ca.inv(upper)
+    half = inverse.T @ (pb.T @ a)
+    residual = inverse.T @ (gradient_v + b.T @ p_vector)
+    gain, offset = -inverse @ half, -inverse @ residual
+    previous = q + a.T @ p_matrix @ a - half.T @ half
+    return ca.Function(
+        "riccati",
+        [p_matrix, p_vector, a, b, gradient_z, gradient_v],
+        [
+            0.5 * (previous + previous.T),
+            gradient_z + a.T @ p_vector - half.T @ residual,
+            gain,
+            offset,
+            inverse,
+        ],
+    )
+
+
+def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM) -> ca.Function:
+    """`_riccati_stage` where s+ = (A s + B v, s without x and its oldest pair, x, v): A (d, D), B (d, m).
+
+    The shift costs no product: the transposed dynamics pick rows.
+    """
+    length, pair = d + behind, d + m
+    p_matrix, p_vector = ca.MX.sym("P", length, length), ca.MX.sym("p", length)
+    a, b = ca.MX.sym("A", d, length), ca.MX.sym("B", d, m)
+    gradient_z, gradient_v = ca.MX.sym("q", d), ca.MX.sym("r", m)
+
+    def back(rows: ca.MX) -> ca.MX:
+        """From the derivative along s+, one row an entry, to that along s."""
+        forgotten = ca.MX.zeros(pair, rows.shape[1])
+        return a.T @ rows[:d, :] + ca.vertcat(
+            rows[length - pair : length - m, :], forgotten, rows[d : length - pair, :]
+        )
+
+    def back_input(rows: ca.MX) -> ca.MX:
+        return b.T @ rows[:d, :] + rows[length - m :, :]
+
+    pa, pb = back(p_matrix).T, back_input(p_matrix).T
+    s = ca.SX.sym("S", m, m)
+    # ca.chol gives the upper factor U with U'U = S; L' = U.
+    inverse = ca.Function("whiten", [s], [ca.inv(ca.chol(s))])(r + back_input(pb))
+    half = inverse.T @ back_input(pa)
+    residual = inverse.T @ (gradient_v + back_input(p_vector))
+    gain, offset = -inverse @ half, -inverse @ residual
+    previous = _padded(q, behind) + back(pa) - half.T @ half
+    return ca.Function(
+        "riccati",
+        [p_matrix, p_vector, a, b, gradient_z, gradient_v],
+        [
+            0.5 * (previous + previous.T),
+            ca.vertcat(gradient_z, ca.DM.zeros(behind)) + back(p_vector) - half.T @ residual,
+            gain,
+            offset,
+            inverse,
+        ],
+    )
+
+
+def _padded(matrix: ca.DM, behind: int) -> ca.MX:
+    """A weight on x as a weight on s."""
+    return ca.MX(ca.densify(ca.diagcat(matrix, ca.DM(behind, behind))) if behind else matrix)

@@ -1,0 +1,82 @@
+"""All constraint rows of a problem over (v, zbar) as one block: inputs first, then states step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbmpc.solver.least_distance import Penalty
+from lbmpc.solver.problem import Problem
+
+Box = tuple[np.ndarray, np.ndarray]
+"""Lower and upper bounds, (m,) each."""
+
+
+class Rows:
+    """The rows' bounds, their values, their slopes, and what their violation costs."""
+
+    def __init__(self, problem: Problem):
+        n, m, d = problem.horizon, problem.model.m, problem.model.d
+        self.n, self.m, self.d = n, m, d
+        if not all(part.is_box for part in problem.inputs):
+            raise ValueError("input constraints must be boxes: they are kept by clipping, exactly")
+        self.input_rows = problem.inputs[0].F
+        self.state_rows = problem.states[0].F
+        common = len(self.state_rows)
+        last = problem.states[-1]
+        # The last step may carry the rows of a terminal set behind the rows that all steps share.
+        self.terminal_rows = last.F[common:]
+        # Boxes throughout: the rows are the variables themselves.
+        self._plain = problem.states[0].is_box and not len(self.terminal_rows)
+        parts = [*problem.inputs, *problem.states]
+        self.lower = np.concatenate([part.lower for part in parts])
+        self.upper = np.concatenate([part.upper for part in parts])
+        self.count_inputs = len(self.input_rows) * n
+        # The same numbers as seen by inputs (N, m).
+        self._lower_v, self._upper_v = (
+            b[: self.count_inputs].reshape(n, m) for b in (self.lower, self.upper)
+        )
+        self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
+        width = self.upper - self.lower
+        scale = np.where(np.isfinite(width), 0.5 * width, np.maximum(np.abs(self.upper), 1e-3))
+        # The scale of a row is that of its plain set: tightening must not make a violation weigh more.
+        plain = np.tile(scale[self.count_inputs + common :][:common] if n > 1 else scale[-common:], n)
+        scale[self.count_inputs : self.count_inputs + common * n] = plain
+        soft = np.arange(len(self.lower)) >= self.count_inputs
+        self.penalty = Penalty(soft, scale, problem.penalty)
+        self.names = [
+            f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
+        ]
+
+    def bound_first(self, first: Box | None) -> None:
+        """Bounds on v_0 from now on; None: those of the problem. Always inside these."""
+        low, high = self._first
+        self.lower[: self.m] = low if first is None else np.clip(first[0], low, high)
+        self.upper[: self.m] = high if first is None else np.clip(first[1], low, high)
+
+    def clip(self, v: np.ndarray) -> np.ndarray:
+        """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""
+        # np.clip takes twice as long for so few numbers.
+        return np.minimum(np.maximum(v, self._lower_v), self._upper_v)
+
+    def values(self, v: np.ndarray, zbar: np.ndarray) -> np.ndarray:
+        """Row values of inputs v (m, n) and nominal states zbar (d, n)."""
+        return self.apply(np.concatenate([v.T.ravel(), zbar.T.ravel()]))
+
+    def apply(self, y: np.ndarray) -> np.ndarray:
+        """The rows of y = (v_0..n-1, zbar_1..n), stage by stage: ((m + d) n,) -> (rows,), or for many columns."""
+        if self._plain:
+            return y
+        n, split = self.n, self.m * self.n
+        many = y.reshape(len(y), -1)
+        inputs = np.matmul(self.input_rows, many[:split].reshape(n, self.m, -1))
+        states = np.matmul(self.state_rows, many[split:].reshape(n, self.d, -1))
+        k = many.shape[1]
+        last = self.terminal_rows @ many[len(y) - self.d :]
+        return np.concatenate([inputs.reshape(-1, k), states.reshape(-1, k), last]).reshape(-1, *y.shape[1:])
+
+    def slack(self, outside: np.ndarray) -> tuple[float, str]:
+        """The largest violation of a state row and the row's name, from all rows' violations, (rows,)."""
+        states = outside[self.count_inputs :]
+        worst = int(states.argmax())
+        slack = float(states[worst])
+        return (slack, self.names[worst]) if slack > 1e-9 else (0.0, "")

@@ -1,0 +1,143 @@
+"""The network's description: all that the trainer's torch network and the controller's CasADi network share.
+
+    h_hat(x, u) = output_scale * K' phi(x, u),        phi = (1, psi_L[W_{L-1}' (1, psi_{L-1}[ ... ])])
+
+(e:NN_structure) of the paper. The input is (x, u) in deviation coordinates divided by `input_scale`, or a window of
+the last k such pairs. Every weight matrix carries its bias as its first row, and every layer's activations carry a
+leading 1, the output layer's included. How the hidden layers act on the window is their architecture, a file of
+`network_model/architectures`. The last hidden activation is bounded, so phi is: |phi|^2 <= 1 + n_L = sigma^2.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from network_model.operations import BOUNDED, Activation, Sizes, get_architecture
+
+__all__ = [
+    "BOUNDED",
+    "Activation",
+    "NetworkDescription",
+    "Width",
+    "hash_layers",
+    "initial_hidden",
+    "why_unacceptable",
+]
+
+Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
+Length = Annotated[int, msgspec.Meta(ge=1, le=128)]
+Window = Annotated[int, msgspec.Meta(ge=1, le=64)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+LAYERS = 32
+"""Hidden layers at most: a description comes from elsewhere, and memory is taken by it."""
+# Fields that came later are left out of the hash at these values: weights in older logs keep their network's hash.
+_FIRST: dict[str, Any] = {"architecture": "mlp", "window": 1, "options": {}}
+
+
+class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Sizes, activations and scaling of one network. Two processes agree when their `sha256` agree."""
+
+    states: Length
+    inputs: Length
+    hidden: Annotated[list[Width], msgspec.Meta(max_length=LAYERS)]
+    """Neurons of each hidden layer, input side first."""
+    activations: list[Activation]
+    """One for each hidden layer; the last must be bounded."""
+    input_scale: list[Positive]
+    """Units of (x, u) that count as 1: half-widths of X and U."""
+    output_scale: list[Positive]
+    """Units of h that count as 1, one for each state."""
+    max_layer_norm: Positive = 100.0
+    """Largest Frobenius norm of a hidden layer that a controller accepts."""
+    architecture: str = "mlp"
+    """A file of `network_model/architectures`."""
+    window: Window = 1
+    """k, the pairs (x, u) that the network sees: the present one and k - 1 before it."""
+    options: dict[str, int] = {}
+    """The architecture's own settings, all of them."""
+
+    def __post_init__(self) -> None:
+        if not self.hidden:
+            raise ValueError("hidden is empty: the network needs at least one hidden layer")
+        if len(self.activations) != len(self.hidden):
+            raise ValueError(f"{len(self.hidden)} hidden layers but {len(self.activations)} activations")
+        if self.activations[-1] not in BOUNDED:
+            raise ValueError(
+                f"the last activation, {self.activations[-1]}, is unbounded; use one of {', '.join(BOUNDED)}"
+            )
+        if len(self.input_scale) != self.states + self.inputs:
+            raise ValueError(
+                f"input_scale has {len(self.input_scale)} entries, (x, u) has {self.states + self.inputs}"
+            )
+        if len(self.output_scale) != self.states:
+            raise ValueError(f"output_scale has {len(self.output_scale)} entries, h has {self.states}")
+        known = get_architecture(self.architecture).options
+        if self.options.keys() != known.keys():
+            raise ValueError(
+                f"the options of {self.architecture} are {sorted(known) or 'none'}, not {sorted(self.options)}"
+            )
+        _ = self.layer_shapes
+
+    @property
+    def pair(self) -> int:
+        """Length of (x, u), d + m."""
+        return self.states + self.inputs
+
+    @property
+    def sizes(self) -> Sizes:
+        """What an architecture needs to know."""
+        return Sizes(self.pair, self.window, tuple(self.hidden), tuple(self.activations), self.options)
+
+    @property
+    def layer_shapes(self) -> list[tuple[int, int]]:
+        """Shapes of the hidden weights, the bias of each as its first row; for an mlp (1 + n_{i-1}, n_i)."""
+        return get_architecture(self.architecture).shapes(self.sizes)
+
+    @property
+    def features(self) -> int:
+        """Length of phi, 1 + n_L."""
+        return 1 + get_architecture(self.architecture).outputs(self.sizes)
+
+    def sha256(self) -> str:
+        """Of all fields."""
+        fields = msgspec.to_builtins(self)
+        kept = {name: value for name, value in fields.items() if name not in _FIRST or value != _FIRST[name]}
+        return hashlib.sha256(msgspec.json.encode(kept)).hexdigest()
+
+
+def initial_hidden(description: NetworkDescription, rng: np.random.Generator) -> list[np.ndarray]:
+    """Random hidden layers, float32 values as they travel: Glorot-uniform weights, zero biases."""
+    layers = []
+    for rows, columns in description.layer_shapes:
+        limit = np.sqrt(6.0 / (rows - 1 + columns))
+        weights = rng.uniform(-limit, limit, size=(rows, columns))
+        weights[0] = 0.0
+        layers.append(weights.astype(np.float32).astype(np.float64))
+    return layers
+
+
+def hash_layers(layers: list[np.ndarray]) -> str:
+    """sha256 over the layers as little-endian float32, row-major, shapes included."""
+    digest = hashlib.sha256()
+    for layer in layers:
+        digest.update(repr(tuple(layer.shape)).encode())
+        digest.update(np.ascontiguousarray(layer, dtype="<f4").tobytes())
+    return digest.hexdigest()
+
+
+def why_unacceptable(description: NetworkDescription, layers: list[np.ndarray]) -> str | None:
+    """The first reason why these hidden layers must not be used, or None when they may."""
+    shapes = [tuple(layer.shape) for layer in layers]
+    if shapes != description.layer_shapes:
+        return f"shapes {shapes}, expected {description.layer_shapes}"
+    for i, layer in enumerate(layers):
+        if not np.isfinite(layer).all():
+            return f"layer {i + 1} is not finite"
+        norm = float(np.linalg.norm(layer))
+        if norm > description.max_layer_norm:
+            return f"layer {i + 1} has norm {norm:.3g}, at most {description.max_layer_norm:.3g}"
+    return None

@@ -1,0 +1,1 @@
+"""The configuration: typed, strict, read from TOML."""

@@ -1,0 +1,375 @@
+"""Configuration: typed, strict, one tree for all processes, read from TOML.
+
+A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file and
+the nearest right key or the allowed values. Defaults are the paper's experiment, with settled values for what
+the paper leaves out.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import tomli_w
+
+from network_model.description import LAYERS, Width
+from network_model.operations import BOUNDED, Activation, get_architecture
+from node_runtime.config.literals import (
+    AdoptionName,
+    AwakeMode,
+    CompileMode,
+    OracleName,
+    SolverMode,
+    StartName,
+    Strategy,
+    TighteningName,
+)
+from node_runtime.config.strict import ConfigError, Fail, apply_override, convert, failing, load_tree
+from protocol.codec import first_non_finite
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
+Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
+"""What may be part of a key on the bus."""
+Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
+
+
+AWAKE_BELOW = 0.01
+"""Seconds. Waking a sleeping core takes up to a few tenths of a millisecond: little of a longer period, but power all
+the time if it is avoided."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the configuration file."""
+
+
+class PlantConfig(Section, frozen=True):
+    model: str = "moore_greitzer"
+    x0: list[float] | None = None
+    """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
+    plan_patience: Positive = 1.25
+    """Periods without a fresh command after which the plant follows the last plan's next entry."""
+
+
+class SolverConfig(Section, frozen=True):
+    mode: SolverMode = "converged"
+    """"converged" solves every tick to its tolerance; "real_time" takes one prepared Gauss-Newton step."""
+    compile: CompileMode = "auto"
+    """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
+    max_iterations: PositiveInt = 10
+    tolerance: Positive = 1e-6
+    """Converged when no input of the plan moves by more than this (input units)."""
+    penalty: Positive = 1e4
+    """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
+
+
+class BackupConfig(Section, frozen=True):
+    """Of the policy that the plant follows when its controller falls silent."""
+
+    enabled: bool = True
+    """Up to 100 Hz; in a faster loop there is no time for it, and the plan is what the plant follows."""
+    margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.0075
+    """By how much X shrinks for it, as a share of its half-widths; less where that would cost the way back."""
+
+
+class ControllerConfig(Section, frozen=True):
+    horizon: PositiveInt = 60
+    oracle: OracleName = "dnn"
+    tightening: TighteningName = "first_step"
+    sets: str | None = None
+    """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
+    W: list[NonNegative] | None = None
+    """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
+    Q: list[NonNegative] | None = None
+    """Diagonal state weights; None: ones."""
+    R: list[Positive] | None = None
+    """Diagonal input weights; None: ones."""
+    keyframe_every: PositiveInt = 100
+    """Ticks between keyframes in the log."""
+    late_fraction: Unit = 0.2
+    """A tick is late when it starts later than this share of a period after its slot."""
+    phase_ms: NonNegative | None = None
+    """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
+    checkpoint: str = ""
+    """File from which the controller takes its memory when it is started again; "": none."""
+    solver: SolverConfig = SolverConfig()
+    backup: BackupConfig = BackupConfig()
+
+
+class NetworkConfig(Section, frozen=True):
+    architecture: str = "mlp"
+    """How the hidden layers act on the window: a file of `network_model/architectures`."""
+    window: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None
+    """k, the pairs (x, u) that the network sees, the present one included; None: the architecture's own."""
+    options: dict[str, int] = msgspec.field(default_factory=dict)
+    """The architecture's own settings, where they are not its defaults."""
+    hidden: Annotated[list[Width], msgspec.Meta(max_length=LAYERS)] = msgspec.field(
+        default_factory=lambda: [64, 64]
+    )
+    activation: Activation = "tanh"
+    """Of every hidden layer; must be bounded, since the last one is."""
+    output_scale: Positive = 0.2
+    """h per second of period that counts as 1 for the network: h of a sampled plant grows with the period."""
+    max_layer_norm: Positive = 100.0
+
+
+class RefitConfig(Section, frozen=True):
+    """Of K at an adoption; used where `adaptation.at_adoption` is "refit"."""
+
+    window: PositiveInt = 200
+    """Newest samples that the controller remembers for it."""
+    ridge: Positive = 1e-4
+    """Weight that holds K where it was."""
+
+
+class TrialConfig(Section, frozen=True):
+    """Of new hidden weights, before they are adopted and for a while after (docs/decisions/0020)."""
+
+    enabled: bool = True
+    seconds: Positive = 4.0
+    """How far the controller's own samples reach back, on which a set on offer is tried."""
+    samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
+    """How many there are of them; a fast loop takes one every few ticks, a slow one reaches further back."""
+    confirm: Positive = 1.0
+    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back."""
+    margin: NonNegative = 0.2
+    """Share by which the mean squared error of a new set may be larger than the old one's."""
+    floor: NonNegative = 0.003
+    """RMS error, as a share of `network.output_scale`, below which a set on offer is good enough in any case."""
+    floor_after: NonNegative = 0.1
+    """The same for a set that was adopted: what K has not learned yet is no reason to roll back."""
+
+
+class AdaptationConfig(Section, frozen=True):
+    enabled: bool = True
+    """False: the last layer stays at K_0 (hidden layers only)."""
+    gamma: Unit = 0.8
+    """Learning rate of the last layer, 0 < gamma < 1."""
+    column_bound: Positive = 1.0
+    """Bound on the norm of each column of K, as h per second of period."""
+    initial_scale: NonNegative = 6e-3
+    """Standard deviation of the entries of K_0, as h per second of period."""
+    start: StartName = "random"
+    """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
+    at_adoption: AdoptionName = "keep"
+    """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
+    refit: RefitConfig = RefitConfig()
+    trial: TrialConfig = TrialConfig()
+
+
+class L2nwConfig(Section, frozen=True):
+    window: PositiveInt = 100
+    bandwidth: Positive = 0.5
+    regularisation: Positive = 1e-3
+    variables: list[str] | None = None
+    """Names of the states and inputs the kernel sees; None: the plant's own choice."""
+
+
+class PlantPlace(Section, frozen=True):
+    """Where a trainer of many plants finds one that has a router of its own."""
+
+    name: Name
+    """The plant's, as in its own configuration."""
+    endpoint: str
+    """Its router's: tls/10.0.0.5:7448."""
+    keys: str | None = None
+    """Folder of the trainer's certificate for this plant; None: `bus.tls.keys`."""
+
+
+class TrainerConfig(Section, frozen=True):
+    enabled: bool = True
+    """False: hidden layers are never trained (last layer only)."""
+    capacity: PositiveInt = 2000
+    """p_max of the replay buffer."""
+    strategy: Strategy = "fifo"
+    train_every: PositiveInt = 10
+    """New samples between two trainings."""
+    min_samples: PositiveInt = 20
+    batch: PositiveInt = 512
+    """M, the samples drawn at random from the buffer for one training."""
+    steps: PositiveInt = 300
+    """Adam steps in one training, each on all M samples."""
+    learning_rate: Positive = 1e-3
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    fleet: list[PlantPlace] = msgspec.field(default_factory=list)
+    """Plants with a router each, trained by one `tandem trainer` (docs/fleet.md); empty: who is at `bus.endpoint`."""
+
+
+class TlsConfig(Section, frozen=True):
+    keys: str | None = None
+    """Folder of this process's own certificate, as `tandem keys create` makes one for each role."""
+
+
+class BusConfig(Section, frozen=True):
+    endpoint: str = "tcp/127.0.0.1:7447"
+    """Where the router listens; nodes are its clients. tls/HOST:PORT needs `tls.keys` (docs/remote.md)."""
+    remote: str | None = None
+    """Where the router listens for other machines as well: tls/0.0.0.0:7448. Only the router reads it."""
+    insecure: bool = False
+    """True: no warning that everybody who reaches a tcp/ endpoint beyond this machine may command the plant."""
+    tls: TlsConfig = TlsConfig()
+    lease_ms: PositiveInt = 1500
+    follow_silence: Positive = 1.0
+    """Seconds of silence after which another process incarnation may take over a topic."""
+
+
+class LogConfig(Section, frozen=True):
+    path: str = "run.mcap"
+    chunk_bytes: PositiveInt = 256 * 1024
+    flush_ms: PositiveInt = 500
+    split_minutes: NonNegative = 60.0
+    """A new file, NAME.part2.mcap, after so long: the index of a file is in memory until it ends. 0: never."""
+    keep: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """How many of a run's files stay, the one being written included; older ones are removed. 0: all."""
+
+
+class RealtimeConfig(Section, frozen=True):
+    priority: Annotated[int, msgspec.Meta(ge=0, le=99)] = 50
+    """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
+    awake: AwakeMode = "auto"
+    """Keep the cores from sleeping between slots; "auto": where there is a priority and the period is below 10 ms."""
+    cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0)]] = "auto"
+    """Core of the controller's loop and core of the plant's; "auto": two of their own where `awake` would be needed."""
+
+
+class Config(Section, frozen=True):
+    """The whole tree; `rate` is the one sampling rate of plant, model and controller."""
+
+    name: Name = "jet1"
+    """The plant's name, part of every key."""
+    rate: Positive = 20.0
+    """Samples a second (Hz)."""
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
+    plant: PlantConfig = PlantConfig()
+    controller: ControllerConfig = ControllerConfig()
+    network: NetworkConfig = NetworkConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
+    l2nw: L2nwConfig = L2nwConfig()
+    trainer: TrainerConfig = TrainerConfig()
+    bus: BusConfig = BusConfig()
+    log: LogConfig = LogConfig()
+    realtime: RealtimeConfig = RealtimeConfig()
+
+    @property
+    def period(self) -> float:
+        """Seconds between samples."""
+        return 1.0 / self.rate
+
+    @property
+    def awake(self) -> bool:
+        """Whether `realtime.awake` keeps the cores from sleeping at this rate."""
+        mode = self.realtime.awake
+        return mode == "always" or (mode == "auto" and self.fast)
+
+    @property
+    def fast(self) -> bool:
+        """Whether the loops have a priority and so little time that their cores matter."""
+        return self.realtime.priority > 0 and self.period < AWAKE_BELOW
+
+
+def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:
+    """Read a TOML file (None: all defaults) and apply `section.key=value` overrides on top.
+
+    Raises:
+        ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
+    """
+    tree = load_tree(path)
+    origins = {apply_override(tree, text): f"--set {text}" for text in overrides or []}
+    return from_tree(tree, str(path) if path is not None else "configuration", origins)
+
+
+def from_tree(
+    tree: dict[str, Any], where: str = "configuration", origins: Mapping[str, str] | None = None
+) -> Config:
+    """Convert a plain tree to a `Config`. Raises `ConfigError`.
+
+    where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
+    """
+
+    fail = failing(where, origins)
+    config = convert(tree, Config, fail)
+    infinite = first_non_finite(config)
+    if infinite is not None:
+        fail(infinite, f"{infinite} is not a finite number")
+    activation = config.network.activation
+    if activation not in BOUNDED:
+        fail(
+            "network.activation",
+            f"network.activation = {activation!r} is unbounded, and the last layer must be bounded; "
+            f"one of {', '.join(BOUNDED)}",
+        )
+    _check_architecture(config.network, fail)
+    if config.trainer.min_samples > config.trainer.capacity:
+        fail(
+            "trainer.min_samples",
+            f"trainer.min_samples = {config.trainer.min_samples} exceeds trainer.capacity = "
+            f"{config.trainer.capacity}: the first training would never come",
+        )
+    for i, place in enumerate(config.trainer.fleet):
+        if place.name in {earlier.name for earlier in config.trainer.fleet[:i]}:
+            fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is there twice")
+    return config
+
+
+def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
+    try:
+        known = get_architecture(network.architecture).options
+    except ValueError as error:
+        fail("network.architecture", f"network.architecture: {error}")
+    for key in network.options:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known) or 'none'}"
+            fail(
+                f"network.options.{key}",
+                f"network.options.{key}: {network.architecture} has no such option; {hint}",
+            )
+
+
+def from_json(text: str) -> Config:
+    """The inverse of `to_json`: a configuration as a log carries it. Raises `ConfigError`."""
+    try:
+        tree = msgspec.json.decode(text)
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
+    if not isinstance(tree, dict):
+        raise ConfigError("the log's configuration is not a table")
+    return from_tree(tree, "the log's configuration")
+
+
+def to_json(config: Config) -> str:
+    return msgspec.json.encode(config).decode()
+
+
+def to_tree(config: Config) -> dict[str, Any]:
+    """Plain dictionaries and lists, in the order of the declaration."""
+    return msgspec.to_builtins(config)
+
+
+def to_toml(config: Config) -> str:
+    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out."""
+    return tomli_w.dumps(_without_none(to_tree(config)))
+
+
+def override(config: Config, assignments: list[str]) -> Config:
+    """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
+    tree = to_tree(config)
+    origins = {apply_override(tree, text): f"--set {text}" for text in assignments}
+    return from_tree(tree, "configuration", origins)
+
+
+def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_none(value)
+        if isinstance(value, dict)
+        else [_without_none(item) if isinstance(item, dict) else item for item in value]
+        if isinstance(value, list)
+        else value
+        for key, value in tree.items()
+        if value is not None
+    }

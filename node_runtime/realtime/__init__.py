@@ -1,0 +1,1 @@
+"""One clock, slots on its grid, and what makes a Python loop punctual."""

@@ -1,0 +1,122 @@
+"""What Zenoh's configuration needs for TLS with certificates on both sides, rights by role, and limits of size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from node_runtime.bus.zenoh_bus import LARGEST_QUESTION
+from node_runtime.tls.credentials import Credentials
+from protocol import topics
+from protocol.rights import ROLES, common_name, rights_of
+
+SECURE = ["tls", "quic"]
+PLAIN = ["tcp"]
+MESSAGES = [
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+]
+
+
+def client_settings(credentials: Credentials) -> dict[str, Any]:
+    """For a session that connects by `tls/` or `quic/`."""
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": str(credentials.authority),
+            "enable_mtls": True,
+            "connect_private_key": str(credentials.key),
+            "connect_certificate": str(credentials.certificate),
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    }
+
+
+def router_settings(credentials: Credentials, plant: str) -> dict[str, Any]:
+    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": str(credentials.authority),
+            "enable_mtls": True,
+            "listen_private_key": str(credentials.key),
+            "listen_certificate": str(credentials.certificate),
+            "close_link_on_expiration": True,
+        },
+        "access_control": access_control(plant),
+        "low_pass_filter": size_limits(plant),
+    }
+
+
+def access_control(plant: str) -> dict[str, Any]:
+    """Zenoh's rules: everything on plain links, which do not leave the machine; on the others by certificate.
+
+    Default deny. "ingress" is what the router receives from the holder of a certificate, "egress" what it sends it.
+    """
+    rules = [_rule("plain", MESSAGES, ["ingress", "egress"], ["**", f"{topics.PREFIX}/*/{topics.DIRECT}/**"])]
+    subjects: list[dict[str, Any]] = [{"id": "plain", "link_protocols": PLAIN}]
+    policies = [{"rules": ["plain"], "subjects": ["plain"]}]
+    # Who listens where: without it a publisher believes that nobody does, and sends nothing.
+    below = [topics.everything(plant), f"{topics.PREFIX}/{plant}/{topics.DIRECT}/**"]
+    rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], below))
+    for role in ROLES:
+        rights = rights_of(role)
+        own = [
+            _rule(f"{role} publishes", ["put"], ["ingress"], rights.publish_keys(plant)),
+            _rule(f"{role} subscribes", ["declare_subscriber"], ["ingress"], rights.read_keys(plant)),
+            _rule(f"{role} hears", ["put"], ["egress"], rights.read_keys(plant)),
+            _rule(f"{role} asks", ["query"], ["ingress"], rights.ask_keys(plant)),
+            _rule(f"{role} is answered", ["reply"], ["egress"], rights.ask_keys(plant)),
+            _rule(f"{role} offers", ["declare_queryable"], ["ingress"], rights.answer_keys(plant)),
+            _rule(f"{role} is asked", ["query"], ["egress"], rights.answer_keys(plant)),
+            _rule(f"{role} answers", ["reply"], ["ingress"], rights.answer_keys(plant)),
+        ]
+        own = [rule for rule in own if rule["key_exprs"]]
+        rules.extend(own)
+        subjects.append(
+            {"id": role, "link_protocols": SECURE, "cert_common_names": [common_name(role, plant)]}
+        )
+        policies.append({"rules": ["matching", *(rule["id"] for rule in own)], "subjects": [role]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def size_limits(plant: str) -> list[dict[str, Any]]:
+    """What comes in by a certificate is no larger than its topic allows, already at the router."""
+    limits: dict[int, list[str]] = {}
+    for topic in topics.ALL:
+        keys = limits.setdefault(topic.max_bytes, [])
+        keys.append(topic.key(plant))
+        if topic.gathered and topic.lane == "control":
+            keys.append(topic.direct_key(plant))
+    filters = [_limit(f"up to {size}", ["put"], keys, size) for size, keys in limits.items()]
+    below = [topics.everything(plant)]
+    largest = max(topic.max_bytes for topic in topics.ALL)
+    filters.append(_limit("questions", ["query"], below, LARGEST_QUESTION))
+    filters.append(_limit("answers", ["reply"], below, largest))
+    return filters
+
+
+def _rule(name: str, messages: list[str], flows: list[str], keys: list[str]) -> dict[str, Any]:
+    return {"id": name, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": keys}
+
+
+def _limit(name: str, messages: list[str], keys: list[str], size: int) -> dict[str, Any]:
+    return {
+        "id": name,
+        "link_protocols": SECURE,
+        "flows": ["ingress"],
+        "messages": messages,
+        "key_exprs": keys,
+        "size_limit": size,
+    }

@@ -1,0 +1,1 @@
+"""Reading a log, a damaged one too."""

@@ -1,0 +1,133 @@
+"""Makes a log that was cut short, or damaged, whole again: in a new file, of all that is still good."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+
+from run_log.errors import LogError
+from run_log.reading.mcap_scan import Scan
+from run_log.reading.reader import RAW, check_ours
+from run_log.writing.durable_file import Sink
+
+CHUNK_BYTES = 256 * 1024
+
+
+class Recovery(msgspec.Struct, frozen=True, kw_only=True):
+    """What was saved. `log` is null when the file was whole already and no new one was made."""
+
+    source: str
+    log: str | None
+    messages: int
+    """Messages that travelled (their views are not counted)."""
+    attachments: int
+    seconds: float
+    """From the first message saved to the last."""
+    cut_at: int | None
+    """Byte at which the source was cut; null when it was not."""
+    lost_bytes: int
+    """Bytes of the incomplete record at the cut."""
+    damage: list[str]
+    """Parts that do not fit their checksum and were left out."""
+
+
+def recover(path: str | Path, out: str | Path) -> Recovery:
+    """Copy all good records of `path` to the new file `out`, with an index.
+
+    Raises:
+        LogExistsError: something is at `out` already.
+        LogError: `path` is unreadable, not a log of ours, or holds nothing; `out` cannot be written.
+    """
+    path, out = Path(path), Path(out)
+    probe = Scan(path, keep_going=True)
+    header: Header | None = None
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    stamps: list[tuple[int, int]] = []
+    attachments = 0
+    for record in probe:
+        match record:
+            case Header():
+                header = header or record
+                check_ours(path, record)
+            case Attachment():
+                attachments += 1
+            case Schema():
+                schemas.setdefault(record.id, record)
+            case Channel():
+                channels.setdefault(record.id, record)
+            case Message():
+                stamps.append((record.channel_id, record.log_time))
+            case _:
+                pass
+    times = [time for i, time in stamps if i in channels and channels[i].topic.startswith(RAW)]
+    if header is None or (not times and not attachments):
+        raise LogError(f"{path}: ends before anything was written to it; there is nothing to recover")
+    whole = probe.cut_at is None and not probe.damage
+    if not whole:
+        _copy(probe, out, header, schemas, channels)
+    return Recovery(
+        source=str(path),
+        log=None if whole else str(out),
+        messages=len(times),
+        attachments=attachments,
+        seconds=(max(times) - min(times)) * 1e-9 if times else 0.0,
+        cut_at=probe.cut_at,
+        lost_bytes=0 if probe.cut_at is None else probe.size - probe.cut_at,
+        damage=probe.damage,
+    )
+
+
+def _copy(
+    probe: Scan, out: Path, header: Header, schemas: dict[int, Schema], channels: dict[int, Channel]
+) -> None:
+    sink = Sink(out)
+    writer = Writer(
+        sink,  # write, tell and flush are all it uses
+        chunk_size=CHUNK_BYTES,
+        compression=CompressionType.ZSTD,
+        enable_data_crcs=True,
+    )
+    writer.start(header.profile, header.library)
+    reason = "whole" if probe.cut_at is None else f"cut at byte {probe.cut_at}"
+    writer.add_metadata("recovered", {"from": probe.path.name, "because": "; ".join([reason, *probe.damage])})
+    new_schemas = {0: 0}
+    new_channels: dict[int, int] = {}
+    for record in Scan(probe.path, keep_going=True):
+        match record:
+            case Attachment():
+                writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
+            case Metadata():
+                writer.add_metadata(record.name, record.metadata)
+            case Message() if record.channel_id in channels:
+                if record.channel_id not in new_channels:
+                    channel = channels[record.channel_id]
+                    schema = schemas.get(channel.schema_id)
+                    if schema is not None and schema.id not in new_schemas:
+                        new_schemas[schema.id] = writer.register_schema(
+                            schema.name, schema.encoding, schema.data
+                        )
+                    new_channels[channel.id] = writer.register_channel(
+                        channel.topic,
+                        channel.message_encoding,
+                        new_schemas.get(channel.schema_id, 0),
+                        channel.metadata,
+                    )
+                writer.add_message(
+                    new_channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
+                sink.drain()
+            case _:
+                pass
+    writer.finish()
+    if not sink.close():
+        raise LogError(f"{sink.error}; {out} is not whole")

@@ -1,0 +1,1 @@
+"""Computing every command of a log again."""

@@ -1,0 +1,227 @@
+"""Pictures of a run. Told apart by line style and marker as well as by colour (Okabe and Ito's)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from lbmpc.plants import Plant
+from run_log.reporting.summary import TOLERANCE
+from run_log.reporting.traces import Traces
+
+BLACK, BLUE, SKY, VERMILION, GREEN = "#000000", "#0072B2", "#56B4E9", "#D55E00", "#009E73"
+GREY = "#6F6F6F"
+WIDTH = 8.0
+# Model errors this much smaller than the largest are no part of the story.
+MATTERS = 0.02
+
+Draw = Callable[[Axes], None]
+
+
+def overview(data: Traces, title: str = "") -> Figure:
+    """The whole run on one page: what is performed, commanded, learned, and what it costs."""
+    performed = [_state(data, i) for i in data.plant.performance]
+    commanded = [_input(data, j) for j in range(data.plant.m)]
+    learned = [_error(data), *([_weights(data)] if _learns(data) else [])]
+    return _figure(title, [*performed, *commanded, *learned, _timing(data)], height=1.9)
+
+
+def pictures(data: Traces) -> dict[str, Figure]:
+    """Every separate picture by name; what the run has not (hidden weights, timings) has no picture."""
+    plant = data.plant
+    drawn = {
+        "states": _figure("States", [_state(data, i) for i in range(plant.d)]),
+        "input": _figure("Input", [_input(data, j) for j in range(plant.m)], height=3.2),
+        "error": _figure("Prediction error", [_error(data)], height=3.2),
+    }
+    shown = _model_errors(data)
+    if shown:
+        drawn["model_error"] = _figure(
+            "Model error over one period, measured and estimated", [_model_error(data, i) for i in shown]
+        )
+    if np.isfinite(data.tick_ms).any():
+        drawn["timing"] = _figure("Time spent", [_timing(data)], height=3.2)
+    if _learns(data):
+        drawn["weights"] = _figure("Hidden weights", [_weights(data), _losses(data)], height=2.4)
+    return drawn
+
+
+def _figure(title: str, draws: list[Draw], height: float = 2.0) -> Figure:
+    figure = Figure(figsize=(WIDTH, 0.7 + height * len(draws)), layout="constrained", dpi=120)
+    axes = figure.subplots(len(draws), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, draw in zip(axes, draws, strict=True):
+        draw(ax)
+        ax.grid(True, color="#DDDDDD", linewidth=0.6)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+        if ax.get_legend_handles_labels()[1]:
+            # Beside the axes, so that it hides nothing.
+            ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), fontsize=8, frameon=False)
+    axes[-1].set_xlabel("time since the first command (s)")
+    figure.align_ylabels()
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _label(plant: Plant, name: str, what: str = "") -> str:
+    unit = plant.units.get(name, "")
+    return f"{what}{name} ({'–' if unit in ('', '1') else unit})"
+
+
+def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float) -> None:
+    """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve."""
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return
+    bottom, top = min(float(values.min()), rest), max(float(values.max()), rest)
+    reach = 2 * max(top - bottom, 1e-9)
+    drawn = [bound for bound in (low, high) if bottom - reach < bound < top + reach]
+    bottom, top = min(bottom, *drawn, top), max(top, *drawn, bottom)
+    margin = 0.06 * max(top - bottom, 1e-9)
+    ax.set_ylim(bottom - margin, top + margin)
+    for i, bound in enumerate(drawn):
+        label = "bounds" if i == 0 else "_nolegend_"
+        ax.axhline(bound, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label=label)
+        beyond = bottom - margin if bound == low else top + margin
+        ax.axhspan(bound, beyond, color=VERMILION, alpha=0.08, linewidth=0)
+    hidden = ", ".join(f"{bound:g}" for bound in (low, high) if bound not in drawn)
+    if hidden:
+        ax.plot([], [], " ", label=f"bounds beyond the\naxis: {hidden}")
+    distance = float(min((values - low).min(), (high - values).min()))
+    inside = (
+        f"inside by {max(distance, 0.0):.2g}" if distance >= -TOLERANCE else f"OUTSIDE by {-distance:.2g}"
+    )
+    ax.plot([], [], " ", label=inside)
+
+
+def _state(data: Traces, i: int) -> Draw:
+    plant, motion = data.plant, data.motion
+
+    def draw(ax: Axes) -> None:
+        x = motion.x[:, i]
+        ax.plot(motion.t, x, color=BLUE, linewidth=1.6, label="true state")
+        ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+        _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
+        ax.set_ylabel(_label(plant, plant.states[i]))
+
+    return draw
+
+
+def _input(data: Traces, j: int) -> Draw:
+    plant, motion = data.plant, data.motion
+
+    def draw(ax: Axes) -> None:
+        u, applied = data.u[:, j], motion.applied[:, j]
+        ax.step(data.t, u, where="post", color=SKY, linewidth=3.0, label="commanded")
+        # `applied` is reported at the end of the period over which it is the mean.
+        ax.step(
+            motion.t, applied, where="pre", color=BLACK, linestyle="--", linewidth=1.0, label="applied (mean)"
+        )
+        if data.fallback.any():
+            ax.plot(
+                data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver"
+            )
+        ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+        _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied]), plant.u_e[j])
+        ax.set_ylabel(_label(plant, plant.inputs[j]))
+
+    return draw
+
+
+def _model_errors(data: Traces) -> list[int]:
+    """States whose measured model error is not negligible beside the largest, in units of its bounds."""
+    if not np.isfinite(data.h).any():
+        return []
+    largest = np.nanmax(np.abs(data.h), axis=0) / (data.plant.x_max - data.plant.x_min)
+    return [int(i) for i in np.flatnonzero(largest > MATTERS * largest.max())]
+
+
+def _model_error(data: Traces, i: int) -> Draw:
+    plant = data.plant
+
+    def draw(ax: Axes) -> None:
+        # The label of a step is known when the step has ended.
+        ax.plot(data.t, data.h[:, i], color=BLACK, linewidth=1.6, label="measured h")
+        ax.plot(data.t, data.h_hat[:, i], color=VERMILION, linestyle="--", linewidth=1.4, label="estimated ĥ")
+        ax.set_ylabel(_label(plant, plant.states[i], "h of "))
+        ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
+
+    return draw
+
+
+def _error(data: Traces) -> Draw:
+    def draw(ax: Axes) -> None:
+        ax.semilogy(data.t, _positive(data.error), color=BLUE, linewidth=1.2, label="|ĥ − h|")
+        for mask, marker, colour, label in (
+            (data.adopted, "^", GREEN, "weights adopted"),
+            (data.refused, "x", VERMILION, "weights refused"),
+            (data.rolled_back, "v", VERMILION, "weights rolled back"),
+        ):
+            if mask.any():
+                level = np.nanmax(_positive(data.error)) * 1.5 if np.isfinite(data.error).any() else 1.0
+                at_top = np.full(mask.sum(), level)
+                ax.plot(data.t[mask], at_top, marker, color=colour, markersize=5, label=label)
+        ax.set_ylabel("prediction error\n(units of x)")
+
+    return draw
+
+
+def _timing(data: Traces) -> Draw:
+    def draw(ax: Axes) -> None:
+        ax.semilogy(data.t, _positive(data.tick_ms), color=BLACK, linewidth=1.0, label="whole tick")
+        ax.semilogy(data.t, _positive(data.solve_ms), ".", color=BLUE, markersize=3, label="solver")
+        ax.axhline(data.period * 1e3, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label="period")
+        if data.late.any():
+            ax.plot(
+                data.t[data.late], data.tick_ms[data.late], "v", color=VERMILION, zorder=5, label="late tick"
+            )
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.yaxis.set_major_formatter(lambda value, _position: f"{value:g}")
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.set_ylabel("time (ms)")
+
+    return draw
+
+
+def _learns(data: Traces) -> bool:
+    return bool(len(data.losses) or data.adopted.any() or data.refused.any())
+
+
+def _weights(data: Traces) -> Draw:
+    def draw(ax: Axes) -> None:
+        ax.step(data.t, data.version, where="post", color=BLUE, linewidth=1.4, label="in force")
+        for mask, marker, colour, label in (
+            (data.adopted, "^", GREEN, "adopted"),
+            (data.refused, "x", VERMILION, "refused"),
+            (data.rolled_back, "v", VERMILION, "rolled back"),
+        ):
+            if mask.any():
+                ax.plot(data.t[mask], data.version[mask], marker, color=colour, markersize=6, label=label)
+        ax.set_ylabel("hidden weights\n(version)")
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+    return draw
+
+
+def _losses(data: Traces) -> Draw:
+    def draw(ax: Axes) -> None:
+        t, before, after = data.losses.T if len(data.losses) else np.zeros((3, 0))
+        ax.semilogy(
+            t, _positive(before), "o-", color=BLACK, markersize=4, linewidth=0.8, label="before training"
+        )
+        ax.semilogy(
+            t, _positive(after), "s--", color=GREEN, markersize=4, linewidth=0.8, label="after training"
+        )
+        ax.set_ylabel("loss")
+
+    return draw
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    """A logarithmic axis has no zero."""
+    return np.where(values > 0.0, values, np.nan)

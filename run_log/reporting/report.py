@@ -1,0 +1,51 @@
+"""`tandem report`: pictures of a run, from its log alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from run_log.errors import LogError
+from run_log.reading.reader import Run, read_run
+from run_log.reporting import plots
+from run_log.reporting.traces import traces
+
+
+def report(path: str | Path, out_dir: str | Path) -> list[Path]:
+    """Draw the log at `path` into `out_dir`: NAME.png is the whole run, NAME-states.png etc. its parts.
+
+    Raises:
+        LogError: the log cannot be read or holds nothing to draw; a picture cannot be written.
+    """
+    path, out_dir = Path(path), Path(out_dir)
+    run = read_run(path)
+    data = traces(run)
+    figures = {f"{path.stem}.png": plots.overview(data, title(run))}
+    figures |= {f"{path.stem}-{name}.png": figure for name, figure in plots.pictures(data).items()}
+    files = []
+    for name, figure in figures.items():
+        files.append(_save(figure, out_dir / name))
+    return files
+
+
+def picture(run: Run, path: str | Path) -> Path:
+    """The whole run on one page. Raises `LogError` as `report` does."""
+    return _save(plots.overview(traces(run), title(run)), Path(path))
+
+
+def title(run: Run) -> str:
+    """Plant, oracle, rate and seed."""
+    config = run.config
+    cut = ", log cut short" if run.truncated or run.recovered else ""
+    return (
+        f"{config.name}: {config.plant.model}, oracle {config.controller.oracle}, "
+        f"{config.rate:g} Hz, seed {config.seed}{cut}"
+    )
+
+
+def _save(figure: plots.Figure, path: Path) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written: {error.strerror}") from error
+    return path

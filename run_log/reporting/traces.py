@@ -1,0 +1,113 @@
+"""What the pictures show, as arrays on one time axis: seconds since the plant began to move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.plants import Plant
+from protocol import topics
+from run_log.errors import LogError
+from run_log.reading.reader import Run
+from run_log.reporting.summary import Trajectory, plant_of, trajectory
+
+
+@dataclass(frozen=True)
+class Traces:
+    """One run, ready to draw. n ticks, d states, m inputs; NaN where a tick has no such figure."""
+
+    plant: Plant
+    period: float
+    motion: Trajectory
+    t: np.ndarray
+    """(n,) time of each tick."""
+    u: np.ndarray
+    """(n, m) commanded input."""
+    h: np.ndarray
+    """(n, d) measured model error of the step that ended at the tick."""
+    h_hat: np.ndarray
+    """(n, d) its estimate."""
+    error: np.ndarray
+    """(n,) |h_hat - h|."""
+    fallback: np.ndarray
+    """(n,) whether the input did not come from the solver."""
+    soft: np.ndarray
+    """(n,) slack in the soft state constraints."""
+    version: np.ndarray
+    """(n,) hidden weights in force, -1 before the first."""
+    adopted: np.ndarray
+    refused: np.ndarray
+    rolled_back: np.ndarray
+    """(n,) booleans."""
+    late: np.ndarray
+    solve_ms: np.ndarray
+    tick_ms: np.ndarray
+    losses: np.ndarray
+    """(k, 3) time at which hidden weights arrived, loss before and after their training."""
+
+
+def traces(run: Run) -> Traces:
+    """Raises `LogError`: the plant is unknown here, or the log holds none of its states or no tick."""
+    plant = plant_of(run)
+    motion = trajectory(run, plant)
+    controllers = set(run.controllers)
+    results = [r for r in run.results if r.run_id in controllers]
+    if not results:
+        raise LogError(f"{run.path}: holds no tick of a controller; there is nothing to draw")
+    keys = [(r.run_id, r.seq) for r in results]
+    when = _tick_times(run, motion)
+    ticks = {(tick.run_id, tick.seq): tick for tick in run.ticks}
+    timings = {(timing.run_id, timing.seq): timing for timing in run.timings}
+
+    def vectors(rows: list[list[float] | None], length: int) -> np.ndarray:
+        absent = [np.nan] * length
+        return np.array([absent if row is None or len(row) != length else row for row in rows])
+
+    # Where a tick is not in the log (a cut), the grid of slots says when it was.
+    t0 = next(iter(when.values()), 0.0)
+    return Traces(
+        plant=plant,
+        period=run.config.period,
+        motion=motion,
+        t=np.array([when.get(key, t0 + key[1] * run.config.period) for key in keys]),
+        u=vectors([r.u for r in results], plant.m),
+        h=vectors([r.h for r in results], plant.d),
+        h_hat=vectors([r.h_hat for r in results], plant.d),
+        error=np.array([np.nan if r.prediction_error is None else r.prediction_error for r in results]),
+        fallback=np.array([r.mode != "solver" for r in results]),
+        soft=np.array([r.slack for r in results]),
+        version=np.array([r.hidden_version for r in results]),
+        adopted=np.array([r.weights_verdict == "adopted" for r in results]),
+        refused=np.array([r.weights_verdict.startswith("refused") for r in results]),
+        rolled_back=np.array([bool(r.weights_rolled_back) for r in results]),
+        late=np.array([key in ticks and ticks[key].late for key in keys]),
+        solve_ms=np.array([timings[key].solve_ms if key in timings else np.nan for key in keys]),
+        tick_ms=np.array([timings[key].tick_ms if key in timings else np.nan for key in keys]),
+        losses=_losses(run, motion),
+    )
+
+
+def _tick_times(run: Run, motion: Trajectory) -> dict[tuple[str, int], float]:
+    """Slots are on the controller's clock; the states that ticks answer tie it to the plant's."""
+    states = [s for s in run.plant_states if s.source != "hold"] or run.plant_states
+    sampled = {(s.run_id, s.seq): s.t for s in run.plant_states}
+    start = states[0].t - (motion.t[1] if len(motion.t) > 1 and states[0].source != "hold" else 0.0)
+    offsets: dict[str, list[float]] = {}
+    for tick in run.ticks:
+        if tick.state is not None and tick.state_verdict == "fresh":
+            at = sampled.get((tick.state.run_id, tick.state.seq), tick.state.t)
+            offsets.setdefault(tick.run_id, []).append(at - start - tick.t)
+    shift = {run_id: float(np.median(values)) for run_id, values in offsets.items()}
+    return {(tick.run_id, tick.seq): tick.t + shift.get(tick.run_id, 0.0) for tick in run.ticks}
+
+
+def _losses(run: Run, motion: Trajectory) -> np.ndarray:
+    states = run.entries(topics.PLANT_STATE)
+    moving = [entry.log_time for entry in states if entry.message.source != "hold"]
+    zero = moving[0] - (motion.t[1] if len(motion.t) > 1 else 0.0) * 1e9 if moving else 0.0
+    rows = [
+        ((entry.log_time - zero) * 1e-9, entry.message.loss_before, entry.message.loss_after)
+        for entry in run.entries(topics.HIDDEN_WEIGHTS)
+    ]
+    return np.array(rows).reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Writing a log while the run happens."""

@@ -1,0 +1,130 @@
+"""`tandem record`: logs everything that is said on the bus of one plant, in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+
+from lbmpc.plants import get_plant
+from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
+from node_runtime.health import HealthPublisher, run_info
+from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.realtime import clock
+from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
+from protocol import topics
+from run_log.errors import LogError
+from run_log.writing.parts import PartedLog
+
+log = logging.getLogger(__name__)
+
+EXIT_CANNOT = 2
+EXIT_NOTHING_WRITTEN = 4
+# After Ctrl-C the other processes still say their last words; listen for that long.
+QUIET_S = 0.25
+LAST_WORDS_S = 1.5
+Said = tuple[Path, str | None, bool]
+# Messages are fetched together: to wake for each costs more than to log it.
+GATHER_S = 0.02
+
+
+def main(config: Config, stop: threading.Event | None = None) -> int:
+    """Record to `config.log.path` until told to stop; then finish the file.
+
+    A disk that is full or read-only stops nobody: it is named in Health and tried again, as long as it takes.
+
+    Returns:
+        0; 2 when the path is taken, the plant unknown or the endpoint none; 4 when nothing could ever be written.
+    """
+    with (
+        stopped_by_signals(stop) as stopping,
+        punctual(min(READER_PRIORITY, config.realtime.priority), silent=True) as punctuality,
+    ):
+        try:
+            plant = get_plant(config.plant.model)
+            writer = PartedLog(config, plant, now=clock.now(), start_ns=time.time_ns())
+        except (LogError, KeyError) as error:
+            log.error("%s", error.args[0])
+            return EXIT_CANNOT
+        if writer.error is not None:
+            log.error("%s; trying again every %d ms", writer.error, config.log.flush_ms)
+        run_id = new_run_id("recorder")
+        try:
+            with Bus(config, "recorder", run_id, stopping) as bus:
+                mailbox = bus.everything()
+                # Only now, so that what it says of itself is in the log too.
+                info = run_info(config, "recorder", run_id, plant.units)
+                with HealthPublisher(bus, info, lambda: writer.counters, punctuality) as health:
+                    _record(config, writer, mailbox, health, stopping)
+        except OpenInterrupted:
+            pass
+        except ConfigError as error:
+            log.error("%s", error)
+            _finish(writer)
+            return EXIT_CANNOT
+        return _finish(writer)
+
+
+def _record(
+    config: Config, writer: PartedLog, mailbox: Mailbox, health: HealthPublisher, stopping: threading.Event
+) -> None:
+    prefix = topics.everything(config.name).removesuffix("**")
+    # Arrival is stamped on the monotonic clock; one offset for the whole run keeps the times in order.
+    to_unix = time.time_ns() - clock.now_ns()
+    flush_s = config.log.flush_ms * 1e-3
+    next_flush = clock.now()
+    said: Said | None = None
+    end: float | None = None
+    last_arrival = clock.now()
+    garbage = GarbageCollection()
+    garbage.begin()
+    while end is None or clock.now() < min(end, last_arrival + QUIET_S):
+        if end is None and stopping.is_set():
+            last_arrival = clock.now()
+            end = last_arrival + LAST_WORDS_S
+        clock.sleep_until(clock.now() + GATHER_S)
+        for delivery in mailbox.drain():
+            last_arrival = clock.now()
+            name, log_time = delivery.key.removeprefix(prefix), delivery.received_ns + to_unix
+            writer.write(name, delivery.payload, log_time, last_arrival)
+        garbage.idle()
+        if clock.now() >= next_flush:
+            writer.flush(clock.now(), clock.now_ns() + to_unix)
+            next_flush = clock.now() + flush_s
+            if (now := (writer.path, writer.error, bool(writer.lost))) != said:
+                said = now
+                _say(writer, health)
+
+
+def _say(writer: PartedLog, health: HealthPublisher) -> None:
+    error = writer.error
+    note = f"writing {writer.path}"
+    if error is None:
+        log.info("%s", note)
+    else:
+        log.error("%s; trying again, %d messages dropped so far", error, writer.counters["dropped"])
+        note = f"NOT LOGGED: {error}"
+    if writer.lost:
+        log.error("ticks of the controller never arrived here; the log has gaps, and replay names them")
+        note += "; THE LOG HAS GAPS: messages never arrived, see the counter 'lost ticks'"
+    health.set("running", note)
+
+
+def _finish(writer: PartedLog) -> int:
+    if writer.last_bad is not None:
+        log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
+    if writer.lost:
+        log.error(
+            "%s: %d ticks never arrived here and are not in it", writer.path, writer.counters["lost ticks"]
+        )
+    try:
+        writer.close()
+    except LogError as error:
+        log.error("%s", error)
+    if writer.counters["file bytes"] == 0:
+        return EXIT_NOTHING_WRITTEN
+    log.info("%s: %d messages", writer.path, writer.counters["messages"])
+    return 0

@@ -1,0 +1,25 @@
+"""Puts a run that only exists in memory (a simulation's) into a log like that of a live run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from protocol import topics
+from run_log.reading.reader import Run
+from run_log.reporting.summary import plant_of
+from run_log.writing.writer import LogWriter
+
+
+def save(run: Run, path: str | Path) -> None:
+    """Write all messages of `run` to a new log, in the order of their times.
+
+    Raises:
+        LogExistsError: something is at `path` already.
+        LogError: the file cannot be written, or not to its end.
+    """
+    entries = [(entry, topic) for topic in topics.ALL for entry in run.entries(topic)]
+    entries.sort(key=lambda pair: pair[0].log_time)
+    start = entries[0][0].log_time if entries else 0
+    with LogWriter(path, run.config, plant_of(run), start_ns=start) as writer:
+        for entry, topic in entries:
+            writer.write(topic.name, entry.payload, entry.log_time)

@@ -1,0 +1,250 @@
+"""Writes the log of a run: MCAP, readable up to the last flush whatever happens to the process.
+
+- `raw/<topic>`: the exact bytes that travelled (msgpack), for replay. No schema in the channel: the
+  attachment schemas.json has them all, and a generic msgpack reader needs none.
+- `view/<topic>`: the same message as plottable JSON with a JSON schema (`run_log.writing.views`).
+- attachments: config.json, config.toml, versions.json, seeds.json, units.json, schemas.json.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from types import TracebackType
+
+import msgspec
+from mcap.writer import LIBRARY_IDENTIFIER, CompressionType, Writer
+
+from lbmpc.plants import Plant
+from node_runtime.bus.inbox import Follower
+from node_runtime.config.sections import Config, to_toml
+from node_runtime.health import versions as installed
+from protocol import codec, topics
+from protocol.codec import Head
+from protocol.messages import Message
+from protocol.topics import Topic
+from run_log.errors import LogError
+from run_log.writing.durable_file import Sink
+from run_log.writing.views import View, views
+
+PROFILE = "tandem"
+FORMAT = "1"
+"""Of the log: which channels and attachments there are. Rises when an older reader would be misled."""
+IDENTITY = "tandem"
+"""Metadata that says what a log is of."""
+CONTINUED = "continued"
+"""Metadata of a log that goes on in another file."""
+MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
+COUNTED = ("controller/tick", "controller/result")
+"""Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
+MAX_STRANGERS = 100
+"""Channels for keys that are in no topic table; whoever makes up more of them is not logged."""
+
+
+class LogWriter:
+    """One log file.
+
+    Args:
+        path: a file that does not exist yet.
+        config: the resolved configuration.
+        plant: the plant that `config` names; its names and units label the views.
+        start_ns: time of the attachments, in the same clock as the messages.
+        versions: what ran; None: the packages installed here.
+        patient: see `Sink`.
+        part: which one of its run's it is, from 1 (`run_log.writing.parts`).
+
+    Raises:
+        LogExistsError: something is at `path` already.
+        LogError: not patient, and the file cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: Config,
+        plant: Plant,
+        *,
+        start_ns: int = 0,
+        versions: dict[str, str] | None = None,
+        patient: bool = False,
+        part: int = 1,
+    ):
+        self.counters = {"messages": 0, "bytes": 0, "without view": 0, "dropped": 0, "lost ticks": 0}
+        self.bad: dict[str, int] = {}
+        """Known topics' payloads that are in the log as they came, but have no view: by reason."""
+        self.last_bad: str | None = None
+        self.lost: dict[str, int] = {}
+        """By topic, messages that are missing between others: they never arrived here."""
+        self._sink = Sink(path, patient=patient)
+        self._views = views(plant)
+        self._raw: dict[str, int] = {}
+        self._shown: dict[str, int] = {}
+        self._next_view: dict[str, int] = {}
+        """When, in ns, a topic's next view is due; what comes earlier has none."""
+        self._speakers = {name: Follower(config.bus.follow_silence) for name in COUNTED}
+        self._counted: dict[tuple[str, str], int] = {}
+        """The last number of each run on each of the topics `COUNTED`."""
+        self._strangers = 0
+        self._mcap = Writer(
+            self._sink,  # write, tell and flush are all it uses
+            chunk_size=config.log.chunk_bytes,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
+        self._mcap.start(profile=PROFILE, library=f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}")
+        identity = {"format": FORMAT, "name": config.name, "plant": plant.name, "part": str(part)}
+        self._mcap.add_metadata(IDENTITY, identity)
+        for name, kind, text in _attachments(
+            config, plant, versions if versions is not None else installed()
+        ):
+            self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
+        self.flush()
+
+    @property
+    def path(self) -> Path:
+        return self._sink.path
+
+    @property
+    def error(self) -> str | None:
+        """Why the file does not grow at the moment; None when it does."""
+        return self._sink.error
+
+    @property
+    def write_errors(self) -> int:
+        return self._sink.errors
+
+    @property
+    def written(self) -> int:
+        """Bytes in the file."""
+        return self._sink.written
+
+    def write_message(self, topic: Topic, message: Message, log_time: int) -> None:
+        """Log one message of ours; `log_time` in ns."""
+        self._log(topic.name, codec.encode(message), log_time, message)
+
+    def write(self, name: str, payload: bytes, log_time: int) -> None:
+        """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
+
+        A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
+        raises for bad input or a full disk: see `counters`, `bad` and `error`.
+        """
+        self._log(name, payload, log_time, None)
+
+    def _log(self, name: str, payload: bytes, log_time: int, message: Message | None) -> None:
+        if len(payload) > MAX_MESSAGE or self._sink.pending > self._sink.limit:
+            self.counters["dropped"] += 1
+            return
+        channel = self._raw.get(name) or self._register_raw(name)
+        if channel is None:
+            self.counters["dropped"] += 1
+            return
+        topic = topics.BY_NAME.get(name)
+        view = self._views.get(name)
+        shown: bytes | None = None
+        # Of a message between two views only who wrote it and its number are looked at.
+        head: Message | Head | None = None
+        if log_time < self._next_view.get(name, 0):
+            head = codec.head_of(payload)
+        if head is None and topic is not None and view is not None:
+            try:
+                head = message = message or codec.decode(topic, payload)
+                shown = view.render(message)
+                if math.isfinite(topic.view_hz):
+                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
+            except codec.BadMessage as error:
+                self._count_bad(error)
+        if head is not None and name in COUNTED:
+            self._count_lost(name, head, log_time)
+        sequence = max(head.seq, 0) & 0xFFFFFFFF if head is not None else 0
+        self._mcap.add_message(channel, log_time, payload, log_time, sequence)
+        if view is not None and shown is not None:
+            self._mcap.add_message(self._view_channel(view), log_time, shown, log_time, sequence)
+        self.counters["messages"] += 1
+        self.counters["bytes"] += len(payload)
+
+    def flush(self) -> bool:
+        """End the chunk and hand all to the operating system; False when it does not take all of it."""
+        self._mcap.flush()
+        return self._sink.error is None
+
+    def close(self, continued: Path | None = None) -> None:
+        """Write the index and close.
+
+        continued: the part in which the log goes on; None: it is the last.
+
+        Raises:
+            LogError: the file does not hold everything; `tandem recover` saves what it holds.
+        """
+        if continued is not None:
+            self._mcap.add_metadata(CONTINUED, {"in": continued.name})
+        self._mcap.finish()
+        if not self._sink.close():
+            raise LogError(f"{self._sink.error}; the log is cut short: `tandem recover` saves what there is")
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _register_raw(self, name: str) -> int | None:
+        topic = topics.BY_NAME.get(name)
+        if topic is None:
+            if self._strangers >= MAX_STRANGERS:
+                return None
+            self._strangers += 1
+        # Nobody vouches for a stranger's encoding.
+        encoding, kind = (
+            ("msgpack", topic.type.__name__) if topic else ("application/octet-stream", "unknown")
+        )
+        self._raw[name] = self._mcap.register_channel(f"raw/{name}", encoding, 0, {"type": kind})
+        return self._raw[name]
+
+    def _view_channel(self, view: View) -> int:
+        name = view.topic.name
+        if name not in self._shown:
+            schema = self._mcap.register_schema(
+                f"tandem.live.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
+            )
+            self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
+        return self._shown[name]
+
+    def _count_lost(self, name: str, message: Message | Head, log_time: int) -> None:
+        """Ticks whose messages were made and never came here: cut links, full queues, whatever it was.
+
+        What is out of order, or of another run than the one that speaks, was sent again or by a stranger.
+        """
+        if self._speakers[name].accept(message.run_id, message.seq, log_time * 1e-9) != "ok":
+            return
+        key = (name, message.run_id)
+        last = self._counted.get(key)
+        if last is None and len(self._counted) >= MAX_STRANGERS:
+            return
+        self._counted[key] = message.seq
+        if last is not None and message.seq > last + 1:
+            missing = message.seq - last - 1
+            self.lost[name] = self.lost.get(name, 0) + missing
+            self.counters["lost ticks"] = max(self.lost.values())
+
+    def _count_bad(self, error: codec.BadMessage) -> None:
+        key = f"bad {error.topic}: {error.reason}"
+        self.bad[key] = self.bad.get(key, 0) + 1
+        self.counters["without view"] += 1
+        self.last_bad = str(error)
+
+
+def _attachments(config: Config, plant: Plant, versions: dict[str, str]) -> list[tuple[str, str, str]]:
+    _, schemas = msgspec.json.schema_components([topic.type for topic in topics.ALL])
+    channels = {f"raw/{topic.name}": topic.type.__name__ for topic in topics.ALL}
+    as_json = "application/json"
+    return [
+        ("config.json", as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
+        ("config.toml", "application/toml", to_toml(config)),
+        ("versions.json", as_json, json.dumps(versions, indent=2)),
+        ("seeds.json", as_json, json.dumps({"seed": config.seed})),
+        ("units.json", as_json, json.dumps(plant.units, indent=2)),
+        ("schemas.json", as_json, json.dumps({"channels": channels, "types": schemas}, indent=2)),
+    ]

@@ -1,0 +1,286 @@
+"""A plant's private authority and one certificate a role: made, made anew, and found again on disk.
+
+keys/jet1/authority/   certificate.pem, key.pem     the key belongs in a drawer: it is needed to renew, not to run
+keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      all that the trainer's machine gets
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from node_runtime.config.strict import ConfigError
+from node_runtime.tls.credentials import AUTHORITY, CERTIFICATE, KEY, load_certificate, name_of, read_bytes
+from protocol.rights import ROLES, common_name
+from tandem.terminal import Refused
+
+AUTHORITY_FOLDER = "authority"
+AUTHORITY_DAYS = 3650
+"""Longer than any certificate that it signs: renewing one of those is one folder to copy, a new authority is all."""
+LEAF_DAYS = 365
+EARLY = timedelta(days=1)
+"""Clocks differ: a certificate is valid a little before it was made."""
+ALWAYS = ("localhost", "127.0.0.1", "router")
+
+
+@dataclass(frozen=True)
+class Issued:
+    """One certificate on disk."""
+
+    folder: Path
+    role: str
+    plant: str
+    certificate: x509.Certificate
+
+    @property
+    def valid_until(self) -> datetime:
+        return self.certificate.not_valid_after_utc
+
+    @property
+    def days_left(self) -> float:
+        return (self.valid_until - datetime.now(UTC)).total_seconds() / 86400.0
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256, as `openssl x509 -fingerprint -sha256` prints it."""
+        return self.certificate.fingerprint(hashes.SHA256()).hex(":").upper()
+
+    @property
+    def hosts(self) -> list[str]:
+        """The names and addresses that it is valid for, the router's alone."""
+        try:
+            names = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return []
+        return [
+            *names.get_values_for_type(x509.DNSName),
+            *map(str, names.get_values_for_type(x509.IPAddress)),
+        ]
+
+
+def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Issued]:
+    """An authority for one plant and a certificate for every role, in `folder`, which must not exist yet."""
+    if folder.exists() or folder.is_symlink():
+        raise Refused(
+            f"{folder}: exists already, and keys never overwrite anything. `tandem keys renew --role ROLE` makes one "
+            "certificate anew; another --out makes another authority, whose certificates do not fit the former's"
+        )
+    if not 1 <= days < AUTHORITY_DAYS:
+        raise Refused(f"--days {days}: at least 1 and below the authority's {AUTHORITY_DAYS}")
+    names = _host_names([*ALWAYS, *hosts])
+    key = ec.generate_private_key(ec.SECP256R1())
+    authority = _authority(plant, key)
+    try:
+        _folder(folder)
+        _folder(folder / AUTHORITY_FOLDER)
+        _write(folder / AUTHORITY_FOLDER / KEY, _pem(key))
+        _write(folder / AUTHORITY_FOLDER / CERTIFICATE, authority.public_bytes(serialization.Encoding.PEM))
+        for role in ROLES:
+            _folder(folder / role)
+            issue(
+                folder / role,
+                common_name(role, plant),
+                key,
+                authority,
+                days,
+                names if role == "router" else [],
+            )
+    except OSError as error:
+        raise Refused(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
+    return found(folder)
+
+
+def renew(
+    role: str, folder: Path, hosts: Sequence[str], days: int, drawer: Path | None
+) -> tuple[Issued, Issued]:
+    """A new key and certificate for one role; returns the old one and the new one.
+
+    folder: the plant's; hosts: more names for the router, beside those that it has; drawer: where the authority is,
+    None: in the folder.
+    """
+    place = drawer or folder / AUTHORITY_FOLDER
+    try:
+        authority = load_certificate(place / CERTIFICATE)
+        key = serialization.load_pem_private_key(read_bytes(place / KEY), password=None)
+    except (ConfigError, ValueError, TypeError) as error:
+        raise Refused(
+            f"{error}. A certificate is renewed with the authority's key: if it lies elsewhere, --authority FOLDER"
+        ) from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
+        raise Refused(f"{place / KEY}: is not the key of {CERTIFICATE} beside it")
+    old = _issued(folder / role)
+    if old is None:
+        raise Refused(f"{folder / role / CERTIFICATE}: not there; is {folder} a plant's folder of keys?")
+    if _plant_of(authority) != old.plant:
+        raise Refused(
+            f"{place}: is the authority of {_plant_of(authority)}, and {folder / role} is of {old.plant}"
+        )
+    left = (authority.not_valid_after_utc - datetime.now(UTC)).days
+    if not 1 <= days < left:
+        raise Refused(f"--days {days}: at least 1, and less than the {left} that the authority has left")
+    if hosts and role != "router":
+        raise Refused(f"--host: only the router's certificate names hosts, not the {role}'s")
+    names = _host_names([*old.hosts, *hosts]) if role == "router" else []
+    try:
+        issue(folder / role, common_name(role, old.plant), key, authority, days, names)
+    except OSError as error:
+        raise Refused(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
+    new = _issued(folder / role)
+    assert new is not None
+    return old, new
+
+
+def found(folder: Path) -> list[Issued]:
+    """All certificates in a folder, in a plant's, or in one of several plants'."""
+    if not folder.is_dir():
+        raise Refused(f"{folder}: no such folder; `tandem keys create --plant NAME` makes one")
+    places = sorted(
+        {path.parent for depth in ("", "*/", "*/*/") for path in folder.glob(depth + CERTIFICATE)}
+    )
+    all_of_them = [issued for place in places if (issued := _issued(place)) is not None]
+    if not all_of_them:
+        raise Refused(f"{folder}: no {CERTIFICATE} in it, or in a folder of it")
+    order = (AUTHORITY_FOLDER, *ROLES)
+    return sorted(
+        all_of_them, key=lambda one: (one.plant, order.index(one.role) if one.role in order else 99)
+    )
+
+
+def _issued(folder: Path) -> Issued | None:
+    path = folder / CERTIFICATE
+    if not path.exists():
+        return None
+    try:
+        certificate = load_certificate(path)
+    except ConfigError as error:
+        raise Refused(str(error)) from error
+    role, _, plant = name_of(certificate).partition(".")
+    return Issued(folder, role, plant, certificate)
+
+
+def _plant_of(authority: x509.Certificate) -> str:
+    return name_of(authority).partition(".")[2]
+
+
+def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
+    names: dict[str, x509.GeneralName] = {}
+    for host in hosts:
+        try:
+            address = ipaddress.ip_address(host)
+        except ValueError:
+            if not host.isascii() or not host or any(sign in host for sign in "/: "):
+                raise Refused(f"--host {host}: neither a name nor an address; no port, no protocol") from None
+            names[host.lower()] = x509.DNSName(host.lower())
+        else:
+            names[str(address)] = x509.IPAddress(address)
+    return list(names.values())
+
+
+def _authority(plant: str, key: ec.EllipticCurvePrivateKey) -> x509.Certificate:
+    # Two authorities of one plant are two names, so that who refuses the other's certificates can say so.
+    number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest.hex()
+    name = x509.Name(
+        [*_name(common_name(AUTHORITY_FOLDER, plant)), x509.NameAttribute(NameOID.SERIAL_NUMBER, number)]
+    )
+    return (
+        _dated(name, name, key.public_key(), AUTHORITY_DAYS)
+        # It signs these certificates and no further authority.
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs_certificates=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+
+
+def issue(
+    folder: Path,
+    name: str,
+    signer: ec.EllipticCurvePrivateKey,
+    authority: x509.Certificate,
+    days: float,
+    hosts: list[x509.GeneralName],
+) -> None:
+    """A new key and its certificate, named `name`, in `folder`. Who has hosts is a server too; all are clients."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    builder = _dated(_name(name), authority.subject, key.public_key(), days)
+    if hosts:
+        uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
+    certificate = (
+        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
+        .sign(signer, hashes.SHA256())
+    )
+    _write(folder / KEY, _pem(key))
+    _write(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
+    _write(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
+
+
+def _dated(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float
+) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - EARLY)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _folder(path: Path) -> None:
+    path.mkdir(mode=0o700, parents=True)
+    path.chmod(0o700)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Readable by the owner alone from the first byte, and whole or not at all."""
+    new = path.with_name(path.name + ".new")
+    new.unlink(missing_ok=True)
+    handle = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)

@@ -1,0 +1,1 @@
+"""`tandem sets`: certified sets, computed, checked and drawn."""

@@ -1,0 +1,119 @@
+"""A whole experiment: from its file to the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from lbmpc.plants import Plant
+from node_runtime.config.sections import Config, from_tree
+from node_runtime.config.strict import ConfigError
+from tandem.experiments.reporting.page import header, page
+from tandem.experiments.study import results
+from tandem.experiments.study.declaration import Declaration, Resolved, resolve
+from tandem.experiments.study.plan import code_version, rows
+from tandem.experiments.study.runner import run_all, time_all, wanted
+from tandem.experiments.study.work import write_whole
+
+DETAILED = ("trajectories", "recovery", "lemma")
+"""Pictures that need every sample."""
+REPEATS = 5
+
+Progress = Callable[[str, int, int], None]
+"""Told the stage, what is done and of how many."""
+
+
+class Finished(NamedTuple):
+    report: Path
+    summary: Path
+    logs: int
+    rows: list[results.Row]
+
+
+def run(
+    declared: Declaration,
+    where: str,
+    plant: Plant,
+    out: Path,
+    processes: int,
+    command: str,
+    quick: bool = False,
+    only: str | None = None,
+    repeats: int = REPEATS,
+    progress: Progress = lambda stage, done, total: None,
+) -> Finished:
+    """Run what is missing under `out`, time the solver, write the report and the summary.
+
+    Args:
+        declared: the experiment.
+        where: its file, for messages.
+        plant: what is controlled.
+        out: a folder; the runs it holds already are taken over where settings and code are the same.
+        processes: at the same time.
+        command: what the report says it was made with.
+        quick: fewer seeds, states and values.
+        only: one group instead of all.
+        repeats: timed runs of what the picture of the solver's time shows; one of everything else.
+        progress: told how far it is.
+
+    Raises:
+        ConfigError: the experiment or a configuration in it cannot be used.
+        RunnerError: a process was killed.
+        OSError: `out` cannot be written to.
+        KeyboardInterrupt: what was finished is kept.
+    """
+    cases = _chosen(declared, resolve(declared, plant, where, quick), only, where)
+    base = settings(declared, where)
+    detailed = {group.name for group in declared.group if group.picture in DETAILED}
+    logs = out / "logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    plans = list(rows(cases))
+    wants = wanted(plans, detailed, logs)
+    records = run_all(wants, out / "runs", processes, lambda done, total: progress("running", done, total))
+    shown = {group.name for group in declared.group if group.picture == "trajectories"}
+    timings = time_all(
+        cases,
+        lambda case: repeats if case.group in shown and not quick else 1,
+        declared.steps * base.period,
+        out / "timings",
+        lambda done, total: progress("timing the solver", done, total),
+    )
+    found = results.collect(plans, records, timings, plant)
+    code = code_version()
+    html = page(declared, found, plant, base, command, code, quick)
+    made = Finished(
+        out / "report.html",
+        out / "summary.json",
+        sum(want.log is not None for want in wants.values()),
+        [row for result in found for row in result.rows],
+    )
+    told = results.summary(found, header(declared, plant, command, code, processes, quick))
+    write_whole(made.report, html.encode())
+    write_whole(made.summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
+    return made
+
+
+def _chosen(declared: Declaration, cases: list[Resolved], only: str | None, where: str) -> list[Resolved]:
+    if only is None:
+        return cases
+    names = [group.name for group in declared.group]
+    if only not in names:
+        raise ConfigError(f"--only {only}: {where} has no such group; it has {', '.join(names)}")
+    return [case for case in cases if case.group == only]
+
+
+def settings(declared: Declaration, where: str) -> Config:
+    """The configuration that no case has changed. Raises `ConfigError`."""
+    return from_tree(dict(declared.base), where)
+
+
+def overview(declared: Declaration) -> dict[str, Any]:
+    """What `tandem experiment list` says of one."""
+    return {
+        "name": declared.name,
+        "title": declared.title,
+        "groups": [group.name for group in declared.group],
+    }

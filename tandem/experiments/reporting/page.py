@@ -1,0 +1,212 @@
+"""The report: one page that needs nothing else, from the results."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+
+from lbmpc.plants import Plant
+from node_runtime import provenance
+from node_runtime.config.sections import Config, to_toml
+from tandem.experiments.reporting import findings, pictures, style
+from tandem.experiments.study.declaration import Declaration, Group
+from tandem.experiments.study.results import CaseResult, spread
+
+
+class Drawn(NamedTuple):
+    uri: str
+    caption: str
+    alt: str
+
+
+class Table(NamedTuple):
+    head: list[str]
+    body: list[list[str]]
+    note: str
+
+
+class Part(NamedTuple):
+    """One group."""
+
+    name: str
+    title: str
+    about: str
+    command: str
+    claims: list[findings.Claim]
+    pictures: list[Drawn]
+    table: Table
+    words: list[str]
+
+
+class Page(NamedTuple):
+    """What the template is given besides the declaration."""
+
+    declared: Declaration
+    parts: list[Part]
+    config: str
+    machine: dict[str, str]
+    command: str
+    code: str
+    runs: int
+    quick: bool
+
+
+def page(
+    declared: Declaration,
+    results: list[CaseResult],
+    plant: Plant,
+    base: Config,
+    command: str,
+    code: str,
+    quick: bool,
+) -> str:
+    """The whole report as HTML.
+
+    Args:
+        declared: the experiment.
+        results: its cases, in order.
+        plant: what was controlled.
+        base: the configuration that no case has changed.
+        command: what made this.
+        code: version of the code, a hash.
+        quick: whether it is the short form.
+    """
+    parts = []
+    for group in declared.group:
+        own = [result for result in results if result.case.group == group.name]
+        if own:
+            parts.append(_part(group, own, plant, command))
+    loader = jinja2.PackageLoader("experiments", "")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    found = {
+        **provenance.describe(),
+        **provenance.versions(),
+        "load": f"{provenance.load():.1f} processes at the end",
+    }
+    whole = Page(
+        declared=declared,
+        parts=parts,
+        config=to_toml(base),
+        machine=found,
+        command=command,
+        code=code,
+        runs=sum(len(result.rows) for result in results),
+        quick=quick,
+    )
+    return environment.get_template("report.html.j2").render(page=whole)
+
+
+def _part(group: Group, results: list[CaseResult], plant: Plant, command: str) -> Part:
+    survival = group.picture == "survival"
+    drawn = [
+        Drawn(style.data_uri(one.figure), one.caption, one.alt)
+        for one in pictures.draw(group.picture, results, plant, group.reference)
+    ]
+    return Part(
+        name=group.name,
+        title=group.title,
+        about=" ".join(group.about.split()),
+        command=f"{command} --only {group.name}",
+        claims=findings.claims(results) if group.picture == "trajectories" else [],
+        pictures=drawn,
+        table=_survival_table(results) if survival else _table(results, plant),
+        words=findings.survival(results) if survival else findings.compare(results, group.reference),
+    )
+
+
+def _table(results: list[CaseResult], plant: Plant) -> Table:
+    """A row for each case: medians, worst cases."""
+    regret = any(row.regret is not None for result in results for row in result.rows)
+    state = plant.states[plant.performance[0]]
+    head = [
+        "case",
+        "runs",
+        "keep all constraints",
+        "cost",
+        *(["regret", "worst regret"] if regret else ["worst cost"]),
+        f"overshoot of {state}",
+        "worst",
+        "settles at step",
+        "infeasible ticks",
+        "solve p50 / p99 (ms)",
+    ]
+    body = []
+    for result in results:
+        worst = "regret" if regret else "cost"
+        times = "–"
+        if result.timing is not None:
+            spent = spread(result.timing)
+            times = f"{spent.p50:.2g} / {spent.p99:.2g}"
+        body.append(
+            [
+                result.label,
+                str(len(result.rows)),
+                f"{result.kept:.0%}",
+                _number(result.median("cost")),
+                *([_number(result.median("regret"))] if regret else []),
+                _number(float(result.values(worst).max())),
+                _number(result.median("overshoot"), 2),
+                _number(float(result.values("overshoot").max()), 2),
+                _settled(result),
+                _number(result.median("infeasible_ticks")),
+                times,
+            ]
+        )
+    note = (
+        "Cost, regret, overshoot, settling and infeasible ticks are medians over the runs; worst is the worst run. A "
+        "negative overshoot is the distance that was never closed. A run settles when z and y stay within 0.02. An "
+        "infeasible tick is one whose problem has no solution that keeps all tightened constraints, so that a soft one "
+        "gave way. Solve times were measured alone, from the plant's own x0, once for every oracle, horizon, network "
+        "and rate."
+    )
+    return Table(head, body, note)
+
+
+def _survival_table(results: list[CaseResult]) -> Table:
+    families = pictures.by_family(results)
+    places = pictures.margins(next(iter(families.values())))
+    body = [
+        [
+            pictures.family_label(members[0]),
+            str(len(members[0].rows)),
+            *(f"{member.kept:.0%}" for member in members),
+        ]
+        for members in families.values()
+    ]
+    return Table(
+        ["oracle", "runs", *(f"{place:g}" for place in places)], body, "Share of the runs kept, by margin."
+    )
+
+
+def _settled(result: CaseResult) -> str:
+    """The last sample of a run that is still off is none at which it has settled."""
+    step = result.median("settling_step")
+    return "not in time" if step >= result.case.steps else _number(step)
+
+
+def _number(value: float, digits: int = 3) -> str:
+    if not np.isfinite(value):
+        return "lost"
+    if value == round(value) and abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.{digits}g}"
+
+
+def header(
+    declared: Declaration, plant: Plant, command: str, code: str, jobs: int, quick: bool
+) -> dict[str, Any]:
+    """What `summary.json` says besides its rows."""
+    return {
+        "experiment": declared.name,
+        "quick": quick,
+        "plant": plant.name,
+        "command": command,
+        "code": code,
+        "machine": provenance.describe(),
+        "versions": provenance.versions(),
+        "processes": jobs,
+        "cores": os.cpu_count(),
+    }

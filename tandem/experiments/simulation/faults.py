@@ -1,0 +1,48 @@
+"""What goes wrong in a run: what the paper leaves out and a user meets."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from lbmpc.plants import Plant
+from node_runtime.config.sections import NonNegative, Section
+
+RAMP_PIECES = 20
+
+
+class Drift(Section, frozen=True):
+    """The true plant's parameters move, linearly in time, and stay where they arrive; no model is told."""
+
+    to: dict[str, float]
+    """Final values by name, of the plant's `parameters`."""
+    at: NonNegative
+    """Seconds."""
+    over: NonNegative = 0.0
+    """Seconds that it takes; 0: a step."""
+
+    def plants(self, plant: Plant) -> list[tuple[float, Plant]]:
+        """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
+        pieces = RAMP_PIECES if self.over > 0 else 1
+        made = []
+        for share in np.arange(1, pieces + 1) / pieces:
+            values = {
+                name: (1 - share) * plant.parameters.get(name, 0.0) + share * value
+                for name, value in self.to.items()
+            }
+            made.append((self.at + float(share) * self.over, plant.varied(**values)))
+        return made
+
+
+class Faults(Section, frozen=True):
+    """None by default."""
+
+    command_seconds: NonNegative = 0.0
+    """From a sample until the command that answers it acts, as live; less than a period."""
+    training_seconds: NonNegative = 0.0
+    """How long a training takes; none begins while one goes on."""
+    trainer_dies_at: NonNegative | None = None
+    """Seconds; what it had not sent by then is lost."""
+    noise: list[NonNegative] | None = None
+    """Standard deviation of what is measured of each state, in its unit."""
+    drift: Drift | None = msgspec.field(default=None)

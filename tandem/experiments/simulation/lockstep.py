@@ -1,0 +1,225 @@
+"""Lock-step simulation: the real controller, trainer and plant in one process, on a virtual clock.
+
+Deterministic for a seed: a tick's state is the plant's sample at exactly that time, its command acts from that time
+on and a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from controller_node.build import initial_state
+from controller_node.core import ControllerCore, Outputs
+from lbmpc.plants import Plant, PlantError
+from node_runtime.config.sections import Config, override
+from node_runtime.config.strict import ConfigError
+from node_runtime.realtime.scheduling import one_blas_thread
+from plant_sim.simulator import PlantSim
+from protocol import messages as m
+from protocol import topics
+from protocol.topics import Topic
+from run_log.reading.reader import Run, gather
+from tandem.experiments.simulation.faults import Faults
+
+if TYPE_CHECKING:
+    from trainer_node.training import Trainer
+
+Progress = Callable[[int], None]
+NO_FAULTS = Faults()
+CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run, whole or until the plant was lost."""
+
+    run: Run
+    """What a recorder would have seen; times are virtual and start at 0."""
+    lost: str | None
+    """Why the true motion could not be followed to the end; None when it could."""
+
+
+def simulate(config: Config, steps: int, adapt_only: bool = False, progress: Progress | None = None) -> Run:
+    """`follow`, without faults, of a plant that is not lost.
+
+    Args:
+        adapt_only: hidden layers are never trained.
+
+    Raises:
+        ConfigError: the configuration admits no controller.
+        PlantError: the true plant left every state from which its equations can be followed.
+    """
+    if adapt_only:
+        config = override(config, ["trainer.enabled=false"])
+    outcome = follow(config, steps, progress=progress)
+    if outcome.lost is not None:
+        raise PlantError(outcome.lost)
+    return outcome.run
+
+
+def follow(
+    config: Config, steps: int, faults: Faults = NO_FAULTS, progress: Progress | None = None
+) -> Outcome:
+    """Run `steps` periods from x0.
+
+    Args:
+        config: the resolved configuration.
+        steps: ticks.
+        faults: what goes wrong.
+        progress: told the number of finished steps.
+
+    Raises:
+        ConfigError: the configuration admits no controller, or the faults do not fit the plant.
+    """
+    with one_blas_thread():
+        return _LockStep(config, faults).run(steps, progress)
+
+
+class _LockStep:
+    def __init__(self, config: Config, faults: Faults):
+        self.config, self.faults = config, faults
+        self.core = ControllerCore(config, CONTROLLER)
+        x0 = initial_state(config, self.core.plant)
+        self.plant = PlantSim(self.core.plant, config.period, x0, config.plant.plan_patience, PLANT)
+        self.changes = self._changes()
+        self.noise = self._noise()
+        if faults.command_seconds >= config.period:
+            raise ConfigError(
+                f"faults.command_seconds = {faults.command_seconds:g} is not less than a period, {config.period:g} s"
+            )
+        self.draws = np.random.default_rng([config.seed, 0x4015E])
+        self.trainer = self._trainer() if config.trainer.enabled else None
+        self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
+        self.log: list[tuple[Topic, m.Message, int]] = []
+
+    def _changes(self) -> list[tuple[float, Plant]]:
+        if self.faults.drift is None:
+            return []
+        try:
+            return self.faults.drift.plants(self.core.plant)
+        except KeyError as error:
+            raise ConfigError(f"faults.drift: {error.args[0]}") from error
+
+    def _noise(self) -> np.ndarray | None:
+        noise, states = self.faults.noise, self.core.plant.d
+        if noise is not None and len(noise) != states:
+            raise ConfigError(f"faults.noise has {len(noise)} entries, the plant has {states} states")
+        return None if noise is None else np.array(noise)
+
+    def _trainer(self) -> Trainer | None:
+        snapshot = self.core.hidden_snapshot(-1)
+        if snapshot is None or self.core.description is None:
+            return None
+        # torch is imported only where there is a network to train.
+        from trainer_node.training import Trainer, use_one_thread
+
+        use_one_thread()
+        hidden = [layer.numpy().astype(float) for layer in snapshot.layers]
+        return Trainer(self.core.description, self.config.trainer, self.config.seed, TRAINER, hidden)
+
+    def run(self, steps: int, progress: Progress | None) -> Outcome:
+        self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
+        if (sets := self.core.certified_sets()) is not None:
+            self._note(topics.SETS, sets, 0)
+        self._note(topics.KEYFRAME, self.core.keyframe(-1), 0)
+        lost, seq = None, -1
+        try:
+            for seq in range(steps):
+                self._step(seq)
+                if progress is not None:
+                    progress(seq + 1)
+            self._note(topics.PLANT_STATE, self.plant.sample(steps * self.config.period), steps)
+        except PlantError as error:
+            lost = f"at step {seq} of {steps}: {error}"
+        if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
+            self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
+        return Outcome(gather(self.config, self.log), lost)
+
+    def _step(self, seq: int) -> None:
+        started = time.perf_counter()
+        t = seq * self.config.period
+        true = self.plant.sample(t)
+        while self.changes and self.changes[0][0] <= t + self.config.period / 2:
+            self.plant.change(self.changes.pop(0)[1])
+        self._note(topics.PLANT_STATE, true, seq)
+        state = self._measured(true)
+        weights = self._arriving(seq)
+        tick = m.Tick(
+            run_id=CONTROLLER,
+            seq=seq,
+            slot=seq,
+            t=t,
+            skipped=0,
+            lateness=0.0,
+            late=False,
+            state_verdict="fresh",
+            state=state,
+            weights=weights,
+        )
+        stepped = time.perf_counter()
+        outputs = self.core.step(tick)
+        timing = m.TickTiming(
+            run_id=CONTROLLER,
+            seq=seq,
+            solve_ms=self.core.solve_seconds * 1e3,
+            tick_ms=(time.perf_counter() - stepped) * 1e3,
+            lateness_ms=0.0,
+            state_age_ms=(stepped - started) * 1e3,
+        )
+        self.plant.command(outputs.command, t + self.faults.command_seconds)
+        for topic, message in (
+            (topics.TICK, tick),
+            (topics.COMMAND, outputs.command),
+            (topics.RESULT, outputs.result),
+            (topics.TIMING, timing),
+        ):
+            self._note(topic, message, seq)
+        self._learn(seq, outputs)
+        if (seq + 1) % self.config.controller.keyframe_every == 0:
+            self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
+
+    def _arriving(self, seq: int) -> m.HiddenWeights | None:
+        """The newest hidden weights that are here by now."""
+        weights = None
+        while self.on_the_way and self.on_the_way[0][0] <= seq:
+            weights = self.on_the_way.pop(0)[1]
+        return weights
+
+    def _learn(self, seq: int, outputs: Outputs) -> None:
+        if outputs.output_weights is not None:
+            self._note(topics.OUTPUT_WEIGHTS, outputs.output_weights, seq)
+        if outputs.sample is not None:
+            batch = m.Samples(run_id=CONTROLLER, seq=outputs.sample.seq, samples=[outputs.sample])
+            self._note(topics.SAMPLES, batch, seq)
+        if self.trainer is None or outputs.output_weights is None or self._trainer_is_dead(seq):
+            return
+        if outputs.sample is not None:
+            self.trainer.add(CONTROLLER, [outputs.sample])
+        if self.trainer.due() and not self.on_the_way:
+            weights = self.trainer.train(outputs.output_weights, CONTROLLER)
+            if weights is not None:
+                takes = max(1, math.ceil(self.faults.training_seconds / self.config.period - 1e-9))
+                if self._trainer_is_dead(seq + takes):
+                    return
+                self._note(topics.HIDDEN_WEIGHTS, weights, seq)
+                self.on_the_way.append((seq + takes, weights))
+
+    def _trainer_is_dead(self, seq: int) -> bool:
+        dies = self.faults.trainer_dies_at
+        return dies is not None and seq * self.config.period > dies
+
+    def _measured(self, true: m.PlantState) -> m.PlantState:
+        if self.noise is None:
+            return true
+        noisy = np.array(true.x) + self.noise * self.draws.standard_normal(len(self.noise))
+        return msgspec.structs.replace(true, x=noisy.tolist())
+
+    def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
+        self.log.append((topic, message, round(seq * self.config.period * 1e9)))

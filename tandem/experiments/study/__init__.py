@@ -1,0 +1,1 @@
+"""An experiment: its declaration, its runs and their results."""

@@ -1,0 +1,115 @@
+"""From cases to runs: each run once, however many rows show it, and a name for it that changes when its result may."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from node_runtime.config.sections import (
+    AdaptationConfig,
+    BusConfig,
+    Config,
+    L2nwConfig,
+    LogConfig,
+    NetworkConfig,
+    RealtimeConfig,
+    TrainerConfig,
+)
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.study.declaration import Resolved
+
+CODE = (
+    "network_model",
+    "lbmpc",
+    "protocol",
+    "controller_node",
+    "trainer_node",
+    "plant_sim",
+    "tandem/experiments/simulation/lockstep.py",
+)
+PACKAGES = ("numpy", "scipy", "casadi", "daqp", "torch")
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True):
+    """One run."""
+
+    config: Config
+    steps: int
+    faults: Faults
+
+    @property
+    def key(self) -> str:
+        """Of everything that its result depends on: settings and code."""
+        return hashlib.sha256(msgspec.json.encode(self) + code_version().encode()).hexdigest()[:24]
+
+
+class RowPlan(NamedTuple):
+    """One row of the results, the run behind it, and the run that is its floor."""
+
+    case: Resolved
+    seed: int
+    x0: list[float] | None
+    job: Job
+    floor: Job | None
+
+
+def rows(cases: list[Resolved]) -> Iterator[RowPlan]:
+    """Every case for every seed and initial state, in the order of the file."""
+    for case in cases:
+        for x0 in case.x0s:
+            for seed in case.seeds:
+                config = case.config_of(seed, x0)
+                yield RowPlan(case, seed, x0, _job(config, case), _floor(config, case))
+
+
+def _job(config: Config, case: Resolved) -> Job:
+    return Job(
+        config=_what_counts(config, case.faults), steps=case.steps, faults=_faults_that_count(config, case)
+    )
+
+
+def _floor(config: Config, case: Resolved) -> Job | None:
+    """The same run with the true h; None where the plant drifts, whose h no oracle here knows."""
+    if case.faults.drift is not None:
+        return None
+    controller = msgspec.structs.replace(config.controller, oracle="perfect")
+    return _job(msgspec.structs.replace(config, controller=controller), case)
+
+
+def _what_counts(config: Config, faults: Faults) -> Config:
+    """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
+    same = {"name": Config().name, "bus": BusConfig(), "log": LogConfig(), "realtime": RealtimeConfig()}
+    oracle = config.controller.oracle
+    if oracle != "l2nw":
+        same["l2nw"] = L2nwConfig()
+    if oracle != "dnn":
+        same |= {"network": NetworkConfig(), "adaptation": AdaptationConfig(), "trainer": TrainerConfig()}
+        if faults.noise is None:
+            same["seed"] = 0
+    return msgspec.structs.replace(config, **same)
+
+
+def _faults_that_count(config: Config, case: Resolved) -> Faults:
+    if config.controller.oracle == "dnn":
+        return case.faults
+    return msgspec.structs.replace(case.faults, training_seconds=0.0, trainer_dies_at=None)
+
+
+@cache
+def code_version() -> str:
+    """Hash of the code and the libraries that a result depends on."""
+    digest = hashlib.sha256()
+    root = Path(__file__).resolve().parents[3]
+    for name in CODE:
+        path = root / name
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
+    for package in PACKAGES:
+        digest.update(f"{package} {metadata.version(package)}\0".encode())
+    return digest.hexdigest()

@@ -1,0 +1,187 @@
+"""Runs what is not there yet, on all cores; then times the solver alone.
+
+A run is the same in any process, so neither the number of processes nor an interruption changes a figure.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from node_runtime.config.sections import AdaptationConfig, Config, PlantConfig
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow
+from tandem.experiments.study.declaration import Resolved
+from tandem.experiments.study.plan import Job, RowPlan
+from tandem.experiments.study.work import Record, read, work, write_whole
+
+Progress = Callable[[int, int], None]
+"""Told what is done and of how many."""
+
+
+class RunnerError(RuntimeError):
+    """The runs cannot go on; the text says why and what to do."""
+
+
+class Want(NamedTuple):
+    """One job, and what is wanted of it beyond its figures."""
+
+    job: Job
+    detail: bool
+    log: Path | None
+
+
+def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Want]:
+    """Every job once, floors too, by key. `detailed`: groups whose pictures show traces."""
+    wants: dict[str, Want] = {}
+
+    def want(job: Job, detail: bool, log: Path | None) -> None:
+        key = job.key
+        before = wants.get(key)
+        wants[key] = Want(
+            job,
+            detail or (before is not None and before.detail),
+            log or (before.log if before else None),
+        )
+
+    for plan in plans:
+        case = plan.case
+        name = f"{_file_name(case.name)}-seed{plan.job.config.seed}.mcap"
+        log = logs / name if case.log and plan.x0 is None else None
+        want(plan.job, case.group in detailed, log)
+        if plan.floor is not None:
+            want(plan.floor, False, None)
+    return wants
+
+
+def run_all(
+    wants: dict[str, Want], folder: Path, processes: int, progress: Progress | None = None
+) -> dict[str, Record]:
+    """Every job's record, by key; those that `folder` holds already are not run again.
+
+    Raises:
+        ConfigError: a configuration admits no controller.
+        RunnerError: a process was killed.
+        KeyboardInterrupt: after the runs that were under way have ended and been kept.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob("*.partial"):
+        leftover.unlink()
+    found = {key: read(folder / f"{key}.json", want.detail) for key, want in wants.items()}
+    missing = {
+        key: want
+        for key, want in wants.items()
+        if found[key] is None or (want.log is not None and not want.log.exists())
+    }
+    # Long ones first, or one of them would keep a single core busy at the end.
+    order = sorted(missing, key=lambda key: _effort(missing[key].job), reverse=True)
+    done = len(wants) - len(missing)
+    if progress is not None:
+        progress(done, len(wants))
+    with ProcessPoolExecutor(
+        processes, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent
+    ) as pool:
+        futures: list[Future[str]] = []
+        try:
+            for key in order:
+                want = missing[key]
+                futures.append(pool.submit(work, want.job, key, folder, want.detail, want.log))
+            for future in as_completed(futures):
+                future.result()
+                done += 1
+                if progress is not None:
+                    progress(done, len(wants))
+        except BrokenProcessPool as error:
+            raise RunnerError(
+                "a process of the experiment was killed, for want of memory perhaps; the finished runs are kept: "
+                "start the same command again, with fewer --jobs"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+    records = {key: read(folder / f"{key}.json", want.detail) for key, want in wants.items()}
+    lacking = [key for key, record in records.items() if record is None]
+    if lacking:
+        raise RunnerError(f"{folder}: {lacking[0]}.json was there and is gone or cannot be read; run again")
+    return {key: record for key, record in records.items() if record is not None}
+
+
+def _leave_ctrl_c_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _effort(job: Job) -> float:
+    learning = 5.0 if job.config.controller.oracle == "dnn" else 1.0
+    return job.steps * job.config.controller.horizon * learning
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_=." else "-" for c in name)
+
+
+# -- solve times ---------------------------------------------------------------------------------------------
+
+
+class Timing(msgspec.Struct, frozen=True):
+    """Solve times, (n,) milliseconds, of some runs of one problem."""
+
+    runs: list[list[float]]
+
+
+def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
+    """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
+    config = case.config
+    controller = msgspec.structs.replace(config.controller, W=None)
+    config = msgspec.structs.replace(
+        config, seed=seed, plant=PlantConfig(model=config.plant.model), controller=controller
+    )
+    if config.controller.oracle == "dnn":
+        trainer = msgspec.structs.replace(Config().trainer, enabled=True)
+        config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
+    steps = round(seconds * config.rate)
+    return Job(config=config, steps=steps, faults=Faults())
+
+
+def time_all(
+    cases: list[Resolved],
+    repeats: Callable[[Resolved], int],
+    seconds: float,
+    folder: Path,
+    progress: Progress | None = None,
+) -> dict[str, Timing]:
+    """Solve times by case name; one process, nothing beside it. Those in `folder` are taken as they are.
+
+    repeats: runs of a case, at least; seconds: of control in each.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    keys = {case.name: timing_job(case, 0, seconds).key for case in cases}
+    most = {keys[case.name]: 0 for case in cases}
+    for case in cases:
+        most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
+    by_key = {keys[case.name]: case for case in cases}
+    timings: dict[str, Timing] = {}
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent) as pool:
+        for done, (key, case) in enumerate(by_key.items()):
+            path = folder / f"{key}.json"
+            try:
+                timing = msgspec.json.decode(path.read_bytes(), type=Timing)
+            except (OSError, msgspec.DecodeError):
+                timing = Timing([])
+            while len(timing.runs) < most[key]:
+                times = pool.submit(_time, timing_job(case, len(timing.runs), seconds)).result()
+                timing = Timing([*timing.runs, times])
+                write_whole(path, msgspec.json.encode(timing))
+            timings[key] = timing
+            if progress is not None:
+                progress(done + 1, len(by_key))
+    return {case.name: timings[keys[case.name]] for case in cases}
+
+
+def _time(job: Job) -> list[float]:
+    return [timing.solve_ms for timing in follow(job.config, job.steps).run.timings]

@@ -1,0 +1,128 @@
+"""One run, in a process of its own: what it came to, in a file that appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from controller_node.build import build_oracle, build_plant
+from lbmpc.model import build_model
+from lbmpc.oracles import DnnOracle
+from node_runtime.config.sections import Config
+from run_log.reading.reader import Run
+from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
+from run_log.writing.save import save
+from tandem.experiments.simulation.lockstep import Outcome, follow
+from tandem.experiments.study.lemma import Lemma, measure
+from tandem.experiments.study.plan import Job
+
+
+class Traces(msgspec.Struct, frozen=True, kw_only=True):
+    """n samples, from the start on."""
+
+    x: list[list[float]]
+    """(n, p) the plant's performance states, its own units."""
+    u: list[list[float]]
+    """(n - 1, m) commanded."""
+    error: list[float | None]
+    """(n - 1,) |h_hat - h| of the step that ended at each tick."""
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What one run came to; it depends on the job and the code alone."""
+
+    job: Job
+    lost: str | None
+    """Why the true motion could not be followed to the end."""
+    cost: float | None
+    """Sum of the squared deviations of the performance states; None where the plant was lost, as for the next two."""
+    overshoot: float | None
+    settling_step: int | None
+    violations: int
+    """Samples outside X or U by more than 1e-6."""
+    infeasible_ticks: int
+    """Ticks whose problem has no solution that keeps all constraints: slack was needed, or the solver failed."""
+    weights_adopted: int
+    error_first: float | None
+    error_last: float | None
+    """Mean prediction error in the first and the last second."""
+    traces: Traces | None
+    lemma: Lemma | None
+
+    @property
+    def kept(self) -> bool:
+        """All constraints, all the time, on the true plant."""
+        return self.lost is None and self.violations == 0
+
+
+def work(job: Job, key: str, folder: Path, detail: bool, log: Path | None) -> str:
+    """Run `job` and write `folder`/`key`.json, and its log. Returns the key.
+
+    Raises:
+        ConfigError: the job's configuration admits no controller.
+    """
+    outcome = follow(job.config, job.steps, job.faults)
+    if log is not None:
+        partial = log.with_suffix(".partial")
+        partial.unlink(missing_ok=True)
+        save(outcome.run, partial)
+        partial.replace(log)
+    write_whole(folder / f"{key}.json", msgspec.json.encode(record(job, outcome, detail)))
+    return key
+
+
+def record(job: Job, outcome: Outcome, detail: bool) -> Record:
+    run, lost = outcome.run, outcome.lost
+    summary = summarise(run)
+    return Record(
+        job=job,
+        lost=lost,
+        cost=None if lost else summary.cost,
+        overshoot=None if lost else summary.overshoot,
+        settling_step=None if lost else summary.settling_step,
+        violations=summary.constraint_violations,
+        infeasible_ticks=sum(
+            r.slack > SOFT or r.mode != "solver" or r.status == "infeasible" for r in run.results
+        ),
+        weights_adopted=summary.weights_adopted,
+        error_first=summary.prediction_error.first_second,
+        error_last=summary.prediction_error.last_second,
+        traces=_traces(run) if detail else None,
+        lemma=_lemma(run, job.config) if detail else None,
+    )
+
+
+def _traces(run: Run) -> Traces:
+    plant = plant_of(run)
+    x = trajectory(run, plant).x[:, list(plant.performance)]
+    return Traces(
+        x=x.tolist(),
+        u=[result.u for result in run.results],
+        error=[result.prediction_error for result in run.results],
+    )
+
+
+def _lemma(run: Run, config: Config) -> Lemma | None:
+    settings = config.controller
+    weights = (None if w is None else np.array(w, dtype=float) for w in (settings.Q, settings.R))
+    oracle = build_oracle(config, build_model(build_plant(config), config.period, *weights))
+    return measure(run, oracle) if isinstance(oracle, DnnOracle) else None
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Under its name only when all of it is there."""
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    partial.write_bytes(data)
+    partial.replace(path)
+
+
+def read(path: Path, detail: bool) -> Record | None:
+    """A finished run; None where there is none, or not all that is wanted of it."""
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=Record)
+    except (OSError, msgspec.DecodeError):
+        return None
+    return found if found.traces is not None or not detail else None

@@ -1,0 +1,1 @@
+"""`tandem run`: its processes, watched and shown."""

@@ -1,0 +1,50 @@
+"""What runs in a process that `tandem run` starts: a tandem command that ends when its supervisor does.
+
+    python -m tandem.live.child SUPERVISOR_PID COMMAND...
+
+A supervisor that is killed cannot stop its children, so they watch it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+import time
+
+GRACE_S = 5.0
+
+
+def end_with(parent: int, grace_s: float = GRACE_S) -> None:
+    """Have this process end, first politely, when the process `parent` does. Ends it now if that is gone."""
+    try:
+        handle = os.pidfd_open(parent)
+    except ProcessLookupError:
+        raise SystemExit(1) from None
+    if os.getppid() != parent:  # it died, and its number was given to somebody else
+        raise SystemExit(1)
+
+    def watch() -> None:
+        poll = select.poll()
+        poll.register(handle, select.POLLIN)
+        poll.poll()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(grace_s)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, name="supervisor", daemon=True).start()
+
+
+def main() -> int:
+    # The supervisor's own priority is not for all: each process takes what it needs.
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    end_with(int(sys.argv[1]))
+    from tandem.cli import main as tandem
+
+    return tandem(sys.argv[2:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

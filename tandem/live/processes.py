@@ -1,0 +1,114 @@
+"""The table of processes that make up a run, and one running process of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+TAIL_LINES = 15
+
+
+@dataclass(frozen=True)
+class Process:
+    """One row of the table."""
+
+    name: str
+    """As in `protocol.topics.PROCESSES`."""
+    command: str
+    """The tandem command that it runs."""
+    when_it_dies: Literal["end the run", "go on", "restart"]
+    ready_s: float
+    """How long it may take until it says that it is ready."""
+    slow_because: str = ""
+    """What a person who waits should know."""
+
+
+# In the order of starting. The controller comes last: learning starts with its first tick.
+TABLE = (
+    Process("router", "router", "end the run", 15.0),
+    Process("recorder", "record", "go on", 30.0),
+    Process("trainer", "trainer", "restart", 60.0, "it loads torch"),
+    Process("plant", "plant", "end the run", 30.0),
+    Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
+)
+# The recorder hears the others' last words; the router carries them.
+STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
+BY_NAME = {process.name: process for process in TABLE}
+
+
+class Child:
+    """A process of the table, running in a process group of its own, its output in a file."""
+
+    def __init__(self, process: Process, config: Path, folder: Path):
+        """config: the TOML file it reads; folder: where its output goes."""
+        self.process = process
+        self.output = folder / f"{process.name}.txt"
+        self.starts = 0
+        self._command = [
+            *(sys.executable, "-m", "tandem.live.child", str(os.getpid())),
+            *(process.command, "--config", str(config)),
+        ]
+        self._running: subprocess.Popen[bytes] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.process.name
+
+    @property
+    def pid(self) -> int | None:
+        return None if self._running is None else self._running.pid
+
+    def start(self) -> None:
+        """Start it, for the first time or again; output is appended."""
+        self.starts += 1
+        with self.output.open("ab") as output:
+            self._running = subprocess.Popen(
+                self._command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                process_group=0,  # Ctrl-C is the supervisor's to handle
+            )
+
+    def exit_code(self) -> int | None:
+        """None while it runs, and before it was started."""
+        return None if self._running is None else self._running.poll()
+
+    def alive(self) -> bool:
+        return self._running is not None and self._running.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to its whole process group, if it runs."""
+        if self._running is not None and self._running.poll() is None:
+            # Not reaped yet, so the number is still its own.
+            os.killpg(self._running.pid, number)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it has ended, after at most `timeout_s`."""
+        if self._running is None:
+            return True
+        try:
+            self._running.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def how_it_ended(self) -> str:
+        """ "exit code 1" or "killed by SIGKILL"."""
+        code = self.exit_code()
+        if code is not None and code < 0:
+            return f"killed by {signal.Signals(-code).name}"
+        return f"exit code {code}"
+
+    def last_words(self) -> str:
+        """The last lines of its output, indented."""
+        try:
+            lines = self.output.read_text(errors="replace").splitlines()
+        except OSError:
+            return ""
+        return "\n".join(f"    {text}" for text in lines[-TAIL_LINES:])

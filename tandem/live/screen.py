@@ -1,0 +1,52 @@
+"""Where a live run is shown: a full view on a terminal, one line a second anywhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+
+from tandem.live import view
+from tandem.live.monitor import Event, Snapshot
+
+
+class Screen:
+    """A context manager; `show` may be called as often as one likes."""
+
+    def __init__(self, console: Console, new_events: Callable[[], list[Event]]):
+        self._console = console
+        self._new_events = new_events
+        self._live: Live | None = None
+        self._second: int | None = None
+        if console.is_terminal:
+            self._live = Live(console=console, auto_refresh=False, transient=False, vertical_overflow="crop")
+
+    def show(self, now: Snapshot) -> None:
+        """Bring the screen up to date."""
+        if self._live is not None:
+            width, height = self._console.size
+            self._live.update(view.render(now, width, height - 1), refresh=True)
+            return
+        for event in self._new_events():
+            at = "          " if event.at < 0 else f"{event.at:6.1f} s  "
+            self._plain(f"{at}{event.text}")
+        second = int(now.elapsed) if now.elapsed is not None else None
+        if second is not None and second != self._second:
+            self._second = second
+            self._plain(view.line(now))
+
+    def _plain(self, text: str) -> None:
+        self._console.print(text, markup=False, soft_wrap=True)
+
+    def __enter__(self) -> Screen:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()

@@ -1,0 +1,312 @@
+"""`tandem run`: start every process of the table, watch them, stop them in order, whatever happens."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
+from node_runtime.config.sections import Config
+from node_runtime.lifecycle import new_run_id
+from tandem.live.monitor import Monitor, Snapshot
+from tandem.live.processes import BY_NAME, STOP_ORDER, TABLE, Child
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# One Ctrl-C may arrive twice (`timeout`, a shell's process group): still one wish.
+SAME_WISH_S = 0.3
+STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
+BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
+LONG_LIFE_S = 20.0
+SHOW_S = 0.2
+GRACE_S = 0.5
+EXPLAIN_S = 5.0
+
+Show = Callable[[Snapshot], None]
+
+
+class Impatient(BaseException):
+    """The person asked a second time: end everything now."""
+
+
+class StartError(RuntimeError):
+    """A process did not get ready. `exit_code` is its own, None when it still ran or was killed."""
+
+    def __init__(self, text: str, exit_code: int | None = None):
+        super().__init__(text)
+        self.exit_code = exit_code
+
+
+@dataclass
+class Wish:
+    """What the person's signals ask for."""
+
+    stop: bool = False
+    since: float = 0.0
+
+
+@contextmanager
+def wishes() -> Iterator[Wish]:
+    """SIGINT, SIGTERM and SIGHUP set `stop`; a second one raises `Impatient` wherever the program is."""
+    wish = Wish()
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if not wish.stop:
+            wish.stop, wish.since = True, now
+        elif now - wish.since > SAME_WISH_S:
+            raise Impatient
+
+    before = {number: signal.signal(number, handle) for number in SIGNALS}
+    try:
+        yield wish
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Supervisor:
+    """Runs the table once. `run` returns why the run ended badly, or None; nothing is left running after it.
+
+    Args:
+        config: what every process gets; its endpoint must be free to listen on.
+        config_file: the same as TOML, for the processes.
+        folder: where the processes' output goes.
+        monitor: is fed with everything on the bus.
+        wish: when to stop.
+        show: is called about five times a second with what there is to see.
+        trainer: False: none is started, for it runs elsewhere.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        config_file: Path,
+        folder: Path,
+        monitor: Monitor,
+        wish: Wish,
+        show: Show,
+        trainer: bool = True,
+    ):
+        self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
+        table = [process for process in TABLE if process.name != "trainer" or (trainer and trains(config))]
+        self.children = {process.name: Child(process, config_file, folder) for process in table}
+        self._bus: Bus | None = None
+        self._mailbox: Mailbox | None = None
+        self._next_show = 0.0
+        self._end: Snapshot | None = None
+        self._restart_at: dict[str, float] = {}
+        self._started_at: dict[str, float] = {}
+        self._deaths: dict[str, int] = {}
+        self.recorder_died = False
+
+    def run(self) -> str | None:
+        """Start, watch, stop. Raises `StartError`, and `Impatient` after everything was killed."""
+        try:
+            try:
+                self._start_all()
+                trouble = None if self.wish.stop else self._watch()
+            except StartError:
+                self._stop_all()
+                raise
+            self._stop_all()
+            return trouble
+        finally:
+            self._kill_all()
+            if self._bus is not None:
+                self._bus.close(drain_s=0.5)
+
+    # -- starting ----------------------------------------------------
+
+    def _start_all(self) -> None:
+        self._start("router")
+        self._connect()
+        early = [name for name in self.children if name not in ("router", "controller")]
+        for name in early:
+            self._start(name)
+        for name in early:
+            self._await_ready(name)
+        self._start("controller")
+        self._await_ready("controller")
+
+    def _start(self, name: str) -> None:
+        if not self.wish.stop:
+            self.monitor.forget(name)
+            self.children[name].start()
+            self._started_at[name] = time.monotonic()
+
+    def _connect(self) -> None:
+        """Become a client of the router; whether it listens is seen by that."""
+        stop = threading.Event()
+        bus = Bus(self.config, "monitor", new_run_id("monitor"), stop)
+        opened = threading.Event()
+
+        def connect() -> None:
+            try:
+                bus.open()
+            except (OpenInterrupted, ValueError):
+                return
+            opened.set()
+
+        threading.Thread(target=connect, name="connect", daemon=True).start()
+        deadline = time.monotonic() + BY_NAME["router"].ready_s
+        try:
+            while not opened.wait(0.02) and not self.wish.stop:
+                self._fail_if_dead("router")
+                if time.monotonic() > deadline:
+                    raise self._not_ready(self.children["router"], "nobody answers at its endpoint")
+        finally:
+            stop.set()
+        if opened.is_set():
+            self._bus, self._mailbox = bus, bus.everything()
+
+    def _await_ready(self, name: str) -> None:
+        child = self.children[name]
+        self.monitor.phase = f"the {name}"
+        deadline = time.monotonic() + child.process.ready_s
+        explain_at = time.monotonic() + EXPLAIN_S
+        while self.monitor.status(name) not in ("ready", "running") and not self.wish.stop:
+            if child.process.slow_because and time.monotonic() > explain_at:
+                explain_at = math.inf
+                self.monitor.phase = f"the {name}: {child.process.slow_because}"
+                self.monitor.say(self.monitor.phase, time.monotonic())
+            self._fail_if_dead(*self.children)
+            if time.monotonic() > deadline:
+                said = self.monitor.status(name)
+                raise self._not_ready(child, f"its last word was {said!r}" if said else "it said nothing")
+            self._listen()
+        if not self.wish.stop:
+            now = time.monotonic()
+            self.monitor.say(f"{name} ready after {now - self._started_at[name]:.1f} s", now)
+
+    def _fail_if_dead(self, *names: str) -> None:
+        for name in names:
+            child = self.children[name]
+            if child.exit_code() is not None:
+                raise self._not_ready(child, f"it ended with {child.how_it_ended()}")
+
+    def _not_ready(self, child: Child, why: str) -> StartError:
+        waited = time.monotonic() - self._started_at[child.name]
+        text = f"the {child.name} did not get ready within {waited:.0f} s: {why}"
+        words = child.last_words()
+        return StartError(f"{text}\n{words}" if words else text, child.exit_code())
+
+    # -- watching ----------------------------------------------------
+
+    def _watch(self) -> str | None:
+        """Until the time is over, or the person asks, or a process without which nothing goes on has died."""
+        self.monitor.phase = ""
+        slots = max(1, round(self.monitor.seconds * self.config.rate))
+        waiting_since = time.monotonic()
+        while not self.wish.stop:
+            first = self.monitor.first_command
+            # The last slot says it exactly, the clock in any case.
+            if self.monitor.slots >= slots:
+                return None
+            if first is not None and time.monotonic() >= first + self.monitor.seconds + GRACE_S:
+                return None
+            if first is None and time.monotonic() > waiting_since + 30.0:
+                return "the controller is ready, but no command came for 30 s"
+            for child in self.children.values():
+                if child.exit_code() is not None:
+                    trouble = self._died(child)
+                    if trouble is not None:
+                        return trouble
+            self._listen()
+        return None
+
+    def _died(self, child: Child) -> str | None:
+        """What to do about a process that has ended: text that ends the run, or None to go on."""
+        process, now = child.process, time.monotonic()
+        if process.when_it_dies == "end the run":
+            return f"the {child.name} died ({child.how_it_ended()})\n{child.last_words()}"
+        if process.when_it_dies == "go on":
+            if not self.recorder_died:
+                self.recorder_died = True
+                self.monitor.ended(child.name)
+                text = f"NOT LOGGED from here on: the {child.name} died ({child.how_it_ended()})"
+                self.monitor.say(f"{text}; the loop goes on", now, "bad")
+            return None
+        if child.name not in self._restart_at:
+            if now - self._started_at[child.name] > LONG_LIFE_S:
+                self._deaths[child.name] = 0
+            deaths = self._deaths.get(child.name, 0)
+            wait = BACKOFF_S[min(deaths, len(BACKOFF_S) - 1)]
+            self._deaths[child.name] = deaths + 1
+            self._restart_at[child.name] = now + wait
+            self.monitor.ended(child.name)
+            self.monitor.say(
+                f"the {child.name} died ({child.how_it_ended()}); started again in {wait:g} s", now, "bad"
+            )
+        elif now >= self._restart_at[child.name]:
+            del self._restart_at[child.name]
+            self._start(child.name)
+        return None
+
+    def _listen(self, timeout_s: float = 0.02) -> None:
+        """Take what arrives within a little time, together, and show it now and then."""
+        time.sleep(timeout_s)
+        if self._mailbox is not None:
+            self.monitor.feed_all(self._mailbox.drain())
+        now = time.monotonic()
+        if self._end is None and now >= self._next_show:
+            self._next_show = now + SHOW_S
+            self._show(self.monitor.snapshot(now))
+
+    # -- stopping ----------------------------------------------------
+
+    def _stop_all(self) -> None:
+        """In order, politely, then not. The screen keeps the last moment of the run."""
+        ended = time.monotonic()
+        last = self._end = self.monitor.snapshot(ended)
+        for name in STOP_ORDER:
+            child = self.children.get(name)
+            if child is None or not child.alive():
+                continue
+            child.signal(signal.SIGTERM)
+            self._show(dataclasses.replace(last, phase=f"the {name} to stop"))
+            deadline = time.monotonic() + STOP_S[name]
+            while child.alive() and time.monotonic() < deadline:
+                self._listen(0.01)
+            if child.alive():
+                child.signal(signal.SIGKILL)
+                self.monitor.say(
+                    f"the {name} did not stop within {STOP_S[name]:g} s and was killed",
+                    time.monotonic(),
+                    "bad",
+                )
+                self.recorder_died |= name == "recorder"
+            elif child.exit_code() != 0:
+                self.monitor.say(f"the {name} ended with {child.how_it_ended()}", time.monotonic(), "bad")
+                self.recorder_died |= name == "recorder"
+        # With what was still on its way: the last tick, and anything that went wrong in stopping.
+        frozen = ("states", "inputs", "source", "processes", "phase")
+        self._show(
+            dataclasses.replace(
+                self.monitor.snapshot(ended), **{name: getattr(last, name) for name in frozen}
+            )
+        )
+
+    def _kill_all(self) -> None:
+        """Whatever still runs. Signals are ignored meanwhile, so that nothing interrupts this."""
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in SIGNALS}
+        try:
+            for child in self.children.values():
+                child.signal(signal.SIGKILL)
+            for child in self.children.values():
+                child.wait(5.0)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def trains(config: Config) -> bool:
+    """Whether there is anything for a trainer to do."""
+    return config.controller.oracle == "dnn" and config.trainer.enabled

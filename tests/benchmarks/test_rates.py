@@ -1,0 +1,34 @@
+"""The table of rates says what was measured, and goes nowhere but between its marks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.live import rates
+from benchmarks.live.rates import COLUMNS, MARKS, Rates
+
+
+def test_a_document_without_marks_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "rates.md"
+    page.write_text("nothing here\n")
+    assert rates.main(Rates(document=page)) == 2
+    assert page.read_text() == "nothing here\n"
+    assert MARKS.begin in capsys.readouterr().err
+
+
+def test_the_table_goes_between_the_marks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "rates.md"
+    page.write_text(f"before\n{MARKS.begin}\nold\n{MARKS.end}\nafter\n")
+    row = ["x"] * len(COLUMNS)
+    monkeypatch.setattr(rates, "_row", lambda _settings, _rate, _mode, _log: row)
+    assert rates.main(Rates(rates=(20, 1000), document=page)) == 0
+    text = page.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    assert text.count(f"| {' | '.join(row)} |") == 4
+    assert text.partition(MARKS.begin)[2].partition(MARKS.end)[0].strip() == capsys.readouterr().out.strip()

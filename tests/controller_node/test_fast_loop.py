@@ -1,0 +1,211 @@
+"""What changes in a fast loop: what a tick publishes and when, how far it lies behind its sample."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from benchmarks.live.wakeups import Wakeups, measure
+from controller_node.core import ControllerCore
+from controller_node.node import COUNTS, ControllerNode, Latched, phase
+from network_model.description import hash_layers
+from node_runtime.bus.inbox import Received
+from node_runtime.bus.mailbox import Mailbox
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import Config, override
+from node_runtime.health import HealthPublisher
+from node_runtime.realtime.pacer import Slot
+from node_runtime.rejected import BadMessages
+from protocol import codec, topics
+from protocol import messages as m
+from protocol.topics import Topic
+from trainer_node.node import NAMES, TRAIN_EVERY, TrainerNode
+
+
+class BusThatWritesDown:
+    """In place of a bus: what would be published, in order."""
+
+    def __init__(self, config: Config):
+        self.config = config
+        self.bad = BadMessages()
+        self.said: list[tuple[str, m.Message | None]] = []
+
+    def queue(self, topic: Topic, capacity: int) -> Mailbox:
+        return Mailbox(topic.name, capacity)
+
+    def serve(self, name: str, handler: object) -> None:
+        pass
+
+    def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
+        return []
+
+    def publish(self, topic: Topic, message: m.Message) -> None:
+        self.said.append((topic.name, message))
+
+    def seqs(self, topic: Topic) -> list[int]:
+        return [message.seq for name, message in self.said if name == topic.name and message is not None]
+
+
+class Loop:
+    """A controller's node without a clock; `tick` is one turn."""
+
+    def __init__(self, *assignments: str):
+        small = ("controller.horizon=4", "network.hidden=[4]", "controller.solver.compile=never")
+        config = override(Config(), [*small, *assignments])
+        self.bus = BusThatWritesDown(config)
+        self.core = ControllerCore(config, "controller-a")
+        prepare = self.core.prepare
+
+        def noted() -> None:
+            self.bus.said.append(("prepare", None))
+            prepare()
+
+        self.core.prepare = noted  # type: ignore[method-assign]
+        self.node = ControllerNode(
+            self.core, cast(Bus, self.bus), cast(HealthPublisher, None), dict.fromkeys(COUNTS, 0)
+        )
+
+    def tick(self, times: int = 1) -> None:
+        for _ in range(times):
+            k, period, plant = self.node._seq + 1, self.core.config.period, self.core.plant
+            state = m.PlantState(
+                run_id="plant-a",
+                seq=k,
+                t=k * period,
+                x=plant.x_e.tolist(),
+                applied=plant.u_e.tolist() if k else None,
+                source="command",
+                command_seq=k - 1,
+            )
+            received = Received(state, k * period, k * period)
+            self.node._tick(Slot(k, k * period, 0), 0.0, Latched("fresh", received, 0.0))
+
+
+def test_ticks_commands_and_results_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
+    loop = Loop("rate=1000")
+    loop.tick(250)
+    for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.TIMING):
+        assert loop.bus.seqs(topic) == list(range(250))
+    assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == list(range(0, 250, 20))
+    # Samples travel a tenth of a second together.
+    assert loop.bus.seqs(topics.SAMPLES) == [99, 199]
+
+
+def test_at_twenty_hertz_every_tick_says_everything() -> None:
+    loop = Loop("rate=20")
+    loop.tick(11)
+    assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == list(range(11))
+    assert loop.bus.seqs(topics.SAMPLES) == [4, 9]
+
+
+def test_the_trainer_hears_of_an_adoption_at_once() -> None:
+    loop = Loop("rate=1000", "adaptation.trial.enabled=false")
+    loop.tick(5)
+    description = loop.core.description
+    assert description is not None
+    layers = [np.full(shape, 0.125) for shape in description.layer_shapes]
+    loop.node._weights = m.HiddenWeights(
+        run_id="trainer-a",
+        seq=1,
+        for_run="controller-a",
+        trained_on=0,
+        base_sha256="",
+        samples=1,
+        loss_before=1.0,
+        loss_after=0.5,
+        network_sha256=description.sha256(),
+        sha256=hash_layers(layers),
+        layers=[m.Array.of(layer, "<f4") for layer in layers],
+    )
+    loop.tick(5)
+    assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == [0, 5]
+
+
+@pytest.mark.parametrize(("rate", "times"), [("20.0", 3), ("100.0", 3), ("200.0", 0)])
+def test_a_backup_follows_each_command_where_there_is_time(rate: str, times: int) -> None:
+    loop = Loop(f"rate={rate}")
+    loop.tick(3)
+    assert loop.bus.seqs(topics.BACKUP) == list(range(times))
+    names = [name for name, _ in loop.bus.said]
+    assert all(names[names.index(topics.BACKUP.name) - 1] == topics.COMMAND.name for _ in range(times))
+
+
+def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else() -> None:
+    loop = Loop("controller.solver.mode=real_time", "controller.backup.enabled=false")
+    loop.tick(3)
+    loop.bus.said.clear()
+    loop.tick()
+    assert [name for name, _ in loop.bus.said][:3] == [topics.COMMAND.name, "prepare", topics.TICK.name]
+    assert loop.core.controller._prepared_for is loop.core.state
+
+
+def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = override(Config(), ["rate=1000"])
+    bus, counts = cast(Bus, BusThatWritesDown(config)), dict.fromkeys(NAMES, 0)
+    node = TrainerNode(config, bus, cast(HealthPublisher, None), counts)
+    began: list[float] = []
+    monkeypatch.setattr(node, "_may_train", lambda: True)
+    monkeypatch.setattr(node, "_must_join", lambda: False)
+    for now in (10.0 + 0.02 * k for k in range(100)):
+        node.listen(now)
+        if node.waits_since(now) is not None:
+            began.append(now)
+            node.rest(now, took=0.01)
+    assert len(began) == pytest.approx(2.0 / TRAIN_EVERY, abs=1)
+    assert min(np.diff(began)) >= TRAIN_EVERY - 1e-9
+    # At 20 Hz, ten samples take longer than that: nothing is held back there.
+    assert Config().trainer.train_every * Config().period > TRAIN_EVERY
+
+
+@pytest.mark.parametrize(
+    ("assignments", "seconds"),
+    [(["rate=20"], 1e-3), (["rate=1000"], 2.5e-4), (["rate=1000", "controller.phase_ms=0.3"], 3e-4)],
+)
+def test_a_slot_lies_a_millisecond_behind_its_sample_or_a_quarter_of_a_period(
+    assignments: list[str], seconds: float
+) -> None:
+    assert phase(override(Config(), assignments)) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(("rate", "every"), [(1, 1), (20, 1), (50, 1), (51, 2), (100, 2), (1000, 20)])
+def test_a_limit_in_the_topic_table_is_kept(rate: float, every: int) -> None:
+    assert topics.OUTPUT_WEIGHTS.every(1 / rate) == every
+    assert topics.TICK.every(1 / rate) == 1
+
+
+def command(*plan: float) -> m.Command:
+    entries = [[value] for value in plan]
+    return m.Command(
+        run_id="c",
+        seq=0,
+        state_run_id="p",
+        state_seq=0,
+        period=1.0,
+        mode="solver",
+        u=entries[0],
+        plan=entries,
+    )
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("place", [0, 1, 19])
+def test_one_number_that_is_not_finite_is_found_wherever_it_is(bad: float, place: int) -> None:
+    plan = [1.0] * 20
+    plan[place] = bad
+    with pytest.raises(codec.BadMessage, match="not finite"):
+        codec.decode(topics.COMMAND, codec.encode(command(*plan)))
+
+
+def test_numbers_whose_sum_overflows_are_finite_all_the_same() -> None:
+    message = command(*[1e308] * 20)
+    assert codec.decode(topics.COMMAND, codec.encode(message)) == message
+
+
+def test_the_empty_loop_counts_every_slot() -> None:
+    found = measure(Wakeups(rate=200.0, seconds=0.1, priority=0))
+    assert found["slots"] >= 20
+    assert 0.0 <= found["off_percent"] <= 100.0

@@ -1,1 +1,0 @@
-"""The fault suite: real processes, one fault at a random moment, and what held. `python -m tests.faults --help`."""

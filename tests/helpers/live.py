@@ -1,0 +1,140 @@
+"""For tests with real processes over a real router on loopback: free ports, processes, waiting for a message.
+
+A machine takes its cores away for a while, now and then, and other work may take a share of them. So a test here waits
+for what must come, and compares orders and the stamps that the processes themselves give; how long something took is
+for `make faults` and `make bench`. A limit only ends a hang.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+
+from node_runtime.bus.zenoh_bus import Bus, Mailbox
+from node_runtime.config.sections import Config, override, to_json
+from node_runtime.realtime import clock
+from protocol import codec
+from protocol import messages as m
+from protocol.topics import Topic, topic_of
+
+PROGRAM = (
+    "import logging, sys; logging.basicConfig(format='%(message)s', level='INFO');"
+    "from node_runtime.config.sections import from_json; from {module} import main;"
+    "sys.exit(main(from_json(sys.argv[1])))"
+)
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def live_config(*assignments: str) -> Config:
+    """Defaults on a free port, at ordinary priority, with `section.key=value` assignments.
+
+    A link is cut after half a minute of silence only: a process without a core says nothing. What ends closes its link.
+    """
+    patient = "bus.lease_ms=30000"
+    return override(
+        Config(), [f'bus.endpoint="{free_endpoint()}"', "realtime.priority=0", patient, *assignments]
+    )
+
+
+HANG_S = 60.0
+"""Nobody waits longer than this for something that must come."""
+
+
+class Process:
+    """One node in a process of its own; always ended at the end of the block."""
+
+    def __init__(self, module: str, config: Config):
+        self._popen = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM.format(module=module), to_json(config)],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.said = ""
+
+    def signal(self, number: signal.Signals) -> None:
+        self._popen.send_signal(number)
+
+    def lines(self) -> Iterator[str]:
+        """What the process says, line by line, while it runs."""
+        assert self._popen.stderr is not None
+        return iter(self._popen.stderr)
+
+    def end(self, timeout_s: float = HANG_S) -> int:
+        """Wait for the end; the exit code. What the process said is in `said` afterwards."""
+        _, self.said = self._popen.communicate(timeout=timeout_s)
+        return self._popen.returncode
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._popen.poll() is None:
+            self._popen.kill()
+            self._popen.communicate()
+
+
+class Ear:
+    """Remembers every message that it hears, in order of arrival."""
+
+    def __init__(self, bus: Bus):
+        self._mailbox: Mailbox = bus.everything()
+        self.heard: list[tuple[str, m.Message]] = []
+
+    def listen(self, timeout_s: float = 0.0) -> m.Message | None:
+        """Hear one more message of a topic that we know and that decodes."""
+        while (delivery := self._mailbox.get(timeout_s)) is not None:
+            topic = topic_of(delivery.key)
+            if topic is None:
+                continue
+            try:
+                message = codec.decode(topic, delivery.payload)
+            except codec.BadMessage:
+                continue
+            self.heard.append((topic.name, message))
+            return message
+        return None
+
+    def until(self, wanted: Callable[[m.Message], bool], timeout_s: float = HANG_S) -> m.Message:
+        """Hear on until a message is the wanted one."""
+        deadline = clock.now() + timeout_s
+        while (remaining := deadline - clock.now()) > 0.0:
+            message = self.listen(remaining)
+            if message is not None and wanted(message):
+                return message
+        raise AssertionError(f"not heard within {timeout_s} s, but {len(self.heard)} other messages")
+
+    def of(self, topic: Topic) -> list:
+        """All messages of one topic heard so far."""
+        while self.listen() is not None:
+            pass
+        return [message for name, message in self.heard if name == topic.name]
+
+
+def health_of(process: str, **expected: object) -> Callable[[m.Message], bool]:
+    """A predicate: a `Health` of that process with these fields."""
+
+    def wanted(message: m.Message) -> bool:
+        return (
+            isinstance(message, m.Health)
+            and message.process == process
+            and all(getattr(message, name) == value for name, value in expected.items())
+        )
+
+    return wanted
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = HANG_S, every: float = 0.005) -> None:
+    """Wait for something that has no event of its own, and look so often; seconds."""
+    deadline = clock.now() + timeout_s
+    while not condition():
+        assert clock.now() < deadline, f"not so within {timeout_s} s"
+        clock.sleep_until(clock.now() + every)

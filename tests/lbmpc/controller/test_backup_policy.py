@@ -1,0 +1,259 @@
+"""The policy that a plant follows when its controller falls silent, on the true plant and against the judge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from controller_node.core import ControllerCore
+from lbmpc.controller.backup_policy import RAMP, STEPS, BackupPlanner, Policy
+from lbmpc.model import Model, build_model
+from lbmpc.oracles import DnnOracle, LinearOracle, Oracle, PerfectOracle
+from lbmpc.plants import Truth
+from lbmpc.sets.constraint_sets import state_set
+from lbmpc.solver.gauss_newton import Solver
+from lbmpc.solver.ipopt_reference import ReferenceSolver
+from lbmpc.solver.least_distance import Nearest, least_distance
+from lbmpc.solver.problem import Problem, build_problem
+from node_runtime.config.sections import Config, override
+from protocol import codec, topics
+from protocol import messages as m
+from run_log.replaying.replay import replay
+from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.science import compressor, describe, oracle_named
+
+N = 40
+MODEL = compressor()
+PLANT = MODEL.plant
+X0 = PLANT.x0 - PLANT.x_e
+HALF = 0.5 * (PLANT.x_max - PLANT.x_min)
+
+
+def problem(oracle: Oracle, model: Model = MODEL) -> Problem:
+    return build_problem(model, oracle, N)
+
+
+def outside(x: np.ndarray) -> float:
+    """How far x, a deviation, lies outside X, as a share of the half-widths; negative inside."""
+    return float(np.max(np.abs(x + PLANT.x_e - 0.5 * (PLANT.x_min + PLANT.x_max)) / HALF)) - 1.0
+
+
+def distance(x: np.ndarray) -> float:
+    """In the norm of the terminal cost."""
+    return float(np.sqrt(x @ MODEL.P @ x))
+
+
+def followed(x: np.ndarray, policy: Policy, truth: Truth) -> list[np.ndarray]:
+    """The true plant's deviations under the policy."""
+    states = []
+    for inputs in policy.inputs:
+        u = np.clip(inputs + policy.gain @ x + PLANT.u_e, PLANT.u_min, PLANT.u_max)
+        x = truth.step(x + PLANT.x_e, u, MODEL.period) - PLANT.x_e
+        states.append(x)
+    return states
+
+
+def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
+    """With h known the backup problem's constraints are the true plant's; the nominal plan's are not."""
+    oracle, truth = PerfectOracle(MODEL), Truth(PLANT)
+    nominal = Solver(problem(oracle)).solve(X0, np.zeros(oracle.parameters), np.zeros((N, 1)))
+    blind = followed(X0, Policy(nominal.v, np.zeros((1, 4)), np.zeros((N, 4)), 0.0), truth)
+    assert max(map(outside, blind)) > 0.02
+    policy = BackupPlanner(problem(oracle), 0.0).policy(X0, np.zeros(oracle.parameters), nominal.v)
+    assert policy is not None
+    states = followed(X0, policy, truth)
+    assert max(map(outside, states)) < 1e-4
+    # What it expects is what happens, so that the feedback has nothing to do.
+    assert np.array(states[:-1]) == pytest.approx(policy.states[1:], abs=2e-4)
+
+
+def test_the_margin_is_kept_once_it_has_grown() -> None:
+    oracle = PerfectOracle(MODEL)
+    x = np.array([-0.1, -0.4, 0.0, 0.0])
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, np.zeros(oracle.parameters), np.zeros((N, 1)))
+    assert policy is not None
+    assert max(map(outside, policy.states[RAMP + 4 :])) < -0.05 + 1e-4
+
+
+@pytest.mark.parametrize(
+    ("flow", "margin", "least", "most"),
+    [
+        (0.15, 0.02, 0.02, 0.02),  # leads back with all of it
+        (0.15, 0.06, 0.02, 0.04),  # with all of it the flow falls to a half
+        (0.14, 0.02, 0.003, 0.01),
+        (0.13, 0.06, 0.0, 0.0),  # too late, but nearer
+    ],
+)
+def test_as_much_of_the_margin_is_kept_as_leads_back(
+    flow: float, margin: float, least: float, most: float
+) -> None:
+    """From the paper's x0 and below the flow recovers only while the pressure is near its bound."""
+    oracle = PerfectOracle(MODEL)
+    x = np.array([flow - PLANT.x_e[0], *X0[1:]])
+    policy = BackupPlanner(problem(oracle), margin).policy(x, np.zeros(0), np.zeros((N, 1)))
+    assert policy is not None
+    assert least <= policy.margin <= most
+    states = followed(x, policy, Truth(PLANT))
+    if policy.margin > 0.0:
+        assert max(map(outside, states)) < 1e-3 - policy.margin
+        assert distance(states[-1]) < 0.95 * distance(x)
+
+
+@pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-4), np.array([-0.1, -0.4, 0.0, 0.0])])
+@pytest.mark.parametrize("oracle", [PerfectOracle(MODEL), oracle_named("dnn", MODEL)])
+def test_a_margin_that_costs_nothing_is_kept(
+    x: np.ndarray, oracle: Oracle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing is solved a second time, at rest neither, where what was learned says that it will move away."""
+    solved = []
+
+    def counted(*arguments: Any) -> Nearest | None:
+        solved.append(arguments)
+        return least_distance(*arguments)
+
+    monkeypatch.setattr("lbmpc.controller.backup_policy.least_distance", counted)
+    theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
+    assert policy is not None
+    assert policy.margin == 0.05
+    assert len(solved) == STEPS
+
+
+def test_a_margin_is_not_given_up_for_nothing() -> None:
+    """A valve that hardly moves: no plan leads back, and none without a margin ends nearer."""
+    stuck = replace(PLANT, u_min=PLANT.u_e - 1e-6, u_max=PLANT.u_e + 1e-6)
+    model = build_model(stuck, MODEL.period)
+    policy = BackupPlanner(problem(PerfectOracle(model), model), 0.05).policy(
+        X0, np.zeros(0), np.zeros((N, 1))
+    )
+    assert policy is not None
+    assert distance(policy.states[-1]) > distance(X0)
+    assert policy.margin == 0.05
+
+
+def test_without_learning_it_is_the_solution_of_the_judge() -> None:
+    """For h_hat = 0 the learned states are the nominal ones, and the judge solves the same problem."""
+    oracle = LinearOracle(MODEL.d, MODEL.m)
+    plain = state_set(MODEL)
+    inside = 0.02 * HALF
+    shares = [min(1.0, (i + 1) / RAMP) for i in range(N)]
+    states = tuple(plain.minus(share * inside, share * inside) for share in shares)
+    judge = ReferenceSolver(replace(problem(oracle), states=states))
+    planner = BackupPlanner(problem(oracle), 0.02)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        x = X0 * rng.uniform(0.5, 1.2, 4)
+        policy = planner.policy(x, np.zeros(0), np.zeros((N, 1)))
+        assert policy is not None
+        v = policy.inputs + policy.states @ policy.gain.T
+        assert v == pytest.approx(judge.solve(x, np.zeros(0), np.zeros((N, 1))).v, abs=1e-5)
+
+
+@pytest.mark.parametrize("architecture", ["mlp", "rnn"])
+def test_the_learned_states_are_what_the_rows_hold(architecture: str) -> None:
+    """Also where the oracle looks back, and the state of the recursion is longer than x."""
+    oracle = DnnOracle(
+        describe(MODEL, [8], architecture=architecture, window=1 if architecture == "mlp" else 3)
+    )
+    rng = np.random.default_rng(5)
+    state = oracle.begin(oracle.initial_state(rng), X0, np.zeros(1))
+    for _ in range(30):
+        state = oracle.learn(
+            state, X0 * rng.uniform(0.8, 1.0, 4), np.zeros(1), np.array([0.001, 0.004, 0, 0])
+        )
+    s = np.concatenate([X0, oracle.past(state).ravel()]) if oracle.pairs > 1 else X0
+    theta = oracle.theta(state)
+    nominal = Solver(problem(oracle)).solve(s, theta, np.zeros((N, 1)))
+    policy = BackupPlanner(problem(oracle), 0.01).policy(s, theta, nominal.v)
+    assert policy is not None
+    assert max(map(outside, policy.states[RAMP + 4 :])) < -0.01 + 1e-3
+
+
+def test_numbers_that_are_none_give_no_policy() -> None:
+    oracle = oracle_named("dnn", MODEL)
+    planner = BackupPlanner(problem(oracle), 0.01)
+    theta = oracle.theta(oracle.initial_state(np.random.default_rng(0)))
+    assert planner.policy(X0, theta, np.zeros((N, 1))) is not None
+    assert planner.policy(X0 * np.nan, theta, np.zeros((N, 1))) is None
+    assert planner.policy(X0, np.full_like(theta, np.inf), np.zeros((N, 1))) is None
+    # And the next one is as if nothing had been.
+    first = planner.policy(X0, theta, np.zeros((N, 1)))
+    again = BackupPlanner(problem(oracle), 0.01).policy(X0, theta, np.zeros((N, 1)))
+    assert first is not None
+    assert again is not None
+    assert first.inputs.tobytes() == again.inputs.tobytes()
+
+
+CONFIG = override(
+    Config(),
+    [
+        "controller.horizon=15",
+        "controller.solver.compile='never'",
+        "network.hidden=[6]",
+        "trainer.enabled=false",
+    ],
+)
+
+
+def test_a_backup_takes_part_in_the_replay_and_changes_nothing_else() -> None:
+    run = simulate(CONFIG, 12)
+    core = ControllerCore(CONFIG, run.controllers[0])
+    backups = []
+    for tick, command in zip(run.ticks, run.entries(topics.COMMAND), strict=True):
+        outputs = core.step(tick)
+        assert codec.encode(outputs.command) == command.payload
+        backups.append(core.backup(outputs.command))
+    assert all(backup is not None for backup in backups)
+    entries = list(run.entries(topics.COMMAND))
+    run.streams[topics.BACKUP.name] = [
+        replace(entry, message=backup, payload=codec.encode(backup))
+        for entry, backup in zip(entries, backups, strict=True)
+        if backup is not None
+    ]
+    assert replay(run).equal
+    last = run.streams[topics.BACKUP.name][7]
+    assert isinstance(last.message, m.Backup)
+    changed = msgspec.structs.replace(last.message, inputs=[[9.0], *last.message.inputs[1:]])
+    run.streams[topics.BACKUP.name][7] = replace(last, message=changed, payload=codec.encode(changed))
+    found = replay(run).first_difference
+    assert found is not None
+    assert (found.tick, found.field) == (7, "backup.inputs[0][0]")
+
+
+def test_in_plant_units_it_is_the_same_policy() -> None:
+    run = simulate(CONFIG, 3)
+    core = ControllerCore(CONFIG, run.controllers[0])
+    for tick in run.ticks:
+        outputs = core.step(tick)
+    backup = core.backup(outputs.command)
+    assert backup is not None
+    codec.check_dimensions(topics.BACKUP, backup, 4, 1)
+    expected = core.state.predicted + PLANT.x_e
+    u = np.array(backup.inputs[0]) + np.array(backup.gain) @ expected
+    planner = BackupPlanner(core.controller.problem, CONFIG.controller.backup.margin)
+    policy = core.controller.backup(planner, core.state)
+    assert policy is not None
+    v = policy.inputs[0] + policy.gain @ policy.states[0]
+    assert u == pytest.approx(v + PLANT.u_e, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"gain": [[1.0] * 3]},
+        {"gain": []},
+        {"gain": [[1.0] * 4] * 2},
+        {"inputs": []},
+        {"inputs": [[1.0, 2.0]]},
+        {"period": 0.0},
+    ],
+)
+def test_a_backup_of_another_plant_is_refused(wrong: dict[str, object]) -> None:
+    good = m.Backup(run_id="c", seq=0, period=0.05, gain=[[0.0] * 4], inputs=[[1.0]])
+    codec.check_dimensions(topics.BACKUP, good, 4, 1)
+    with pytest.raises(codec.BadMessage, match="wrong size"):
+        codec.check_dimensions(topics.BACKUP, msgspec.structs.replace(good, **wrong), 4, 1)

@@ -1,0 +1,227 @@
+"""One control step: learn, adopt, solve, plan; and what happens when a part of it is missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lbmpc.controller.step import Controller, ControllerState, HiddenSet, Observation, same_memory
+from lbmpc.model import discretise
+from lbmpc.oracles import DnnOracle
+from lbmpc.solver.gauss_newton import Solver
+from lbmpc.solver.problem import build_problem
+from lbmpc.solver.rows import Box
+from lbmpc.solver.solution import Solution, Status
+from network_model.description import hash_layers
+from tests.helpers.science import compressor, describe
+
+MODEL = compressor()
+ORACLE = DnnOracle(describe(MODEL, [8, 8]))
+PROBLEM = build_problem(MODEL, ORACLE, 15, "first_step")
+CONTROLLER = Controller(PROBLEM, Solver(PROBLEM))
+X = np.array([0.05, 0.05, 0.0, 0.0])
+X_NEXT = np.array([0.052, 0.049, 0.01, 0.1])
+
+
+def seen(x: np.ndarray | None, sequence: int, applied: float | None = 0.1, **more) -> Observation:  # type: ignore[no-untyped-def]
+    given = None if applied is None else np.array([applied])
+    return Observation(x, given, more.get("source", 1), sequence, more.get("hidden"))
+
+
+def offered(shift: float, version: int = 1) -> HiddenSet:
+    hidden = ORACLE.hidden(CONTROLLER.initial_state(0).oracle)
+    layers = [(layer + shift).astype(np.float32).astype(float) for layer in hidden]
+    return HiddenSet(version, layers, hash_layers(layers), ORACLE.description.sha256())
+
+
+def test_the_label_uses_the_input_that_was_applied_and_not_the_commanded_one() -> None:
+    state, first = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
+    assert first.label is None
+    _, second = CONTROLLER.step(state, seen(X_NEXT, 1, applied=0.3))
+    assert second.label is not None
+    np.testing.assert_allclose(second.label.h, X_NEXT - MODEL.A @ X - MODEL.B @ [0.3])
+    np.testing.assert_array_equal(second.label.u, [0.3])
+    assert abs(first.plan[0, 0] - 0.3) > 0.05
+
+
+def test_a_swap_learns_the_old_label_with_the_old_features() -> None:
+    """The set arrives together with x_{t+1}: the label of u_t belongs to phi_j, not to phi_{j+1}."""
+    state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
+    plain, _ = CONTROLLER.step(state, seen(X_NEXT, 1))
+    swapped, result = CONTROLLER.step(state, seen(X_NEXT, 1, hidden=offered(0.5)))
+    assert result.verdict == "adopted"
+    np.testing.assert_array_equal(swapped.oracle["K"], plain.oracle["K"])
+    assert not np.array_equal(swapped.oracle["W1"], plain.oracle["W1"])
+    # And from then on the new features count.
+    after = CONTROLLER.step(swapped, seen(X, 2))[0].oracle["K"]
+    assert not np.array_equal(after, CONTROLLER.step(plain, seen(X, 2))[0].oracle["K"])
+    phi = ORACLE.features(swapped.oracle, X_NEXT, np.array([0.1]))
+    h = X - MODEL.A @ X_NEXT - MODEL.B @ [0.1]
+    error = swapped.oracle["K"].T @ phi - h / ORACLE.output_scale
+    expected = swapped.oracle["K"] - ORACLE.gamma * np.outer(phi, error) / (phi @ phi)
+    norms = np.linalg.norm(expected, axis=0)
+    np.testing.assert_allclose(after, expected * np.minimum(1, ORACLE.bounds / norms), atol=1e-12)
+
+
+def test_a_label_needs_two_consecutive_samples_of_one_plant_and_a_known_input() -> None:
+    state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 4, None))
+    for observation in (
+        seen(X_NEXT, 6),
+        seen(X_NEXT, 4),
+        seen(X_NEXT, 5, None),
+        seen(X_NEXT, 5, source=2),
+        seen(None, 5),
+    ):
+        after, result = CONTROLLER.step(state, observation)
+        assert result.label is None
+        np.testing.assert_array_equal(after.oracle["K"], state.oracle["K"])
+    # A missing state breaks the chain: the sample after it has no label either.
+    gone, _ = CONTROLLER.step(state, seen(None, 5))
+    assert CONTROLLER.step(gone, seen(X_NEXT, 5))[1].label is None
+
+
+def test_a_refused_set_is_named_and_the_loop_goes_on_with_the_old_one() -> None:
+    state = CONTROLLER.initial_state(0)
+    broken = offered(0.1)
+    broken.layers[0][0, 0] = np.nan
+    after, result = CONTROLLER.step(state, seen(X, 0, None, hidden=broken))
+    assert result.verdict == "refused: layer 1 is not finite"
+    assert result.mode == "solver"
+    np.testing.assert_array_equal(after.oracle["W1"], state.oracle["W1"])
+    assert CONTROLLER.step(after, seen(X_NEXT, 1, hidden=offered(0.1)))[1].verdict == "adopted"
+
+
+class Failing:
+    """A solver that finds nothing from some call on; the real one before that."""
+
+    def __init__(self, good: int):
+        self.good, self.real = good, Solver(PROBLEM)
+
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution:
+        self.good -= 1
+        if self.good >= 0:
+            return self.real.solve(x, oracle_parameters, warm_start)
+        nothing = np.zeros_like(warm_start)
+        return Solution(Status.NUMERICAL, nothing, np.zeros((len(nothing), 4)), np.inf, 0, 0.0, "")
+
+
+def test_without_a_solution_the_shifted_plan_and_then_K() -> None:
+    controller = Controller(PROBLEM, Failing(1))
+    state, first = controller.step(controller.initial_state(0), seen(X, 0, None))
+    assert first.mode == "solver"
+    for i in range(1, 15):
+        state, result = controller.step(state, seen(X_NEXT, i))
+        assert result.mode == "shifted_plan"
+        assert result.solution is not None
+        assert result.solution.status is Status.NUMERICAL
+        np.testing.assert_array_equal(result.plan[0], first.plan[i])
+    _, result = controller.step(state, seen(X_NEXT, 15))
+    assert result.mode == "feedback"
+    np.testing.assert_allclose(result.plan[0], MODEL.K @ X_NEXT)
+    assert result.plan.shape == (15, 1)
+
+
+def test_without_a_state_the_plan_goes_on_and_without_both_the_equilibrium() -> None:
+    state, first = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
+    _, result = CONTROLLER.step(state, seen(None, -1))
+    assert result.mode == "shifted_plan"
+    np.testing.assert_array_equal(result.plan[0], first.plan[1])
+    _, result = CONTROLLER.step(CONTROLLER.initial_state(0), seen(np.full(4, np.nan), 0, None))
+    assert result.mode == "feedback"
+    np.testing.assert_array_equal(result.plan, np.zeros((15, 1)))
+
+
+@pytest.mark.parametrize("absurd", [1.7e308, 1e307, -1e160, 3e6])
+def test_a_number_that_is_no_measurement_is_no_state(absurd: float) -> None:
+    """Finite, but what would be learned from it is not, and what is not finite stays in the memory for good."""
+    state = CONTROLLER.initial_state(0)
+    for i in range(3):
+        state, _ = CONTROLLER.step(state, late(X, i, 0.1, 0.004, 0.1))
+    wrong = late(np.array([X[0], absurd, *X[2:]]), 3, 0.1, 0.004, 0.1)
+    after, result = CONTROLLER.step(state, wrong)
+    assert result.mode == "shifted_plan"
+    assert result.label is None
+    without, _ = CONTROLLER.step(state, replace(wrong, x=None))
+    assert same_memory(after, without) is None
+    _, result = CONTROLLER.step(after, late(X_NEXT, 4, 0.1, 0.004, 0.1))
+    assert result.mode == "solver"
+
+
+def test_what_is_learned_from_a_wild_measurement_is_finite() -> None:
+    state = CONTROLLER.initial_state(0)
+    half = 0.5 * (MODEL.plant.x_max - MODEL.plant.x_min)
+    for i in range(4):
+        x = 9e5 * half if i == 2 else X
+        state, result = CONTROLLER.step(state, late(x, i, 0.1, 0.004, 0.1))
+        assert all(np.isfinite(array).all() for array in state.to_arrays().values())
+    assert result.mode == "solver"
+
+
+def test_the_feedback_is_clipped_to_U() -> None:
+    controller = Controller(PROBLEM, Failing(0))
+    _, result = controller.step(controller.initial_state(0), seen(np.array([0.5, -0.5, 0, 0]), 0, None))
+    assert result.mode == "feedback"
+    low, high = MODEL.plant.u_min - MODEL.plant.u_e, MODEL.plant.u_max - MODEL.plant.u_e
+    assert (result.plan >= low).all()
+    assert (result.plan <= high).all()
+    assert abs(float((MODEL.K @ [0.5, -0.5, 0, 0])[0])) > high[0]
+
+
+def test_the_memory_survives_freezing_and_thawing_bit_for_bit() -> None:
+    state = CONTROLLER.initial_state(0)
+    for i in range(5):
+        state, _ = CONTROLLER.step(state, seen(X + 0.001 * i, i))
+    thawed = ControllerState.from_arrays({name: array.copy() for name, array in state.to_arrays().items()})
+    assert same_memory(state, thawed) is None
+    a, _ = CONTROLLER.step(state, seen(X, 5))
+    b, _ = CONTROLLER.step(thawed, seen(X, 5))
+    assert same_memory(a, b) is None
+    assert same_memory(a, state) is not None
+
+
+def test_the_seed_decides_the_start_and_nothing_else_does() -> None:
+    assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(3)) is None
+    assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(4)) == "oracle.K"
+
+
+def late(x: np.ndarray, sequence: int, first: float, delay: float, then: float) -> Observation:
+    """A sample whose period began with the input `first` and went on with `then` after `delay` seconds."""
+    pieces = ((delay, np.array([first])), (0.05 - delay, np.array([then])))
+    mean = (delay * first + (0.05 - delay) * then) / 0.05
+    return Observation(x, np.array([mean]), 1, sequence, None, pieces)
+
+
+def test_the_problem_is_solved_from_where_the_command_will_act() -> None:
+    """With the true linear plant and a constant delay, the prediction meets what then happens."""
+    delay, x, acting = 0.004, np.array([0.1, 0.05, 0.0, 0.0]), 0.0
+    state = CONTROLLER.initial_state(0)
+    state = ControllerState.from_arrays(state.to_arrays() | {"oracle.K": np.zeros_like(state.oracle["K"])})
+    commanded, errors = 0.0, []
+    for i in range(60):
+        seen_now = seen(x, 0, None) if i == 0 else late(x, i, acting, delay, commanded)
+        acting = commanded
+        state, result = CONTROLLER.step(state, seen_now)
+        before, commanded = state.predicted, float(result.plan[0, 0])
+        x = MODEL.A @ x + (MODEL.answer(((delay, np.array([acting])), (0.05 - delay, np.array([commanded])))))
+        # Where the next command will act, under this one until then.
+        phi, gamma = discretise(MODEL.a, MODEL.b, delay)
+        errors.append(np.abs(phi @ x + gamma @ [commanded] - before).max())
+    assert abs(state.delay - delay) < 1e-6
+    assert max(errors[40:]) < 1e-6
+    assert max(errors[:3]) > 1e-4
+
+
+def test_in_lock_step_there_is_no_delay() -> None:
+    state = CONTROLLER.initial_state(0)
+    for i in range(4):
+        state, result = CONTROLLER.step(state, seen(X, i))
+        assert result.delay == 0.0

@@ -1,0 +1,107 @@
+"""Linearisation, discretisation, K and P."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lbmpc.model import ModelError, build_model, discretise, linearise
+from lbmpc.plants import Truth
+from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
+from tests.helpers.science import compressor
+
+
+def test_the_jacobian_is_that_of_the_equations_by_hand() -> None:
+    a, b = linearise(PLANT)
+    z, y, r = PLANT.x_e[:3]
+    w2, damping = 1000.0, 2 / np.sqrt(2) * 10 * np.sqrt(10)
+    expected = [
+        [1.5 - 1.5 * z**2, -1, 0, 0],
+        [1, -r / (2 * np.sqrt(y)), -np.sqrt(y), 0],
+        [0, 0, 0, 1],
+        [0, 0, -w2, -damping],
+    ]
+    np.testing.assert_allclose(a, expected, atol=1e-12)
+    np.testing.assert_allclose(b.ravel(), [0, 0, 0, w2])
+
+
+@pytest.mark.parametrize("period", [0.05, 0.001])
+def test_a_part_of_a_period_is_discretised_exactly(period: float) -> None:
+    model = compressor(period)
+    directions = np.eye(model.d + model.m)
+    for share in (0.0, 1e-6, 0.1, 0.37, 1.0, 1.9, 2.0, 3.5):
+        exact = np.hstack(discretise(model.a, model.b, share * period))
+        quick = [model.ahead(way[: model.d], way[model.d :], share * period) for way in directions]
+        np.testing.assert_allclose(
+            np.transpose(quick), exact, rtol=0, atol=1e-13 * max(1.0, np.abs(exact).max())
+        )
+
+
+def test_discretisation_is_exact() -> None:
+    model = compressor(0.05)
+    a, b = linearise(PLANT)
+    x, u = np.array([0.1, -0.2, 0.3, 2.0]), np.array([0.4])
+    fine = x.copy()
+    steps = 2000
+    h = 0.05 / steps
+    for _ in range(steps):  # Runge-Kutta 4 on the linear equations
+        k1 = a @ fine + b @ u
+        k2 = a @ (fine + h / 2 * k1) + b @ u
+        k3 = a @ (fine + h / 2 * k2) + b @ u
+        fine = fine + h / 6 * (k1 + 2 * k2 + 2 * k3 + a @ (fine + h * k3) + b @ u)
+    np.testing.assert_allclose(model.A @ x + model.B @ u, fine, atol=1e-10)
+
+
+def test_K_is_that_of_the_published_example() -> None:
+    # Aswani et al. (2013) at T = 0.01 s, and the same continuous poles at 0.05 s.
+    np.testing.assert_allclose(compressor(0.01).K[0], [-3.0742, 2.0958, 0.1194, -0.00895], atol=5e-5)
+    np.testing.assert_allclose(compressor(0.05).K[0], [-2.7709, 1.9127, 0.1605, 0.00005], atol=5e-5)
+
+
+def test_P_solves_the_lyapunov_equation() -> None:
+    model = compressor()
+    f = model.closed_loop
+    right = -(model.Q + model.K.T @ model.R @ model.K)
+    np.testing.assert_allclose(f.T @ model.P @ f - model.P, right, atol=1e-8)
+    assert np.linalg.eigvalsh(model.P).min() > 0
+
+
+def test_without_poles_K_is_the_lqr_gain() -> None:
+    model = build_model(dataclasses.replace(PLANT, poles=None), 0.05)
+    assert np.abs(np.linalg.eigvals(model.closed_loop)).max() < 1
+    # The LQR gain is the one that is greedy for its own cost-to-go.
+    gain = np.linalg.solve(model.R + model.B.T @ model.P @ model.B, model.B.T @ model.P @ model.A)
+    np.testing.assert_allclose(-gain, model.K, atol=1e-7)
+
+
+def test_what_is_no_equilibrium_is_refused() -> None:
+    moved = dataclasses.replace(PLANT, x_e=PLANT.x_e + np.array([0.1, 0, 0, 0]))
+    with pytest.raises(ModelError, match="not an equilibrium"):
+        build_model(moved, 0.05)
+
+
+def test_weights_of_the_wrong_length_are_refused() -> None:
+    with pytest.raises(ModelError, match="Q has 3 weights"):
+        build_model(PLANT, 0.05, Q=np.ones(3))
+
+
+def test_the_answer_to_one_piece_is_B_u_and_pieces_compose() -> None:
+    model, u = compressor(), np.array([0.3])
+    np.testing.assert_allclose(model.answer(((0.05, u),)), model.B @ u, atol=1e-15)
+    np.testing.assert_allclose(model.answer(((0.02, u), (0.03, u))), model.B @ u, atol=1e-14)
+
+
+def test_a_label_with_pieces_is_free_of_the_commands_timing() -> None:
+    """Near the equilibrium h is tiny; the mean input would book a late command as an h many times that size."""
+    model, truth = compressor(), Truth(PLANT)
+    early, late = np.array([0.02]), np.array([-0.05])
+    x = np.array([0.01, -0.01, 0.0, 0.0])
+    middle = truth.step(x + PLANT.x_e, early + PLANT.u_e, 0.01)
+    after = truth.step(middle, late + PLANT.u_e, 0.04) - PLANT.x_e
+    mean = 0.2 * early + 0.8 * late
+    exact = model.label(x, mean, after, ((0.01, early), (0.04, late)))
+    naive = model.label(x, mean, after)
+    assert np.abs(exact).max() < 2e-5
+    assert np.abs(naive).max() > 0.05

@@ -1,0 +1,139 @@
+"""Torch and CasADi compute one and the same network, and the controller has no torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import get_args
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lbmpc.oracles.dnn.oracle import DnnOracle
+from network_model.description import NetworkDescription
+from network_model.operations import BOUNDED, Activation, architecture_names, get_architecture
+from trainer_node.network import Network
+
+ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
+
+
+@st.composite
+def descriptions(draw: st.DrawFn) -> NetworkDescription:
+    layers = draw(st.integers(1, 4))
+    states, inputs = draw(st.integers(1, 6)), draw(st.integers(1, 3))
+    scale = st.floats(1e-3, 1e3)
+    architecture = draw(st.sampled_from(architecture_names()))
+    window = draw(st.integers(1 if architecture == "mlp" else 2, 5))
+    options = dict(get_architecture(architecture).options)
+    if architecture == "cnn":
+        options["kernel"] = draw(st.integers(1, window))
+    return NetworkDescription(
+        states=states,
+        inputs=inputs,
+        hidden=draw(st.lists(st.integers(1, 40), min_size=layers, max_size=layers)),
+        activations=[
+            *draw(st.lists(st.sampled_from(ACTIVATIONS), min_size=layers - 1, max_size=layers - 1)),
+            draw(st.sampled_from(BOUNDED)),
+        ],
+        input_scale=draw(st.lists(scale, min_size=states + inputs, max_size=states + inputs)),
+        output_scale=draw(st.lists(scale, min_size=states, max_size=states)),
+        architecture=architecture,
+        window=window,
+        options=options,
+    )
+
+
+def test_all_three_of_the_paper_are_there() -> None:
+    assert set(architecture_names()) >= {"mlp", "rnn", "cnn"}
+    assert get_architecture("cnn").options == {"kernel": 3}
+
+
+@settings(max_examples=80, deadline=None)
+@given(descriptions(), st.integers(0, 2**32 - 1), st.sampled_from([0.1, 1.0, 10.0]))
+def test_torch_casadi_and_numpy_agree_to_1e_12_in_float64(
+    description: NetworkDescription, seed: int, size: float
+) -> None:
+    check_parity(description, seed, size)
+
+
+def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) -> None:
+    """The value, its slope along every entry of the window by CasADi and by torch, and the bound of phi."""
+    rng = np.random.default_rng(seed)
+    d, points = description.states, 5
+    hidden = [size * rng.standard_normal(shape) / np.sqrt(shape[0]) for shape in description.layer_shapes]
+    K = rng.standard_normal((description.features, d)) / description.features
+    windows = rng.standard_normal((points, description.window, description.pair)) * description.input_scale
+
+    network = Network(description, torch.float64)
+    network.load(hidden)
+    rows = network.tensor(windows.reshape(points, -1)).requires_grad_()
+    values = network(rows, network.tensor(K))
+    slopes = [torch.autograd.grad(values[:, i].sum(), rows, retain_graph=True)[0].numpy() for i in range(d)]
+
+    oracle = DnnOracle(description)
+    function, theta = oracle.function(), oracle.pack(hidden, K)
+    in_numpy = oracle.output_scale * (oracle.features_of(hidden, windows) @ K)
+    for p, window in enumerate(windows):
+        s, u = np.concatenate([window[-1, :d], window[:-1].ravel()]), window[-1, d:]
+        h, jacobian = (np.array(part) for part in function(s, u, theta))
+        # In units of the scales, so that neither a large unit nor a small one decides.
+        ours = values[p].detach().numpy() / description.output_scale
+        assert np.abs(h.ravel() / description.output_scale - ours).max() < 1e-12
+        assert np.abs(in_numpy[p] / description.output_scale - ours).max() < 1e-12
+        behind = jacobian.shape[1] - len(u)
+        along_window = np.hstack([jacobian[:, d:behind], jacobian[:, :d], jacobian[:, behind:]])
+        per_unit = np.tile(description.input_scale, description.window) / oracle.output_scale[:, None]
+        found = np.array([slope[p] for slope in slopes])
+        bound = 1e-12 * (1 + np.abs(found * per_unit).max())
+        assert (np.abs(along_window - found) * per_unit).max() < bound
+
+    phi = network.features(rows)
+    assert phi.shape == (points, description.features)
+    assert bool((phi[:, 0] == 1.0).all())
+    assert bool((phi.square().sum(dim=1) <= description.features).all())
+
+
+def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> None:
+    description = NetworkDescription(
+        states=1,
+        inputs=1,
+        hidden=[1, 1],
+        activations=["softplus", "softsign"],
+        input_scale=[1.0, 1.0],
+        output_scale=[1.0],
+    )
+    hidden, K = [np.array([[0.0], [1.0], [0.0]]), np.array([[-21.0], [1.0]])], np.array([[0.0], [1.0]])
+    network, oracle = Network(description, torch.float64), DnnOracle(description)
+    network.load(hidden)
+    function, theta = oracle.function(), oracle.pack(hidden, K)
+    for x in (-60.0, -5.0, 0.0, 19.9, 20.1, 21.0, 30.0, 49.0, 51.0, 600.0):
+        ours = network(network.tensor([[x, 0.0]]), network.tensor(K)).item()
+        assert abs(ours - float(function([x], [0.0], theta)[0])) < 1e-12
+
+
+def test_a_controller_and_a_plant_load_neither_torch_nor_the_trainer() -> None:
+    code = (
+        "import sys, controller_node.node, plant_sim.node\n"
+        "found = [name for name in sys.modules if name.split('.')[0] in ('torch', 'trainer_node')]\n"
+        "sys.stdout.write(' '.join(found))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+
+
+def test_a_trainer_loads_neither_casadi_nor_the_science() -> None:
+    code = (
+        "import sys, trainer_node.node\n"
+        "found = [name for name in sys.modules if name.split('.')[0] in ('casadi', 'lbmpc')]\n"
+        "sys.stdout.write(' '.join(found))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""

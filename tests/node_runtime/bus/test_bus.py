@@ -1,0 +1,341 @@
+"""The bus over a real router: newest values, bounded queues, nobody stalls anybody, a router may come and go."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+
+import msgpack
+import pytest
+import zenoh
+
+from node_runtime import router
+from node_runtime.bus.mailbox import Delivery, Mailbox
+from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted, session_config
+from node_runtime.config.sections import Config, override
+from node_runtime.config.strict import ConfigError
+from node_runtime.realtime import clock
+from node_runtime.router import Router
+from protocol import codec, topics
+from protocol import messages as m
+from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
+
+pytestmark = pytest.mark.live
+BLOCKED_S = 5.0
+
+
+def state(seq: int) -> m.PlantState:
+    return m.PlantState(
+        run_id="plant-a", seq=seq, t=0.05 * seq, x=[1.0, 2.0], applied=None, source="hold", command_seq=-1
+    )
+
+
+def keyframe(seq: int, size: int) -> m.Keyframe:
+    array = m.Array("|u1", [size], bytes(size))
+    return m.Keyframe(run_id="controller-a", seq=seq, arrays={"a": array})
+
+
+@pytest.fixture(scope="module")
+def config() -> Iterator[Config]:
+    config = live_config()
+    with Router(config):
+        yield config
+
+
+@pytest.fixture
+def plant(config: Config) -> Iterator[Bus]:
+    with Bus(config, "plant", "plant-a") as bus:
+        yield bus
+
+
+@pytest.fixture
+def controller(config: Config) -> Iterator[Bus]:
+    with Bus(config, "controller", "controller-a") as bus:
+        yield bus
+
+
+def seq_of(payload: bytes | None) -> int:
+    assert payload is not None
+    return codec.decode(topics.PLANT_STATE, payload).seq
+
+
+# -- receiving -------------------------------------------------------------------------------------------
+
+
+def test_latest_is_the_newest_and_only_once(plant: Bus, controller: Bus) -> None:
+    latest = controller.latest(topics.PLANT_STATE)
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    assert latest.take() is None
+    for seq in range(10):
+        plant.publish(topics.PLANT_STATE, state(seq))
+        # One by one: the control lane drops what a full link cannot take at once.
+        wait_for(lambda: latest.received == seq + 1)  # noqa: B023 - called before the loop goes on
+    assert seq_of(latest.take()) == 9
+    assert latest.take() is None
+    assert latest.superseded == 9
+
+
+def test_waiting_ends_with_the_arrival_or_in_time(plant: Bus, controller: Bus) -> None:
+    latest = controller.latest(topics.PLANT_STATE)
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    assert latest.wait(0.02) is None
+    threading.Timer(0.05, plant.publish, (topics.PLANT_STATE, state(3))).start()
+    before = clock.now()
+    assert seq_of(latest.wait(2 * HANG_S)) == 3
+    assert clock.now() - before < HANG_S
+
+
+def test_a_queue_keeps_order_and_its_bound(plant: Bus, controller: Bus) -> None:
+    mailbox = controller.queue(topics.PLANT_STATE, capacity=5)
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    for seq in range(20):
+        plant.publish(topics.PLANT_STATE, state(seq))
+        wait_for(lambda: mailbox.received == seq + 1)  # noqa: B023 - called before the loop goes on
+    deliveries = [mailbox.get(0.0) for _ in range(6)]
+    assert [seq_of(d.payload) for d in deliveries if d] == [15, 16, 17, 18, 19]
+    assert deliveries[5] is None
+    assert controller.counters()["overflow plant/state"] == 15
+
+
+def test_a_mailbox_is_bounded_in_bytes_too() -> None:
+    mailbox = Mailbox("test", capacity=1000, max_bytes=1000)
+    for k in range(50):
+        mailbox.put(Delivery(str(k), bytes(100), 0))
+    assert [delivery.key for delivery in mailbox.drain()] == [str(k) for k in range(40, 50)]
+    assert mailbox.overflow == 40
+
+
+def test_everything_is_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus) -> None:
+    mailbox = controller.everything()
+    health = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={"n": 1}, note="")
+    wait_for(lambda: plant.matched(topics.PLANT_STATE) and plant.matched(topics.HEALTH["plant"]))
+    plant.publish(topics.PLANT_STATE, state(1))
+    plant.publish(topics.HEALTH["plant"], health)
+    controller.publish(topics.KEYFRAME, keyframe(0, 100_000))
+    wait_for(lambda: len(mailbox) == 3)
+    heard = {delivery.key.removeprefix("tandem/jet1/"): delivery.payload for delivery in mailbox.drain()}
+    assert heard["plant/state"] == codec.encode(state(1))
+    assert heard["plant/health"] == codec.encode(health)
+    assert heard["controller/keyframe"] == codec.encode(keyframe(0, 100_000))
+    assert msgpack.unpackb(heard["plant/state"])["x"] == [1.0, 2.0]
+
+
+def test_a_slow_reader_stalls_nobody(plant: Bus, controller: Bus) -> None:
+    unread = controller.queue(topics.HEALTH["plant"], capacity=3)
+    latest = controller.latest(topics.PLANT_STATE)
+    health = m.Health(
+        run_id="plant-a", seq=0, process="plant", status="ready", counters={}, note="x" * 20_000
+    )
+    wait_for(lambda: plant.matched(topics.PLANT_STATE) and plant.matched(topics.HEALTH["plant"]))
+    for seq in range(300):
+        plant.publish(topics.HEALTH["plant"], health)
+        if seq % 50 == 0:
+            plant.publish(topics.PLANT_STATE, state(seq))
+            assert seq_of(latest.wait(HANG_S)) == seq
+    wait_for(lambda: unread.received == 300)
+    assert unread.overflow == 297
+
+
+def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, controller: Bus) -> None:
+    mailbox = controller.everything()
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+    key = topics.PLANT_STATE.key(config.name)
+    publisher = stranger.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    wait_for(lambda: publisher.matching_status.matching)
+    publisher.put(bytes(topics.PLANT_STATE.max_bytes + 1))
+    wait_for(lambda: controller.counters().get("bad plant/state: oversized", 0) == 1)
+    stranger.close()
+    note = "x" * topics.HEALTH["plant"].max_bytes
+    large = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={}, note=note)
+    plant.publish(topics.HEALTH["plant"], large)
+    assert plant.counters()["not sent, oversized plant/health"] == 1
+    plant.publish(topics.PLANT_STATE, state(0))
+    wait_for(lambda: mailbox.received > 0)
+    assert [delivery.key for delivery in mailbox.drain()] == [key]
+
+
+# -- sending ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_pending_is_sent_before_closing(config: Config, controller: Bus) -> None:
+    mailbox = controller.queue(topics.HEALTH["plant"])
+    with Bus(config, "plant", "plant-b") as bus:
+        wait_for(lambda: bus.matched(topics.HEALTH["plant"]))
+        for seq in range(200):
+            note = "y" * 30_000
+            health = m.Health(
+                run_id="plant-b", seq=seq, process="plant", status="stopping", counters={}, note=note
+            )
+            bus.publish(topics.HEALTH["plant"], health)
+    wait_for(lambda: mailbox.received == 200)
+
+
+def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
+    config = live_config("bus.lease_ms=60000")
+    with (
+        Process("node_runtime.router", config) as frozen,
+        Bus(config, "controller", "controller-a") as bus,
+        Bus(config, "plant", "plant-a") as reader,
+    ):
+        reader.everything()
+        wait_for(lambda: bus.matched(topics.KEYFRAME) and bus.matched(topics.COMMAND))
+        frozen.signal(signal.SIGSTOP)
+        command = m.Command(
+            run_id="controller-a",
+            seq=0,
+            state_run_id="",
+            state_seq=-1,
+            period=0.05,
+            mode="solver",
+            u=[1.0],
+            plan=[[1.0]] * 20_000,
+        )
+        longest = 0.0
+        for seq in range(60):
+            before = clock.now()
+            bus.publish(topics.COMMAND, command)
+            bus.publish(topics.KEYFRAME, keyframe(seq, 8_000_000))
+            longest = max(longest, clock.now() - before)
+        # A link that is full lets a message wait for 5 s, and would let 60 do so.
+        assert longest < BLOCKED_S / 2
+        assert bus.counters()["bulk overflow"] > 20
+        before = clock.now()
+        reader.close(drain_s=0.2)
+        bus.close(drain_s=0.2)
+        assert clock.now() - before < HANG_S
+
+
+# -- questions and answers -------------------------------------------------------------------------------
+
+
+def test_questions_are_answered_in_several_parts(plant: Bus, controller: Bus) -> None:
+    asked: list[dict[str, str]] = []
+
+    def handler(parameters: dict[str, str]) -> list[bytes]:
+        asked.append(parameters)
+        return [b"one", b"two", bytes(1_000_000)]
+
+    controller.serve(topics.OUTBOX_QUERY, handler)
+    wait_for(lambda: bool(plant.ask(topics.OUTBOX_QUERY, {"since": "7", "run": ""}, HANG_S)))
+    answer = plant.ask(topics.OUTBOX_QUERY, {"since": "7", "run": "controller-a"}, HANG_S)
+    assert answer == [b"one", b"two", bytes(1_000_000)]
+    assert asked[-1] == {"since": "7", "run": "controller-a"}
+
+
+def test_nobody_answers_is_no_error(plant: Bus) -> None:
+    assert plant.ask(topics.OUTBOX_QUERY, {}, 0.2) == []
+
+
+def test_a_wrong_question_is_counted_on_both_sides(plant: Bus, controller: Bus) -> None:
+    def handler(parameters: dict[str, str]) -> list[bytes]:
+        if parameters.get("since") == "seven":
+            raise ValueError("since = 'seven' is not a whole number")
+        return [b"fine"]
+
+    controller.serve(topics.OUTBOX_QUERY, handler)
+    wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"])
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "seven"}, HANG_S) == []
+    assert controller.counters()["bad controller/outbox: bad query"] == 1
+    assert plant.counters()["bad controller/outbox: answered with an error"] == 1
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"]
+
+
+def test_an_oversized_question_is_dropped_unread(plant: Bus, controller: Bus) -> None:
+    """A router's limits of size are for payloads; the parameters of a question may be of any size."""
+    asked: list[dict[str, str]] = []
+
+    def handler(parameters: dict[str, str]) -> list[bytes]:
+        asked.append(parameters)
+        return [b"fine"]
+
+    controller.serve(topics.OUTBOX_QUERY, handler)
+    wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"])
+    asked.clear()
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "1" * 100_000}, HANG_S) == []
+    assert controller.counters()["bad controller/outbox: oversized question"] == 1
+    assert plant.ask(topics.OUTBOX_QUERY, {"since": "2"}, HANG_S) == [b"fine"]
+    assert asked == [{"since": "2"}]
+
+
+def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controller: Bus) -> None:
+    release = threading.Event()
+    controller.serve("controller/slow", lambda _: [b"late"] if release.wait(HANG_S) else [])
+    latest = controller.latest(topics.PLANT_STATE)
+    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    assert plant.ask("controller/slow", {}, 0.3) == []
+    for seq in range(50):
+        plant.publish(topics.PLANT_STATE, state(seq))
+        assert seq_of(latest.wait(HANG_S)) == seq
+    release.set()
+
+
+# -- the router ------------------------------------------------------------------------------------------
+
+
+def test_a_router_restart_is_survived() -> None:
+    config = live_config()
+    with (
+        Router(config) as first,
+        Bus(config, "plant", "plant-a") as plant,
+        Bus(config, "controller", "controller-a") as controller,
+    ):
+        latest = controller.latest(topics.PLANT_STATE)
+        controller.serve(topics.OUTBOX_QUERY, lambda _: [b"answer"])
+        wait_for(lambda: plant.matched(topics.PLANT_STATE))
+        first.close()
+        wait_for(lambda: not plant.connected and not controller.connected)
+        plant.publish(topics.PLANT_STATE, state(0))
+        with Router(config):
+            wait_for(lambda: plant.connected and controller.connected and plant.matched(topics.PLANT_STATE))
+            plant.publish(topics.PLANT_STATE, state(1))
+            assert seq_of(latest.wait(HANG_S)) == 1
+            wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {}, 1.0) == [b"answer"])
+
+
+def test_opening_waits_for_the_router() -> None:
+    config = live_config()
+    bus = Bus(config, "plant", "plant-a")
+    opening = threading.Thread(target=bus.open)
+    opening.start()
+    opening.join(0.3)
+    assert opening.is_alive()
+    with Router(config):
+        opening.join(HANG_S)
+        assert not opening.is_alive()
+        assert bus.connected
+        bus.close()
+
+
+def test_opening_can_be_stopped() -> None:
+    stop = threading.Event()
+    threading.Timer(0.2, stop.set).start()
+    before = clock.now()
+    with pytest.raises(OpenInterrupted, match="router"), Bus(live_config(), "plant", "plant-a", stop):
+        pass
+    assert clock.now() - before < HANG_S
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "tcp/127.0.0.1", "carrier/127.0.0.1:1", "tcp/::1:1"])
+def test_an_endpoint_that_is_none_is_an_error_for_a_person(endpoint: str) -> None:
+    config = override(Config(), [f'bus.endpoint="{endpoint}"'])
+    with pytest.raises(ConfigError, match=r"bus\.endpoint"):
+        Bus(config, "plant", "plant-a").open()
+    assert router.main(config) == 2
+
+
+def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+    assert router.main(config) == 1
+    assert "is taken: another router may be running" in caplog.text
+    assert config.bus.endpoint in caplog.text
+
+
+def test_the_router_process_ends_cleanly() -> None:
+    config = override(live_config(), [f'bus.endpoint="{free_endpoint()}"'])
+    with Process("node_runtime.router", config) as process, Bus(config, "recorder", "r-1") as bus:
+        mailbox = bus.queue(topics.HEALTH["router"])
+        assert mailbox.get(HANG_S) is not None
+        process.signal(signal.SIGINT)
+        assert process.end() == 0
+        assert "Traceback" not in process.said

@@ -1,0 +1,181 @@
+"""Large messages in pieces: put together in any order, in bounded memory, and what does not fit is not used."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+
+from node_runtime.bus.fragments import HEADER, MARK, PARTIAL, PIECE, Assembler, Piece, split
+from node_runtime.bus.zenoh_bus import Bus, session_config
+from node_runtime.config.sections import Config
+from node_runtime.rejected import BadMessages
+from node_runtime.router import Router
+from protocol import codec, topics
+from protocol import messages as m
+from tests.helpers.live import HANG_S, live_config, wait_for
+
+MESSAGE = np.random.default_rng(0).bytes(5 * PIECE + 17)
+LIMIT = 64 * PIECE
+
+
+def pieces(message: bytes = MESSAGE, writer: str = "trainer-a", number: int = 0) -> list[bytes]:
+    return list(split(message, writer, number))
+
+
+def altered(payload: bytes, **changes: object) -> bytes:
+    piece = msgspec.msgpack.decode(payload[1:], type=Piece)
+    return MARK + msgspec.msgpack.encode(msgspec.structs.replace(piece, **changes))
+
+
+class Receiver:
+    def __init__(self, limit: int = LIMIT) -> None:
+        self.bad = BadMessages()
+        self.assembler = Assembler(limit, self.bad)
+
+    def take(self, *payloads: bytes, name: str = "x") -> list[bytes]:
+        found = (self.assembler.whole(name, payload, LIMIT) for payload in payloads)
+        return [whole for whole in found if whole is not None]
+
+
+def test_what_is_small_travels_as_it_is() -> None:
+    assert pieces(MESSAGE[:PIECE]) == [MESSAGE[:PIECE]]
+    assert Receiver().take(b"", b"\x80", MESSAGE[:PIECE]) == [b"", b"\x80", MESSAGE[:PIECE]]
+
+
+def test_no_message_begins_like_a_piece() -> None:
+    health = m.Health(run_id="a", seq=0, process="plant", status="ready", counters={}, note="")
+    assert codec.encode(health)[:1] != MARK
+
+
+def test_pieces_make_the_message_in_any_order_and_twice() -> None:
+    parts = pieces()
+    assert len(parts) == 6
+    assert max(map(len, parts)) <= PIECE + HEADER
+    receiver = Receiver()
+    order = np.random.default_rng(1).permutation(6)
+    assert receiver.take(*(parts[k] for k in order)) == [MESSAGE]
+    assert receiver.assembler.held == 0
+    twice = [part for part in parts for _ in range(2)][:-1]
+    assert receiver.take(*twice) == [MESSAGE]
+    assert receiver.bad.counters() == {}
+
+
+def test_a_lost_piece_loses_its_message_and_no_other() -> None:
+    receiver = Receiver()
+    assert receiver.take(*pieces()[1:], *pieces(number=1)) == [MESSAGE]
+    assert receiver.bad.counters() == {"bad x: pieces lost": 1}
+    assert receiver.take(*pieces()[:1]) == []
+    receiver.assembler.end()
+    assert receiver.assembler.held == 0
+    assert receiver.bad.counters() == {"bad x: pieces lost": 2}
+
+
+def test_writers_and_topics_do_not_mix() -> None:
+    receiver = Receiver()
+    mixed = zip(pieces(), pieces(MESSAGE[::-1], "trainer-b"), strict=True)
+    assert receiver.take(*(part for pair in mixed for part in pair)) == [MESSAGE, MESSAGE[::-1]]
+    assert receiver.take(*pieces()[:3]) == []
+    assert receiver.take(*pieces()[3:], name="y") == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (MARK, "malformed piece"),
+        (MARK + b"\x00" * 40, "malformed piece"),
+        (pieces()[0][:-1], "malformed piece"),
+        (MARK + bytes(PIECE + HEADER), "oversized piece"),
+        (altered(pieces()[0], size=LIMIT + 1), "oversized"),
+        (altered(pieces()[0], size=PIECE), "malformed piece"),
+        (altered(pieces()[0], index=6), "malformed piece"),
+        (altered(pieces()[0], index=5), "malformed piece"),
+        (altered(pieces()[0], data=b""), "malformed piece"),
+        (altered(pieces()[0], writer="w" * 200), "malformed piece"),
+    ],
+)
+def test_what_is_no_piece_is_counted_and_disturbs_nothing(payload: bytes, reason: str) -> None:
+    receiver, parts = Receiver(), pieces()
+    assert receiver.take(*parts[:3], payload, *parts[3:]) == [MESSAGE]
+    assert receiver.bad.counters() == {f"bad x: {reason}": 1}
+
+
+def test_a_message_that_is_not_what_was_sent_is_not_used() -> None:
+    receiver, parts = Receiver(), pieces()
+    assert receiver.take(altered(parts[0], data=bytes(PIECE)), *parts[1:]) == []
+    assert receiver.bad.counters() == {"bad x: pieces do not make the message": 1}
+    assert receiver.take(parts[0], altered(parts[1], crc32=zlib.crc32(b"")), *parts[1:]) == [MESSAGE]
+
+
+def test_strangers_under_many_names_cannot_fill_it_either() -> None:
+    """With a byte each the bytes held are few."""
+    receiver, small = Receiver(), altered(pieces()[0], size=PIECE + 1, index=1, data=b"x")
+    for k in range(PARTIAL + 500):
+        receiver.take(altered(small, writer=f"stranger-{k}"))
+    assert receiver.assembler.held == PARTIAL
+    assert receiver.bad.counters() == {"bad x: pieces lost": 500}
+    assert receiver.take(*pieces()) == [MESSAGE]
+
+
+def test_strangers_cannot_fill_the_memory() -> None:
+    receiver = Receiver(limit=8 * PIECE)
+    for k in range(300):
+        receiver.take(*pieces(writer=f"stranger-{k}")[:2])
+        assert receiver.assembler.held <= 8 * PIECE
+    assert receiver.take(*pieces()) == [MESSAGE]
+
+
+# -- over a real router --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def config() -> Iterator[Config]:
+    config = live_config()
+    with Router(config):
+        yield config
+
+
+def keyframe(size: int) -> m.Keyframe:
+    data = np.random.default_rng(2).bytes(size)
+    return m.Keyframe(run_id="controller-a", seq=0, arrays={"a": m.Array("|u1", [size], data)})
+
+
+@pytest.mark.live
+def test_on_the_bus_only_pieces_travel_and_every_reader_gets_the_message(config: Config) -> None:
+    sent = keyframe(3_000_000)
+    travelled: list[int] = []
+    with (
+        Bus(config, "controller", "controller-a") as controller,
+        Bus(config, "recorder", "recorder-a") as recorder,
+        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as stranger,
+    ):
+        all_of_it, one = recorder.everything(), recorder.queue(topics.KEYFRAME)
+        stranger.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
+        wait_for(lambda: controller.matched(topics.KEYFRAME))
+        controller.publish(topics.KEYFRAME, sent)
+        wait_for(lambda: one.received == 1 and all_of_it.received == 1)
+        for mailbox in (all_of_it, one):
+            delivery = mailbox.get()
+            assert delivery is not None
+            assert delivery.payload == codec.encode(sent)
+        wait_for(lambda: sum(travelled) > 3_000_000)
+        assert max(travelled) <= PIECE + HEADER
+        assert controller.counters()["sent bulk"] == len(travelled)
+
+
+@pytest.mark.live
+def test_answers_travel_in_pieces(config: Config) -> None:
+    answers = [codec.encode(keyframe(size)) for size in (700_000, 10, 2_000_000)]
+    with (
+        Bus(config, "controller", "controller-a") as controller,
+        Bus(config, "trainer", "trainer-a") as trainer,
+    ):
+        controller.serve("controller/large", lambda _parameters: answers)
+        found: list[list[bytes]] = []
+        wait_for(lambda: bool(found.append(trainer.ask("controller/large", {}, HANG_S)) or found[-1]))
+        assert found[-1] == answers
+        assert "bad controller/large: pieces lost" not in trainer.counters()

@@ -1,0 +1,403 @@
+"""The plant: held, driven, going on alone; in virtual time bit for bit, and as a real process."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import replace
+from itertools import groupby, pairwise
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lbmpc.plants import Plant, PlantError, Truth, get_plant
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.router import Router
+from plant_sim import node
+from plant_sim.simulator import PlantSim
+from plant_sim.watchdog import Orders, Standby
+from protocol import messages as m
+from protocol import topics
+from tests.helpers.live import Ear, Process, health_of, live_config, wait_for
+
+PLANT: Plant = get_plant("moore_greitzer")
+PERIOD = 0.05
+U = float(PLANT.u_e[0])
+
+
+def command(
+    seq: int,
+    u: float,
+    plan: list[float] | None = None,
+    answers: int = 0,
+    run_id: str = "plant-a",
+    period: float = PERIOD,
+) -> m.Command:
+    entries = [[u], *([value] for value in plan or [])]
+    return m.Command(
+        run_id="controller-a",
+        seq=seq,
+        state_run_id=run_id,
+        state_seq=answers,
+        period=period,
+        mode="solver",
+        u=[u],
+        plan=entries,
+    )
+
+
+def backup(
+    seq: int, inputs: list[float], run_id: str = "controller-a", period: float = PERIOD, gain: float = 0.5
+) -> m.Backup:
+    """u = U + input + gain (z - z_e)."""
+    offset = U - gain * float(PLANT.x_e[0])
+    return m.Backup(
+        run_id=run_id,
+        seq=seq,
+        period=period,
+        gain=[[gain, 0.0, 0.0, 0.0]],
+        inputs=[[offset + value] for value in inputs],
+    )
+
+
+def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
+    return PlantSim(PLANT, period, x0, 1.5, "plant-a")
+
+
+# -- in virtual time -------------------------------------------------------------------------------------
+
+
+def test_the_plant_is_held_until_its_first_command() -> None:
+    sim = plant()
+    for k in range(5):
+        state = sim.sample(k * PERIOD)
+        assert (state.seq, state.x, state.applied) == (k, PLANT.x0.tolist(), None)
+        assert (state.source, state.command_seq) == ("hold", -1)
+    assert not sim.moving
+
+
+# With a period of 0.03 s an average over the period would round, with 0.05 s it would not.
+@pytest.mark.parametrize("period", [0.05, 0.03])
+def test_lock_step_applies_each_input_exactly_for_its_period(period: float) -> None:
+    sim, truth = plant(period=period), Truth(PLANT)
+    x = PLANT.x0
+    rng = np.random.default_rng(0)
+    state = sim.sample(0.0)
+    for k in range(60):
+        u = U + float(rng.uniform(-0.05, 0.05))
+        assert sim.command(command(k, u, answers=state.seq, period=period), k * period) == "ok"
+        state = sim.sample((k + 1) * period)
+        x = truth.step(x, np.array([u]), period)
+        assert state.x == x.tolist()
+        assert state.applied == [u]
+        assert (state.source, state.command_seq, state.seq) == ("command", k, k + 1)
+
+
+def test_an_input_in_the_middle_of_a_period_acts_from_there() -> None:
+    sim, truth = plant(), Truth(PLANT)
+    sim.sample(0.0)
+    sim.command(command(0, 1.1), 0.0)
+    sim.sample(PERIOD)
+    sim.command(command(1, 1.3, answers=1), 1.2 * PERIOD)
+    state = sim.sample(2 * PERIOD)
+    x = truth.step(PLANT.x0, np.array([1.1]), PERIOD)
+    x = truth.step(truth.step(x, np.array([1.1]), 0.2 * PERIOD), np.array([1.3]), 0.8 * PERIOD)
+    assert state.x == pytest.approx(x.tolist(), abs=1e-10)
+    assert state.applied == pytest.approx([0.2 * 1.1 + 0.8 * 1.3], abs=1e-12)
+
+
+def test_the_period_in_which_the_plant_is_released_has_no_applied_input() -> None:
+    sim = plant()
+    sim.sample(0.0)
+    sim.command(command(0, U, [U]), 0.3 * PERIOD)
+    assert sim.sample(PERIOD).applied is None
+    assert sim.sample(2 * PERIOD).applied == [U]
+
+
+def test_without_commands_the_plan_and_then_the_safe_input() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U + 0.01, [U + 0.02, U + 0.03, U + 0.04]), 0.0)
+    states = [sim.sample(k * PERIOD) for k in range(1, 8)]
+    assert [state.source for state in states] == ["command", "plan", "plan", "plan", "safe", "safe", "safe"]
+    # The first entry acts for the patience of 1.5 periods, so half of the second period is still its.
+    applied = [state.applied[0] - U for state in states if state.applied]
+    assert applied[:4] == pytest.approx([0.01, 0.015, 0.03, 0.04], abs=1e-12)
+    assert PLANT.safe_gain is not None
+    for before, u in zip(states[3:], applied[4:], strict=False):
+        assert u == pytest.approx(float((PLANT.safe_gain @ (np.array(before.x) - PLANT.x_e))[0]), abs=1e-12)
+    assert all(state.command_seq == 0 for state in states)
+
+
+def test_without_commands_the_backup_policy_acts_on_what_the_plant_measures() -> None:
+    sim, truth = plant(), Truth(PLANT)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U + 0.5] * 4), 0.0)
+    assert sim.backup(backup(0, [0.01, 0.02])) == "ok"
+    states = [sim.sample(k * PERIOD) for k in range(1, 5)]
+    assert [state.source for state in states] == ["command", "plan", "plan", "plan"]
+    x = truth.step(truth.step(PLANT.x0, np.array([U]), PERIOD), np.array([U]), PERIOD / 2)
+    # Entry 0 belongs to the second period, half of which the command was still waited for.
+    u = np.array([U + 0.01 + 0.5 * (x[0] - PLANT.x_e[0])])
+    x = truth.step(x, u, PERIOD / 2)
+    assert states[1].x == pytest.approx(x.tolist(), abs=1e-10)
+    u = np.array([U + 0.02 + 0.5 * (x[0] - PLANT.x_e[0])])
+    assert states[2].applied == pytest.approx(u.tolist(), abs=1e-10)
+    # Where it has no entry any more, the plan goes on with its own of that period.
+    assert states[3].applied == [U + 0.5]
+
+
+def test_the_backup_of_the_command_before_serves_until_the_new_one_is_there() -> None:
+    def applied(backups: int) -> list[float]:
+        """Over the fourth and the fifth period, after three commands a fifth of a period late."""
+        sim = plant(PLANT.x_e)
+        for k in range(3):
+            sim.sample(k * PERIOD)
+            sim.command(command(k, U, [U + 0.3] * 9, answers=k), (k + 0.2) * PERIOD)
+            if k < backups:
+                assert sim.backup(backup(k, [0.01, 0.02, 0.03, 0.04], gain=0.0)) == "ok"
+        sim.sample(3 * PERIOD)
+        states = [sim.sample(4 * PERIOD), sim.sample(5 * PERIOD)]
+        return [state.applied[0] - U for state in states if state.applied]
+
+    # Command 2 acts until 3.7; then the entries of command 1 that belong to its periods from 3.2 and from 4.2 on.
+    assert applied(backups=2) == pytest.approx([0.3 * 0.02, 0.2 * 0.02 + 0.8 * 0.03], abs=1e-12)
+    # That of two commands ago is not followed.
+    assert applied(backups=1) == pytest.approx([0.3 * 0.3, 0.3], abs=1e-12)
+
+
+def test_a_backup_without_its_command_is_refused() -> None:
+    sim = plant(PLANT.x_e)
+    assert sim.backup(backup(0, [0.0])) == "foreign"
+    sim.sample(0.0)
+    sim.command(command(5, U, [U] * 3), 0.0)
+    assert sim.backup(backup(5, [0.0], period=1.0)) == "wrong period"
+    assert sim.backup(backup(4, [0.0])) == "stale"
+    assert sim.backup(backup(5, [0.0], run_id="controller-b")) == "foreign"
+    assert sim.backup(backup(5, [0.0])) == "ok"
+
+
+def test_a_backup_whose_numbers_overflow_leaves_the_plant_to_the_plan() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U + 0.1] * 3), 0.0)
+    huge = msgspec.structs.replace(backup(0, [0.0, 0.0]), gain=[[1e308, 1e308, -1e308, 1e308]])
+    assert sim.backup(msgspec.structs.replace(huge, inputs=[[-1e308], [1e308]])) == "ok"
+    sim.sample(PERIOD)
+    assert sim.sample(2 * PERIOD).applied == pytest.approx([U + 0.05], abs=1e-12)
+
+
+@pytest.mark.parametrize("period", [0.1, 0.05, 0.01])
+def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
+    """With a constant input it would leave for the surge that the equilibrium is unstable towards."""
+
+    def after(plant: Plant) -> float:
+        sim = PlantSim(plant, period, PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0]), 1.5, "plant-a")
+        sim.sample(0.0)
+        sim.command(command(0, U, period=period), 0.0)
+        for k in range(1, round(10 / period)):
+            state = sim.sample(k * period)
+        assert state.source == "safe"
+        return float(np.abs(np.array(state.x) - PLANT.x_e).max())
+
+    assert after(PLANT) < 0.01
+    assert after(replace(PLANT, safe_gain=None)) > 0.1
+
+
+def test_a_fresh_command_ends_the_plan() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U, [U] * 3), 0.0)
+    for k in range(1, 4):
+        state = sim.sample(k * PERIOD)
+    assert state.source == "plan"
+    sim.command(command(9, U + 0.01, answers=3), 3 * PERIOD)
+    state = sim.sample(4 * PERIOD)
+    assert (state.source, state.applied, state.command_seq) == ("command", [U + 0.01], 9)
+
+
+@given(
+    st.floats(1.0, 6.0),
+    st.integers(0, 8),
+    st.integers(0, 8),
+    st.floats(0.0, 1e7),
+    st.floats(0.001, 10.0),
+    st.sampled_from([None, PLANT.safe_gain]),
+)
+def test_what_drives_always_moves_on(
+    patience: float, entries: int, backups: int, arrived: float, period: float, gain: np.ndarray | None
+) -> None:
+    held = replace(PLANT, safe_gain=gain)
+    orders = Orders(held, command(0, U, [U] * entries, period=period), arrived, patience)
+    standby = Standby(backup(0, [0.0] * backups, period=period), arrived) if backups else None
+    t, sources = arrived, []
+    while np.isfinite(t):
+        drive = orders.drive(t, PLANT.x_e, standby)
+        assert drive.until > t
+        sources.append(drive.source)
+        t = drive.until
+        if (gain is not None and sources.count("safe") > 3) or len(sources) > 3 + max(entries, backups):
+            break
+    assert sources[0] == "command"
+    assert sources[-1] == "safe"
+    safe = sources.index("safe")
+    assert sources[1:safe] == ["plan"] * (safe - 1)
+    assert sources[safe:] == ["safe"] * (len(sources) - safe)
+
+
+def test_the_actuator_clips_and_what_is_reported_is_the_clipped_input() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, 99.0, [-99.0] * 5), 0.0)
+    assert sim.sample(PERIOD).applied == PLANT.u_max.tolist()
+    assert sim.sample(3 * PERIOD).applied is None  # a sample was missed
+    state = sim.sample(4 * PERIOD)
+    assert (state.applied, state.source, state.seq) == (PLANT.u_min.tolist(), "plan", 4)
+
+
+def test_what_must_not_be_obeyed_is_refused() -> None:
+    sim = plant()
+    assert sim.command(command(0, U), 0.0) == "foreign"  # there was no sample yet
+    sim.sample(0.0)
+    assert sim.command(command(0, U, run_id="plant-b"), 0.0) == "foreign"
+    assert sim.command(command(0, U, answers=1), 0.0) == "foreign"
+    assert sim.command(command(0, U, answers=-1, run_id=""), 0.0) == "answers no sample"
+    assert sim.command(command(0, U, period=3000.0), 0.0) == "wrong period"
+    assert not sim.sample(PERIOD).command_seq >= 0
+    assert sim.command(command(0, U, answers=1), PERIOD) == "ok"
+    assert sim.sample(2 * PERIOD).source == "command"
+    # Nor when it moves: the plan of a controller that hears no states is worse than the policy that the plant has.
+    assert sim.command(command(1, U, answers=-1, run_id=""), PERIOD) == "answers no sample"
+    assert sim.sample(3 * PERIOD).command_seq == 0
+
+
+def test_old_commands_in_a_burst_are_refused() -> None:
+    sim = plant(PLANT.x_e)
+    sim.sample(0.0)
+    sim.command(command(0, U), 0.0)
+    for k in range(1, 61):
+        sim.sample(k * PERIOD)
+    burst = 60.5 * PERIOD
+    verdicts = [sim.command(command(k, U, answers=k), burst) for k in range(1, 61)]
+    assert verdicts == ["stale"] * 57 + ["ok"] * 3
+
+
+def test_working_ahead_changes_nothing() -> None:
+    def states(ahead: bool) -> list[m.PlantState]:
+        sim, rng, found = plant(), np.random.default_rng(1), []
+        for k in range(30):
+            found.append(sim.sample(k * PERIOD))
+            if ahead:
+                sim.prepare((k + 1) * PERIOD)
+            if k % 7 < 5:
+                at = (k + rng.uniform(0.0, 0.9)) * PERIOD
+                sim.command(command(k, U + rng.uniform(-0.05, 0.05), [U] * 2, answers=k), at)
+            if ahead:
+                sim.prepare((k + 1) * PERIOD)
+        return found
+
+    assert states(ahead=True) == states(ahead=False)
+
+
+def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
+    sim = plant(np.array([-1.6, 0.05, 2.0, 0.0]))
+    sim.sample(0.0)
+    sim.command(command(0, float(PLANT.u_max[0]), [float(PLANT.u_max[0])] * 60), 0.0)
+    with pytest.raises(PlantError, match="pressure y"):
+        sim.sample(PERIOD * 10)
+
+
+# -- as a process ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.live
+def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
+    # The stranger must stay one, however slow this machine is.
+    config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]", "bus.follow_silence=60.0")
+    with Router(config), Bus(config, "controller", "controller-a") as bus:
+        ear = Ear(bus)
+        with Process("plant_sim.node", config) as process:
+            ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
+            stranger = Bus(config, "controller", "controller-b")
+            stranger.open()
+            wait_for(lambda: bus.matched(topics.COMMAND) and stranger.matched(topics.COMMAND))
+            for k in range(5):
+                ear.of(topics.PLANT_STATE)
+                state = ear.until(lambda message: isinstance(message, m.PlantState))
+                assert isinstance(state, m.PlantState)
+                answer = command(k, U + 0.01, [U] * 40, answers=state.seq, run_id=state.run_id)
+                bus.publish(topics.COMMAND, answer)
+                stranger.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
+            ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
+            foreign = "bad controller/command: foreign"
+            ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
+            process.signal(signal.SIGINT)
+            ear.until(health_of("plant", status="stopping"))
+            assert process.end() == 0
+            stranger.close()
+    states = ear.of(topics.PLANT_STATE)
+    order = [source for source, _ in groupby(state.source for state in states)]
+    assert order[0] == "hold"
+    assert "command" in order
+    assert order[-2:] == ["plan", "safe"]
+    # Where this test was kept waiting for longer than a plan lasts, a period may begin under the safe input.
+    driven = [after for before, after in pairwise(states) if "safe" not in (before.source, after.source)]
+    applied = {state.applied[0] for state in driven if state.applied}
+    assert applied
+    assert all(U - 1e-9 <= u <= U + 0.01 + 1e-9 for u in applied)
+    seqs = [state.seq for state in states]
+    assert seqs == sorted(set(seqs))
+
+
+@pytest.mark.live
+def test_a_plant_whose_motion_ends_says_why() -> None:
+    config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
+    high = float(PLANT.u_max[0])
+    with Router(config), Bus(config, "controller", "controller-a") as bus:
+        ear = Ear(bus)
+        with Process("plant_sim.node", config) as process:
+            failed = health_of("plant", status="failed")
+            wait_for(lambda: bus.matched(topics.COMMAND))
+            health, seq = None, 0
+            # Until it has had one in time: a command that answers an old state is refused.
+            while not isinstance(health, m.Health):
+                health = ear.until(lambda message: isinstance(message, m.PlantState) or failed(message))
+                if isinstance(health, m.PlantState):
+                    bus.publish(
+                        topics.COMMAND,
+                        command(
+                            seq, high, [high] * 60, answers=health.seq, run_id=health.run_id, period=0.02
+                        ),
+                    )
+                    seq += 1
+            assert "pressure y" in health.note
+            assert process.end() == 3
+            assert "Traceback" not in process.said
+            assert "pressure y" in process.said
+
+
+def test_a_wrong_plant_is_a_message_for_a_person(caplog: pytest.LogCaptureFixture) -> None:
+    assert node.main(live_config('plant.model="moore"')) == 2
+    assert node.main(live_config("plant.x0=[1.0]")) == 2
+    assert "did you mean 'moore_greitzer'?" in caplog.text
+    assert "plant.x0 has 1 entries; moore_greitzer has 4 states: z, y, r, rdot" in caplog.text
+
+
+@pytest.mark.live
+def test_a_plant_without_a_router_can_be_stopped() -> None:
+    config = live_config()
+    with Process("plant_sim.node", config) as process:
+        wait_for_words(process, "waiting for it")
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0
+        assert "Traceback" not in process.said
+
+
+def wait_for_words(process: Process, words: str) -> None:
+    """Read what the process says up to a line with these words."""
+    for line in process.lines():
+        if words in line:
+            return
+    raise AssertionError(f"the process never said {words!r}")

@@ -1,0 +1,440 @@
+"""The log of a run: what goes in comes out; others can read it; what is wrong with a file is said."""
+
+from __future__ import annotations
+
+import json
+import resource
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from lbmpc.plants import get_plant
+from node_runtime.config.sections import Config, from_json, override
+from protocol import codec, topics
+from protocol import messages as m
+from run_log.errors import LogError, LogExistsError
+from run_log.reading.reader import gather, read_run
+from run_log.reading.recover import recover
+from run_log.writing.durable_file import Sink
+from run_log.writing.save import save
+from run_log.writing.writer import LogWriter
+from tests.helpers.run_log_samples import Logged, synthetic, write
+
+STEPS = 60
+PLANT = get_plant("moore_greitzer")
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    # Small chunks, so that a short log has many.
+    return override(Config(), ["log.chunk_bytes=8192", "controller.keyframe_every=20", "seed=7"])
+
+
+@pytest.fixture(scope="module")
+def messages(config: Config) -> list[Logged]:
+    return synthetic(config, STEPS)[1]
+
+
+@pytest.fixture(scope="module")
+def whole(config: Config, messages: list[Logged], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("log") / "run.mcap", config, messages)
+
+
+def payloads(messages: list[Logged]) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    for topic, message, _ in messages:
+        found.setdefault(topic.name, []).append(codec.encode(message))
+    return found
+
+
+def logged(path: Path) -> dict[str, list[bytes]]:
+    return {name: [entry.payload for entry in entries] for name, entries in read_run(path).streams.items()}
+
+
+# -- writing and reading ---------------------------------------------------------------------------------
+
+
+def test_every_byte_comes_back(whole: Path, config: Config, messages: list[Logged]) -> None:
+    run = read_run(whole)
+    assert not run.truncated
+    assert not run.recovered
+    assert run.config == config
+    assert logged(whole) == payloads(messages)
+    assert len(run.ticks) == len(run.results) == len(run.commands) == STEPS
+    assert (
+        run.entries(topics.COMMAND)[3].log_time
+        == [t for topic, _, t in messages if topic is topics.COMMAND][3]
+    )
+    assert [info.process for info in run.run_infos] == ["controller"]
+    assert len(run.samples) == STEPS - 1
+
+
+def test_attachments_say_what_ran(whole: Path, config: Config) -> None:
+    attached = read_run(whole).attachments
+    assert from_json(attached["config.json"].decode()) == config
+    assert b"keyframe_every = 20" in attached["config.toml"]
+    assert json.loads(attached["seeds.json"]) == {"seed": 7}
+    assert json.loads(attached["units.json"])["rdot"] == "1/s"
+    assert json.loads(attached["versions.json"]) == {"python": "3.11"}
+    schemas = json.loads(attached["schemas.json"])
+    assert schemas["channels"]["raw/controller/tick"] == "Tick"
+    assert "state_verdict" in schemas["types"]["Tick"]["properties"]
+
+
+def test_a_reader_that_is_not_ours_reads_it_all(whole: Path, messages: list[Logged]) -> None:
+    raw, views = 0, 0
+    with whole.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert {a.name for a in reader.iter_attachments()} >= {"config.json", "config.toml", "versions.json"}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic.startswith("raw/"):
+                fields = msgpack.unpackb(message.data)
+                assert fields["run_id"]
+                assert channel.message_encoding == "msgpack"
+                raw += 1
+            else:
+                assert schema is not None
+                assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+                obey(json.loads(schema.data), strict_json(message.data), channel.topic)
+                views += 1
+        summary = reader.get_summary()
+    keyframes = sum(topic is topics.KEYFRAME for topic, _, _ in messages)
+    assert raw == len(messages)
+    assert views == len(messages) - keyframes
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == raw + views
+
+
+def strict_json(data: bytes) -> Any:
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(data, parse_constant=refuse)
+
+
+def obey(schema: dict[str, Any], value: Any, where: str) -> None:
+    """The part of JSON schema that the views use."""
+    kinds = {"number": (int, float), "integer": int, "string": str, "boolean": bool, "object": dict}
+    assert isinstance(value, kinds[schema["type"]]), where
+    if schema["type"] != "object":
+        return
+    known, others = schema.get("properties", {}), schema["additionalProperties"]
+    assert set(schema.get("required", [])) <= value.keys(), where
+    for name, child in value.items():
+        assert name in known or others, f"{where}.{name}"
+        obey(known.get(name, others), child, f"{where}.{name}")
+
+
+def test_views_have_the_plants_names(whole: Path) -> None:
+    shown = {}
+    with whole.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            shown[channel.topic] = strict_json(message.data) if channel.topic.startswith("view/") else None
+    assert set(shown["view/plant/state"]["x"]) == {"z", "y", "r", "rdot"}
+    assert set(shown["view/controller/command"]["u"]) == {"u"}
+    assert "plan" not in shown["view/controller/command"]
+    assert set(shown["view/trainer/hidden_weights"]["layer_norms"]) == {"W_1", "W_2"}
+    assert set(shown["view/controller/output_weights"]["column_norms"]) == {"z", "y", "r", "rdot"}
+    assert "view/controller/keyframe" not in shown
+
+
+def test_garbage_is_logged_as_it_came(tmp_path: Path, config: Config) -> None:
+    state = m.PlantState(run_id="p", seq=0, t=0.0, x=[0.0] * 4, applied=None, source="hold", command_seq=-1)
+    nan = codec.encode(msgspec.structs.replace(state, x=[float("nan"), 0.0, 0.0, 0.0]))
+    short = codec.encode(msgspec.structs.replace(state, x=[1.0, 2.0]))
+    bad = [b"", b"\xc1", b"\x93\x01\x02", msgpack.packb({"run_id": 3}), nan, b"\xdd\xff\xff\xff\xff"]
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config, PLANT) as writer:
+        for i, payload in enumerate([*bad, short, codec.encode(state)]):
+            writer.write("plant/state", payload, i)
+        writer.write("some/stranger", b"hello", 9)
+        for i in range(300):
+            writer.write(f"stranger/{i}", b"hello", 10)
+        assert writer.counters["without view"] == len(bad) + 1
+        assert writer.counters["dropped"] == 201
+        assert writer.bad["bad plant/state: not finite"] == 1
+    run = read_run(path)
+    assert run.bad == {"plant/state: malformed": 5, "plant/state: not finite": 1}
+    assert [s.x for s in run.plant_states] == [[1.0, 2.0], [0.0] * 4]
+    assert run.strangers["some/stranger"] == 1
+    with path.open("rb") as stream:
+        found = [(c.topic, x.data) for _, c, x in make_reader(stream).iter_messages()]
+    raw = [data for topic, data in found if topic == "raw/plant/state"]
+    assert raw == [*bad, short, codec.encode(state)]
+    assert [topic for topic, _ in found].count("view/plant/state") == 1
+
+
+@pytest.mark.parametrize(("rate", "views"), [(20, 40), (100, 200), (1000, 200)])
+def test_a_fast_loop_has_all_its_bytes_in_the_log_and_a_view_a_hundred_times_a_second(
+    tmp_path: Path, config: Config, rate: int, views: int
+) -> None:
+    path = tmp_path / "run.mcap"
+    weights = m.OutputWeights(
+        run_id="c", seq=0, hidden_version=0, hidden_sha256="", K=m.Array.of(np.zeros((3, PLANT.d)))
+    )
+    with LogWriter(path, config, PLANT) as writer:
+        for i in range(2 * rate):
+            state = m.PlantState(
+                run_id="p", seq=i, t=i / rate, x=[0.0] * 4, applied=None, source="hold", command_seq=-1
+            )
+            writer.write("plant/state", codec.encode(state), i * 1_000_000_000 // rate)
+            # Of topics without such a limit nothing is left out.
+            writer.write("controller/output_weights", codec.encode(weights), i * 1_000_000_000 // rate)
+    with path.open("rb") as stream:
+        found = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
+    assert [found.count(name) for name in ("raw/plant/state", "view/plant/state")] == [2 * rate, views]
+    assert found.count("view/controller/output_weights") == 2 * rate
+
+
+def test_a_simulation_saves_the_same_log_twice(
+    tmp_path: Path, config: Config, messages: list[Logged]
+) -> None:
+    run = gather(config, messages)
+    save(run, tmp_path / "a.mcap")
+    save(run, tmp_path / "b.mcap")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    assert logged(tmp_path / "a.mcap") == payloads(messages)
+
+
+# -- a disk that does not take it ------------------------------------------------------------------------
+
+
+def test_nothing_is_ever_overwritten(tmp_path: Path, config: Config) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(LogExistsError, match="exists already"):
+        LogWriter(path, config, PLANT, patient=True)
+    assert path.read_bytes() == b"mine"
+
+
+def test_an_unwritable_place_is_an_error_or_is_waited_for(tmp_path: Path, config: Config) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    path = tmp_path / "file" / "run.mcap"
+    with pytest.raises(LogError, match="cannot be created"):
+        LogWriter(path, config, PLANT)
+    writer = LogWriter(path, config, PLANT, patient=True)
+    writer.write("plant/state", b"early", 1)
+    assert not writer.flush()
+    assert writer.error is not None
+    (tmp_path / "file").unlink()
+    assert writer.flush()
+    assert writer.error is None
+    writer.close()
+    assert read_run(path).bad == {"plant/state: malformed": 1}
+
+
+@contextmanager
+def file_size_limit(limit: int) -> Iterator[None]:
+    """No file of this process may grow beyond `limit` bytes: what a full disk is to a writer."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_after_a_full_disk_the_log_goes_on_where_it_stopped(
+    tmp_path: Path, config: Config, messages: list[Logged]
+) -> None:
+    path = tmp_path / "run.mcap"
+    writer = LogWriter(path, config, PLANT)
+    third = len(messages) // 3
+    limit = path.stat().st_size + 500
+    with file_size_limit(limit):
+        for topic, message, log_time in messages[: 2 * third]:
+            writer.write_message(topic, message, log_time)
+        assert not writer.flush()
+        assert writer.error is not None
+        assert "cannot be written" in writer.error
+        assert path.stat().st_size == limit
+        assert read_run(path).truncated
+    for topic, message, log_time in messages[2 * third :]:
+        writer.write_message(topic, message, log_time)
+    assert writer.flush()
+    writer.close()
+    assert logged(path) == payloads(messages)
+    assert not read_run(path).truncated
+
+
+def test_a_disk_that_stays_full_costs_messages_not_memory(tmp_path: Path, config: Config) -> None:
+    path = tmp_path / "run.mcap"
+    noise = np.random.default_rng(0).bytes(10_000)
+    writer = LogWriter(path, config, PLANT)
+    writer._sink.limit = 200_000
+    with file_size_limit(20_000):
+        for i in range(100):
+            writer.write("controller/keyframe", noise, i)
+        writer.flush()
+        assert writer.counters["messages"] < 40
+        assert writer.counters["messages"] + writer.counters["dropped"] == 100
+        with pytest.raises(LogError, match="tandem recover"):
+            writer.close()
+    assert read_run(path).truncated
+
+
+def test_sink_keeps_its_place_in_a_torn_write(tmp_path: Path) -> None:
+    sink = Sink(tmp_path / "file")
+    data = [bytes([i]) * 1000 for i in range(5)]
+    with file_size_limit(1500):
+        for piece in data:
+            sink.write(piece)
+        assert not sink.drain()
+        assert (sink.written, sink.pending, sink.tell()) == (1500, 3500, 5000)
+    assert sink.close()
+    assert (tmp_path / "file").read_bytes() == b"".join(data)
+
+
+# -- files that are not as they should be ----------------------------------------------------------------
+
+
+def test_a_cut_file_is_read_up_to_the_cut(whole: Path, messages: list[Logged], tmp_path: Path) -> None:
+    data, expected = whole.read_bytes(), payloads(messages)
+    cut = tmp_path / "cut.mcap"
+    counts, unreadable = [], []
+    for end in [*range(0, len(data), len(data) // 60), len(data) - 1]:
+        cut.write_bytes(data[:end])
+        try:
+            run = read_run(cut)
+        except LogError:
+            unreadable.append(end)  # cut before there was a configuration
+            continue
+        assert run.truncated
+        assert f"of {end}" in run.note
+        assert "tandem recover" in run.note
+        for name, entries in run.streams.items():
+            found = [entry.payload for entry in entries]
+            assert found == expected[name][: len(found)]
+        counts.append(sum(map(len, run.streams.values())))
+    assert max(unreadable) < 20_000
+    assert counts == sorted(counts)
+    assert counts[-1] == len(messages)
+
+
+def test_any_flipped_bit_is_found(whole: Path, tmp_path: Path) -> None:
+    data = whole.read_bytes()
+    edited = tmp_path / "edited.mcap"
+    rng = np.random.default_rng(1)
+    places = {*range(80), *range(len(data) - 120, len(data)), *rng.integers(0, len(data), 80).tolist()}
+    for place in sorted(places):
+        changed = bytearray(data)
+        changed[place] ^= 1 << int(rng.integers(8))
+        edited.write_bytes(changed)
+        with pytest.raises(LogError) as caught:
+            read_run(edited)
+        assert str(edited) in str(caught.value)
+
+
+def test_damage_says_where_and_what_to_do(whole: Path, tmp_path: Path) -> None:
+    edited = tmp_path / "edited.mcap"
+    data = bytearray(whole.read_bytes())
+    data[len(data) // 2] ^= 4
+    edited.write_bytes(data)
+    with pytest.raises(LogError, match=r"damaged or edited at byte \d+.*tandem recover"):
+        read_run(edited)
+
+
+def test_foreign_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    cases = {
+        b"": "is empty",
+        b"PK\x03\x04 and so on": "not an MCAP file",
+        b"\x89MCAP0\r\n": "ends before anything",
+    }
+    for data, said in cases.items():
+        path.write_bytes(data)
+        with pytest.raises(LogError, match=said):
+            read_run(path)
+    for profile in ("", "ros2"):
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile=profile)
+            writer.finish()
+        with pytest.raises(LogError, match="not a log of Tandem"):
+            read_run(path)
+        with pytest.raises(LogError, match="not a log of Tandem"):
+            recover(path, tmp_path / "out.mcap")
+    with pytest.raises(LogError, match="cannot be read: No such file"):
+        read_run(tmp_path / "nowhere.mcap")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_run(tmp_path)
+
+
+def test_a_lying_chunk_does_not_take_the_memory(whole: Path, tmp_path: Path) -> None:
+    """A chunk that says it is 2^62 bytes when unpacked."""
+    data = bytearray(whole.read_bytes())
+    struct.pack_into("<Q", data, chunks(data)[0] + 9 + 16, 2**62)
+    path = tmp_path / "liar.mcap"
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="chunk"):
+        read_run(path)
+
+
+# -- recover ---------------------------------------------------------------------------------------------
+
+
+def test_recover_makes_a_cut_file_whole(whole: Path, tmp_path: Path) -> None:
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    saved = recover(cut, out)
+    before, after = read_run(cut), read_run(out)
+    assert logged(out) == logged(cut)
+    assert before.truncated
+    assert not after.truncated
+    assert after.recovered
+    assert after.attachments == before.attachments
+    assert saved.messages == sum(map(len, before.streams.values()))
+    assert saved.lost_bytes > 0
+    with out.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        views = [c.topic for _, c, _ in reader.iter_messages() if c.topic.startswith("view/")]
+        assert views
+    assert cut.read_bytes() == data[: len(data) * 2 // 3]
+
+
+def test_recover_overwrites_nothing_and_leaves_whole_files_alone(whole: Path, tmp_path: Path) -> None:
+    assert recover(whole, tmp_path / "none.mcap").log is None
+    assert not (tmp_path / "none.mcap").exists()
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
+    cut.write_bytes(whole.read_bytes()[:-1000])
+    out.write_bytes(b"mine")
+    with pytest.raises(LogExistsError):
+        recover(cut, out)
+    assert out.read_bytes() == b"mine"
+    with pytest.raises(LogExistsError):
+        recover(cut, cut)
+
+
+def chunks(data: bytes | bytearray) -> list[int]:
+    """Where each chunk record begins."""
+    found, position = [], 8
+    while data[position] != 0x0F:  # the end of the data
+        if data[position] == 6:
+            found.append(position)
+        position += 9 + struct.unpack_from("<Q", data, position + 1)[0]
+    return found
+
+
+@pytest.mark.parametrize("which", [0, 4, -1])
+def test_recover_saves_what_is_around_the_damage(whole: Path, tmp_path: Path, which: int) -> None:
+    """The first chunk too, in which the channels are declared."""
+    data = bytearray(whole.read_bytes())
+    data[chunks(data)[which] + 200] ^= 1
+    edited, out = tmp_path / "edited.mcap", tmp_path / "out.mcap"
+    edited.write_bytes(data)
+    saved = recover(edited, out)
+    assert len(saved.damage) >= 1
+    count = sum(map(len, read_run(whole).streams.values()))
+    assert 0.5 * count < saved.messages < count
+    assert sum(map(len, read_run(out).streams.values())) == saved.messages

@@ -1,0 +1,192 @@
+"""A run in figures and pictures, from its log alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from lbmpc import plants
+from lbmpc.plants import get_plant
+from node_runtime.config.sections import Config, override
+from protocol import topics
+from run_log.errors import LogError
+from run_log.reading.reader import gather, read_run
+from run_log.reporting import plots
+from run_log.reporting.report import picture, report
+from run_log.reporting.summary import summarise
+from run_log.reporting.traces import traces
+from tests.helpers.run_log_samples import Logged, synthetic, write
+
+STEPS = 60
+PLANT = get_plant("moore_greitzer")
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    # Small chunks, so that a short log has many.
+    return override(Config(), ["log.chunk_bytes=8192", "controller.keyframe_every=20", "seed=7"])
+
+
+@pytest.fixture(scope="module")
+def messages(config: Config) -> list[Logged]:
+    return synthetic(config, STEPS)[1]
+
+
+@pytest.fixture(scope="module")
+def whole(config: Config, messages: list[Logged], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("log") / "run.mcap", config, messages)
+
+
+# -- figures ---------------------------------------------------------------------------------------------
+
+
+def test_summary_of_a_known_run(config: Config, messages: list[Logged]) -> None:
+    run = gather(config, messages)
+    summary = summarise(run)
+    x = np.array([s.x for s in run.plant_states])
+    z, y = x[:, 0] - 0.5, x[:, 1] - 1.6875
+    assert summary.ticks == STEPS
+    assert summary.late_ticks == 2
+    assert summary.weights_adopted == 2
+    assert summary.weights_refused == 1
+    assert summary.fallback_ticks == 1
+    assert summary.soft_ticks == 1
+    assert summary.cost == pytest.approx(sum(z * z + y * y))
+    assert summary.overshoot == max(z)
+    assert summary.settling_step == STEPS - 1
+    assert summary.final_deviation == max(abs(z[-1]), abs(y[-1]))
+    assert summary.constraint_violations == sum(y < -0.5 - 1e-6)
+    assert summary.constraint_violations > 5
+    errors = [r.prediction_error for r in run.results]
+    assert errors[0] is None
+    assert summary.prediction_error.first_second == pytest.approx(np.mean(errors[1:21]))
+    assert summary.prediction_error.last_second == pytest.approx(np.mean(errors[-20:]))
+    assert summary.solve_ms is not None
+    assert summary.solve_ms.max == max(t.solve_ms for t in run.timings)
+    assert summary.log is None
+
+
+def moved(messages: list[Logged], **changes: Any) -> list[Logged]:
+    """With fields of every plant state replaced by functions of it."""
+    return [
+        (topic, msgspec.structs.replace(message, **{k: f(message) for k, f in changes.items()}), t)
+        if topic is topics.PLANT_STATE
+        else (topic, message, t)
+        for topic, message, t in messages
+    ]
+
+
+def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, messages: list[Logged]) -> None:
+    plain = summarise(gather(config, messages))
+    first = next(message for topic, message, _ in messages if topic is topics.PLANT_STATE)
+    held = [(topics.PLANT_STATE, msgspec.structs.replace(first, seq=i, t=90.0 + i), i) for i in range(5)]
+    later = moved(messages, seq=lambda s: s.seq + 5)
+    liar = (
+        topics.PLANT_STATE,
+        msgspec.structs.replace(first, run_id="liar", x=[99.0] * 4, source="command"),
+        6,
+    )
+    tick = next(message for topic, message, _ in messages if topic is topics.TICK)
+    strange = (topics.TICK, msgspec.structs.replace(tick, run_id="stranger", state=liar[1]), 7)
+    disturbed = summarise(gather(config, [*held, *later[:50], liar, strange, *later[50:]]))
+    assert disturbed == plain
+
+
+def test_summary_of_applied_input_and_settled_states(config: Config, messages: list[Logged]) -> None:
+    at_rest = moved(messages, x=lambda s: PLANT.x_e.tolist(), applied=lambda s: [2.1547 + 5e-7])
+    summary = summarise(gather(config, at_rest))
+    assert (summary.settling_step, summary.constraint_violations, summary.cost) == (0, 0, 0.0)
+    outside = moved(at_rest, applied=lambda s: [2.1547 + 2e-6] if s.seq == 9 else None)
+    assert summarise(gather(config, outside)).constraint_violations == 1
+    late = moved(at_rest, x=lambda s: np.add(PLANT.x_e, [0, 0.021 * (s.seq == 17), 0, 0]).tolist())
+    assert summarise(gather(config, late)).settling_step == 17
+
+
+def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged]) -> None:
+    slow = [
+        (topic, msgspec.structs.replace(message, tick_ms=51.0) if message.seq == 12 else message, t)
+        if topic is topics.TIMING
+        else (topic, message, t)
+        for topic, message, t in messages
+    ]
+    assert summarise(gather(config, slow)).late_ticks == 3
+
+
+# -- pictures --------------------------------------------------------------------------------------------
+
+
+def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
+    files = report(whole, tmp_path / "new" / "folder")
+    parts = ["", "-states", "-input", "-error", "-model_error", "-timing", "-weights"]
+    assert [file.name for file in files] == [f"run{part}.png" for part in parts]
+    for file in files:
+        assert file.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_pictures_have_units_and_bounds(whole: Path) -> None:
+    data = traces(read_run(whole))
+    labels = [ax.get_ylabel() for ax in plots.pictures(data)["states"].axes]
+    assert labels == ["z (–)", "y (–)", "r (–)", "rdot (1/s)"]
+    levels = {
+        line.get_ydata()[0] for line in plots.pictures(data)["states"].axes[1].lines if len(line.get_ydata())
+    }
+    assert {1.1875, 2.1875, 1.6875} <= levels
+    assert data.t[0] == pytest.approx(0.0)
+    assert np.diff(data.t) == pytest.approx(0.05)
+
+
+def test_report_of_a_cut_log_and_of_one_without_a_network(
+    whole: Path, config: Config, messages: list[Logged], tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:60_000])
+    assert picture(read_run(cut), tmp_path / "cut.png").exists()
+    plain = [
+        (
+            topic,
+            msgspec.structs.replace(
+                message, h=None, h_hat=None, prediction_error=None, weights_verdict="none"
+            ),
+            t,
+        )
+        if topic is topics.RESULT
+        else (topic, message, t)
+        for topic, message, t in messages
+        if topic not in (topics.HIDDEN_WEIGHTS, topics.TIMING)
+    ]
+    drawn = plots.pictures(traces(gather(config, plain)))
+    assert set(drawn) == {"states", "input", "error"}
+    with pytest.raises(LogError, match="nothing to draw"):
+        traces(gather(config, [entry for entry in plain if entry[0] is not topics.RESULT]))
+
+
+def test_any_plant_has_its_names_on_the_axes(
+    config: Config, messages: list[Logged], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = dataclasses.replace(
+        PLANT,
+        name="tank",
+        states=("level", "flow", "a", "b"),
+        inputs=("valve",),
+        units={"level": "m", "valve": "%"},
+    )
+    monkeypatch.setitem(plants.PLANTS, "tank", other)
+    run = gather(override(config, ["plant.model=tank"]), messages)
+    drawn = plots.pictures(traces(run))
+    assert drawn["states"].axes[0].get_ylabel() == "level (m)"
+    assert drawn["input"].axes[0].get_ylabel() == "valve (%)"
+    monkeypatch.delitem(plants.PLANTS, "tank")
+    with pytest.raises(LogError, match="no plant is called 'tank'"):
+        summarise(run)
+
+
+def test_reading_needs_neither_torch_nor_a_display() -> None:
+    code = "import sys, run_log.reporting.report, run_log.replaying.replay; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,311 @@
+"""Experiments: one strict file; the same figures for any number of processes and after an interruption; a page that
+needs nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from lbmpc.plants import get_plant
+from node_runtime.config.strict import ConfigError
+from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
+from tandem.experiments import experiment
+from tandem.experiments.experiment import Finished
+from tandem.experiments.reporting import findings
+from tandem.experiments.study import results
+from tandem.experiments.study.declaration import Resolved, load, resolve
+from tandem.experiments.study.plan import Job, code_version, rows
+from tandem.experiments.study.runner import run_all, wanted
+from tandem.experiments.study.work import Record, read
+from tests.helpers.paths import CONFIGS
+
+PLANT = get_plant("moore_greitzer")
+SHIPPED = CONFIGS / "experiments" / "paper.toml"
+SMALL = """
+name = "small"
+title = "A small one"
+steps = 30
+[base]
+controller = { horizon = 15, solver = { compile = "never" } }
+network = { hidden = [6] }
+trainer = { steps = 5 }
+[x0s.some]
+grid = { z = [0.4, 0.6], y = [1.6] }
+[[group]]
+name = "comparison"
+title = "Comparison"
+picture = "trajectories"
+reference = "dnn"
+[[case]]
+name = "linear"
+group = "comparison"
+set.controller.oracle = "linear"
+x0s = "some"
+seeds = 2
+[[case]]
+name = "l2nw"
+group = "comparison"
+set.controller.oracle = "l2nw"
+x0s = "some"
+[[case]]
+name = "dnn"
+group = "comparison"
+label = "network"
+x0s = "some"
+seeds = [3, 4]
+[[group]]
+name = "rows"
+title = "Rows"
+picture = "lemma"
+[[case]]
+name = "gamma"
+group = "rows"
+vary."adaptation.gamma" = [0.2, 0.5]
+log = true
+"""
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+def cases(path: Path, quick: bool = False) -> list[Resolved]:
+    return resolve(load(path), PLANT, str(path), quick)
+
+
+def run_small(path: Path, out: Path, processes: int) -> Finished:
+    return experiment.run(
+        load(path), str(path), PLANT, out, processes, "tandem experiment small.toml", repeats=1
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right", "expected"),
+    [
+        ("steps = 30", "stepz = 30", "unknown key 'stepz'; did you mean 'steps'?"),
+        ("seeds = 2", "seed = 2", "unknown key 'case[0].seed'; did you mean 'case[0].seeds'?"),
+        ('group = "rows"', 'group = "row"', "case[3].group = 'row' is not known; did you mean 'rows'?"),
+        ('x0s = "some"', 'x0s = "sume"', "case[0].x0s = 'sume' is not known; did you mean 'some'?"),
+        (
+            "set.controller.oracle",
+            "set.controler.oracle",
+            "case 'linear': unknown key 'controler'; did you mean 'controller'?",
+        ),
+        ('"adaptation.gamma"', '"adaptation.gama"', "unknown key 'adaptation.gama'; did you mean"),
+        ("z = [0.4, 0.6]", "zz = [0.4]", "x0s.some.grid = 'zz' is not known; did you mean 'z'?"),
+        (
+            "log = true",
+            "faults.nose = 1",
+            "unknown key 'case[3].faults.nose'; did you mean 'case[3].faults.noise'?",
+        ),
+        ('reference = "dnn"', 'reference = "dn"', "reference = 'dn' is not known; did you mean 'dnn'?"),
+    ],
+)
+def test_a_misspelt_key_is_named_with_file_and_nearest(
+    small: Path, wrong: str, right: str, expected: str
+) -> None:
+    small.write_text(SMALL.replace(wrong, right, 1))
+    with pytest.raises(ConfigError) as caught:
+        cases(small)
+    assert str(caught.value).startswith(str(small))
+    assert expected in str(caught.value)
+
+
+def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
+    found = {case.name: case for case in cases(small)}
+    assert list(found) == ["linear", "l2nw", "dnn", "gamma: gamma = 0.2", "gamma: gamma = 0.5"]
+    assert found["dnn"].seeds == [3, 4]
+    assert found["dnn"].x0s == [[0.4, 1.6, 1.1547, 0.0], [0.6, 1.6, 1.1547, 0.0]]
+    assert found["gamma: gamma = 0.5"].config.adaptation.gamma == 0.5
+    plans = list(rows(list(found.values())))
+    assert len(plans) == 2 * 2 + 2 + 2 * 2 + 2
+    # linear draws nothing: both its seeds are one run; so is the floor of every controller from one state.
+    assert len({plan.job.key for plan in plans if plan.case.name == "linear"}) == 2
+    assert len({plan.floor.key for plan in plans if plan.floor is not None}) == 3
+
+
+def test_a_key_changes_with_the_settings_and_with_nothing_else(small: Path) -> None:
+    job: Job = next(iter(rows(cases(small)))).job
+    assert job.key == msgspec.json.decode(msgspec.json.encode(job), type=Job).key
+    assert msgspec.structs.replace(job, steps=31).key != job.key
+
+
+def test_the_shipped_experiment_is_valid_whole_and_quick() -> None:
+    whole, quick = cases(SHIPPED), cases(SHIPPED, quick=True)
+    assert {case.group for case in quick} <= {case.group for case in whole}
+    network = next(case for case in whole if case.name == "dnn")
+    assert network.seeds == list(range(20))
+    assert any(len(case.x0s) == 25 for case in whole)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
+    folder = tmp_path_factory.mktemp("experiment")
+    path = folder / "small.toml"
+    path.write_text(SMALL)
+    return folder, run_small(path, folder / "out", 2)
+
+
+def test_figures_do_not_depend_on_the_number_of_processes(finished: tuple[Path, Finished]) -> None:
+    folder, _made = finished
+    plans = list(rows(cases(folder / "small.toml")))
+    wants = wanted(plans, {"comparison", "rows"}, folder / "no-logs")
+    few = {key: want for key, want in wants.items() if want.log is None}
+    run_all(few, folder / "alone", 1)
+    for key in few:
+        assert (folder / "alone" / f"{key}.json").read_bytes() == (
+            folder / "out/runs" / f"{key}.json"
+        ).read_bytes()
+
+
+def test_the_summary_has_what_it_promises(finished: tuple[Path, Finished]) -> None:
+    _folder, made = finished
+    told = json.loads(made.summary.read_text())
+    assert len(told["rows"]) == 12
+    promised = "case oracle seed x0 cost regret overshoot settling_step violations infeasible_ticks solve_ms"
+    for row in told["rows"]:
+        assert set(promised.split()) <= row.keys()
+        assert len(row["x0"]) == 4
+        assert set(row["solve_ms"]) == {"p50", "p99", "max"}
+    regrets = [row["regret"] for row in told["rows"] if row["oracle"] == "linear"]
+    assert regrets[0] == regrets[1]
+
+
+def test_the_page_needs_nothing_else(finished: tuple[Path, Finished]) -> None:
+    _folder, made = finished
+    html = made.report.read_text()
+    links = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"'>)\s]+)""", html)
+    assert links
+    assert all(link.startswith(("data:", "#")) for link in links)
+    assert "<script" not in html
+    assert html.count("<img") == 4
+    assert "tandem experiment small.toml --only rows" in html
+
+
+def test_the_log_of_a_run_replays(finished: tuple[Path, Finished]) -> None:
+    folder, made = finished
+    logs = sorted((folder / "out/logs").glob("*.mcap"))
+    assert len(logs) == made.logs == 2
+    assert replay(read_run(logs[0])).equal
+
+
+def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finished]) -> None:
+    folder, _made = finished
+    plans = list(rows(cases(folder / "small.toml")))
+    wants = wanted(
+        [plan for plan in plans if plan.case.name in ("linear", "l2nw")], set(), folder / "no-logs"
+    )
+    runs = folder / "again"
+    run_all(wants, runs, 1)
+    whole = {path.name: path.read_bytes() for path in runs.iterdir()}
+    missing, damaged = sorted(whole)[:2]
+    (runs / missing).unlink()
+    (runs / damaged).write_bytes(whole[damaged][:-20])
+    (runs / "x.1.partial").write_text("{")
+    told: list[tuple[int, int]] = []
+    run_all(wants, runs, 1, lambda done, total: told.append((done, total)))
+    assert told[0] == (len(wants) - 2, len(wants))
+    assert told[-1] == (len(wants), len(wants))
+    assert {path.name: path.read_bytes() for path in runs.iterdir()} == whole
+
+
+def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
+    # The other process reads the code anew; so must this one, where somebody edits while tests run.
+    code_version.cache_clear()
+    small.write_text(SMALL.replace("steps = 30", "steps = 150"))
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "tandem", "experiment", str(small), "--out", str(out), "--jobs", "1"]
+    command += ["--only", "comparison"]
+    # Who runs the tests in the background of a shell runs them with SIGINT ignored, and that is inherited.
+    started = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    runs = out / "runs"
+    while not list(runs.glob("*.json")):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            raise AssertionError(f"ended with {started.wait(0.02)}")
+    started.send_signal(signal.SIGINT)
+    said, _ = started.communicate(timeout=120)
+    assert started.returncode == 130, said
+    assert "goes on from there" in said
+    assert "Traceback" not in said
+    kept = {path.name: path.stat().st_mtime_ns for path in runs.glob("*.json")}
+    plans = [plan for plan in rows(cases(small)) if plan.case.group == "comparison"]
+    wants = wanted(plans, {"comparison"}, tmp_path)
+    assert 0 < len(kept) < len(wants)
+    run_all(wants, runs, 2)
+    assert {name: (runs / name).stat().st_mtime_ns for name in kept} == kept
+    assert len(list(runs.iterdir())) == len(wants)
+
+
+SHIPPED_CASES = cases(SHIPPED)
+
+
+def a_record(cost: float, overshoot: float, violations: int = 0) -> Record:
+    job = Job(config=SHIPPED_CASES[0].config, steps=200, faults=SHIPPED_CASES[0].faults)
+    return Record(
+        job=job,
+        lost=None,
+        cost=cost,
+        overshoot=overshoot,
+        settling_step=100,
+        violations=violations,
+        infeasible_ticks=0,
+        weights_adopted=0,
+        error_first=None,
+        error_last=None,
+        traces=None,
+        lemma=None,
+    )
+
+
+def a_result(
+    name: str, costs: list[float], overshoot: float = 0.0, violations: int = 0
+) -> results.CaseResult:
+    case = next(case for case in SHIPPED_CASES if case.name == "dnn")
+    case = msgspec.structs.replace(case, name=name, label=name, seeds=list(range(len(costs))))
+    plans = list(rows([case]))
+    floor = a_record(20.0, 0.0)
+    records: dict[str, Record] = {plan.floor.key: floor for plan in plans if plan.floor is not None}
+    records |= {
+        plan.job.key: a_record(cost, overshoot, violations) for plan, cost in zip(plans, costs, strict=True)
+    }
+    return results.collect(plans, records, {}, PLANT)[0]
+
+
+def test_words_follow_from_the_figures() -> None:
+    base = a_result("base", [21.0, 21.1, 21.2, 21.3])
+    worse, same = a_result("worse", [22.0, 22.1, 22.2, 22.3]), a_result("same", [21.3, 21.2, 21.0, 21.1])
+    breaks = a_result("breaks", [21.0, 21.1, 21.2, 21.3], violations=3)
+    said = findings.compare([base, worse, same, breaks], "base")
+    assert said[0] == "Matters, against base: worse, breaks."
+    assert said[1] == "No clear difference from base: same."
+    assert "more regret, 2.15 against 1.15 in the median in all 4 pairs" in said[2]
+    assert "keeps all constraints in 0 of 4 runs, against 4 of 4 runs" in said[3]
+
+
+def test_regret_is_the_cost_above_the_floor() -> None:
+    assert a_result("some", [21.0, 23.5]).values("regret").tolist() == [1.0, 3.5]
+
+
+def test_a_record_that_lacks_what_is_wanted_is_not_taken(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    path.write_bytes(msgspec.json.encode(a_record(1.0, 0.0)))
+    assert read(path, detail=False) is not None
+    assert read(path, detail=True) is None

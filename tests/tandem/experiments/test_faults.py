@@ -1,0 +1,172 @@
+"""What goes wrong in a lock-step run, the oracle that knows h, K refitted at an adoption, and Lemma 1 on a real run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller_node.build import build_oracle
+from lbmpc.model import build_model
+from lbmpc.oracles import DnnOracle, PerfectOracle
+from lbmpc.oracles.base import function
+from lbmpc.oracles.dnn.adaptation_law import refit
+from lbmpc.plants import PlantError, Truth, get_plant
+from node_runtime.config.sections import Config, load
+from node_runtime.config.strict import ConfigError
+from run_log.reading.reader import Run
+from run_log.replaying.replay import replay
+from tandem.experiments.simulation.faults import Drift, Faults
+from tandem.experiments.simulation.lockstep import follow
+from tandem.experiments.study.lemma import measure
+
+PLANT = get_plant("moore_greitzer")
+SETTINGS = [
+    "controller.solver.compile=never",
+    "controller.horizon=15",
+    "network.hidden=[6]",
+    "trainer.steps=5",
+]
+
+
+def config(*more: str) -> Config:
+    return load(None, [*SETTINGS, *more])
+
+
+def states(run: Run) -> np.ndarray:
+    return np.array([state.x for state in run.plant_states])
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 100.0])
+def test_the_perfect_oracle_knows_h_and_its_slopes(rate: float) -> None:
+    model = build_model(PLANT, 1 / rate)
+    truth, evaluate = Truth(PLANT), function(PerfectOracle(model))
+    rng = np.random.default_rng(5)
+
+    def h(xu: np.ndarray) -> np.ndarray:
+        x, u = xu[:4], xu[4:]
+        after = truth.step(x + PLANT.x_e, u + PLANT.u_e, model.period) - PLANT.x_e
+        return model.label(x, u, after)
+
+    followed = 0
+    for _ in range(20):
+        xu = np.concatenate([rng.uniform(PLANT.x_min, PLANT.x_max) - PLANT.x_e, rng.uniform(-1, 1, 1)])
+        xu[3] *= 0.5
+        try:
+            expected = h(xu)
+            numeric = np.column_stack([(h(xu + step) - h(xu - step)) / 2e-4 for step in 1e-4 * np.eye(5)])
+        except PlantError:
+            continue
+        followed += 1
+        value, slopes = (np.array(part) for part in evaluate(xu[:4], xu[4:], []))
+        np.testing.assert_allclose(value[:, 0], expected, atol=2e-9)
+        np.testing.assert_allclose(slopes, numeric, atol=2e-6)
+    assert followed >= 15
+
+
+def test_refitted_weights_explain_the_samples_and_stay_within_their_bounds() -> None:
+    rng = np.random.default_rng(1)
+    phi, true = rng.normal(size=(80, 5)), rng.normal(size=(5, 2))
+    K, wide = np.zeros((5, 2)), np.full(2, 100.0)
+    np.testing.assert_allclose(refit(K, phi, phi @ true, 1e-9, wide), true, atol=1e-6)
+    np.testing.assert_allclose(refit(K + 1.0, phi, phi @ true, 1e9, wide), K + 1.0, atol=1e-6)
+    tight = refit(K, phi, phi @ true, 1e-9, np.full(2, 0.1))
+    np.testing.assert_allclose(np.linalg.norm(tight, axis=0), 0.1)
+
+
+def test_refit_at_an_adoption_changes_K_and_replays() -> None:
+    kept, fitted = (follow(config(f"adaptation.at_adoption={how}"), 40).run for how in ("keep", "refit"))
+    adopted = [r.seq for r in fitted.results if r.weights_verdict == "adopted"]
+    assert adopted
+    first = adopted[0]
+    K = {
+        name: {w.seq: w.K.numpy() for w in run.output_weights}
+        for name, run in (("kept", kept), ("fitted", fitted))
+    }
+    np.testing.assert_array_equal(K["kept"][first - 1], K["fitted"][first - 1])
+    assert np.abs(K["kept"][first] - K["fitted"][first]).max() > 1e-6
+    assert replay(fitted).equal
+
+
+def test_without_adaptation_the_last_layer_stays() -> None:
+    run = follow(config("adaptation.enabled=false"), 30).run
+    weights = [w.K.numpy() for w in run.output_weights]
+    np.testing.assert_array_equal(weights[0], weights[-1])
+    assert any(r.weights_verdict == "adopted" for r in run.results)
+
+
+def test_the_three_starts_of_K() -> None:
+    model = build_model(PLANT, 0.05)
+    at = np.random.default_rng(0).uniform(-1, 1, (200, 5)) * np.array([0.5, 0.5, 1.0, 20.0, 1.0])
+    size = {}
+    for start in ("zero", "random", "pretrained"):
+        oracle = build_oracle(config(f"adaptation.start={start}"), model)
+        state = oracle.initial_state(np.random.default_rng(7))
+        size[start] = max(np.abs(oracle.estimate(state, xu[:4], xu[4:])).max() for xu in at)
+    assert size["zero"] == 0.0
+    assert 0.0 < size["pretrained"] < 0.5 * size["random"]
+
+
+def test_noise_is_in_what_is_measured_and_not_in_the_truth() -> None:
+    noise = [0.001, 0.001, 0.0, 0.0]
+    run = follow(config("controller.oracle=linear"), 40, Faults(noise=noise)).run
+    measured = np.array([tick.state.x for tick in run.ticks if tick.state is not None])
+    difference = measured - states(run)[:-1]
+    assert 0.0005 < difference[:, :2].std() < 0.0015
+    assert not difference[:, 2:].any()
+    again = follow(config("controller.oracle=linear"), 40, Faults(noise=noise)).run
+    np.testing.assert_array_equal(states(run), states(again))
+    assert replay(run).equal
+
+
+def test_a_command_that_takes_its_time_acts_later_and_is_known_to() -> None:
+    run = follow(config("controller.oracle=linear"), 20, Faults(command_seconds=0.01)).run
+    pieces = [[piece.seconds for piece in tick.state.pieces] for tick in run.ticks[2:] if tick.state]
+    assert len(pieces) == 18
+    for seconds in pieces:
+        assert seconds == pytest.approx([0.01, 0.04])
+    assert replay(run).equal
+    with pytest.raises(ConfigError, match=r"command_seconds = 0.05 is not less than a period, 0.05 s"):
+        follow(config("controller.oracle=linear"), 1, Faults(command_seconds=0.05))
+
+
+def test_a_late_trainer_is_late_and_trains_once_at_a_time() -> None:
+    run = follow(config(), 60, Faults(training_seconds=1.0)).run
+    arrived = [tick.seq for tick in run.ticks if tick.weights is not None]
+    # 20 samples are there at tick 20; what is trained then takes 20 ticks.
+    assert arrived == [40]
+
+
+def test_a_dead_trainer_sends_nothing() -> None:
+    run = follow(config(), 60, Faults(trainer_dies_at=1.5)).run
+    arrived = [tick.seq for tick in run.ticks if tick.weights is not None]
+    assert arrived
+    assert max(arrived) <= 30
+
+
+def test_a_plant_that_drifts_moves_otherwise_from_then_on() -> None:
+    calm = states(follow(config("controller.oracle=linear"), 40).run)
+    for over in (0.0, 0.5):
+        faults = Faults(drift=Drift(to={"slope": 1.4}, at=1.0, over=over))
+        moved = states(follow(config("controller.oracle=linear"), 40, faults).run)
+        np.testing.assert_array_equal(calm[:21], moved[:21])
+        assert np.abs(calm - moved)[30:].max() > 1e-3
+
+
+def test_faults_that_do_not_fit_the_plant_are_named() -> None:
+    with pytest.raises(ConfigError, match="no parameter bta; it has beta, z_c, slope"):
+        follow(config(), 5, Faults(drift=Drift(to={"bta": 2.0}, at=0.0)))
+    with pytest.raises(ConfigError, match="2 entries, the plant has 4 states"):
+        follow(config(), 5, Faults(noise=[0.1, 0.1]))
+
+
+def test_lemma_1_holds_on_a_real_run() -> None:
+    settings = config("network.hidden=[16]")
+    oracle = build_oracle(settings, build_model(PLANT, settings.period))
+    assert isinstance(oracle, DnnOracle)
+    run = follow(settings, 80).run
+    found = measure(run, oracle)
+    assert found is not None
+    logged = [r.prediction_error**2 for r in run.results if r.prediction_error is not None]
+    np.testing.assert_allclose(found.error, logged, rtol=1e-9, atol=1e-18)
+    assert (found.accumulated <= found.bound).all()
+    assert (found.bound <= found.bound_beforehand).all()

@@ -1,0 +1,109 @@
+"""The closed loop in lock-step: what the paper claims, on every seed, and bit for bit the same twice."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from node_runtime.config.sections import load
+from protocol import topics
+from run_log.reading.reader import Run
+from run_log.reporting.summary import Summary, summarise
+from tandem.experiments.simulation.lockstep import simulate
+
+STEPS = 200
+SEEDS = range(10)
+
+
+def run_summary(case: tuple[str, int, bool]) -> Summary:
+    oracle, seed, adapt_only = case
+    config = load(None, [f"controller.oracle={oracle}", f"seed={seed}"])
+    return summarise(simulate(config, STEPS, adapt_only=adapt_only))
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[tuple[str, int, bool], Summary]:
+    """Every run that these tests compare, on both cores; a run is the same in any process."""
+    cases = [("linear", 0, False), ("l2nw", 0, False)]
+    cases += [("dnn", seed, adapt_only) for seed in SEEDS for adapt_only in (False, True)]
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        return dict(zip(cases, pool.map(run_summary, cases), strict=True))
+
+
+Results = dict[tuple[str, int, bool], Summary]
+
+
+def test_no_true_constraint_is_violated_by_any_of_the_three(results: Results) -> None:
+    for case, summary in results.items():
+        if not case[2]:
+            assert summary.constraint_violations == 0, case
+            assert summary.fallback_ticks == 0, case
+            assert summary.soft_ticks == 0, case
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_network_does_not_overshoot_and_settles_earlier(results: Results, seed: int) -> None:
+    both, linear = results["dnn", seed, False], results["linear", 0, False]
+    assert both.overshoot < 0.005
+    assert both.settling_step <= 0.9 * linear.settling_step
+    assert both.final_deviation < 0.02
+    assert both.prediction_error.last_second is not None
+    assert both.prediction_error.last_second < 1e-4
+    assert both.weights_adopted >= 5
+    assert both.weights_refused == 0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_last_layer_alone_overshoots_more(results: Results, seed: int) -> None:
+    alone = results["dnn", seed, True]
+    assert alone.overshoot > results["dnn", seed, False].overshoot
+    assert alone.weights_adopted == 0
+
+
+def test_the_kernel_overshoots_and_linear_mpc_is_slow(results: Results) -> None:
+    assert results["l2nw", 0, False].overshoot > 0.03
+    assert results["linear", 0, False].overshoot < 0.03
+    assert results["linear", 0, False].cost > results["l2nw", 0, False].cost
+
+
+def payloads(run: Run) -> dict[str, list[bytes]]:
+    return {
+        topic.name: [entry.payload for entry in run.entries(topic)]
+        for topic in topics.ALL
+        if topic is not topics.TIMING
+    }
+
+
+def test_a_run_is_bit_identical_for_a_seed_and_differs_for_another() -> None:
+    config = load(None, ["seed=3"])
+    first, second = simulate(config, 45), simulate(config, 45)
+    assert payloads(first) == payloads(second)
+    assert len(first.commands) == 45
+    assert len(first.hidden_weights) >= 3
+    other = simulate(load(None, ["seed=4"]), 45)
+    assert payloads(first)["controller/command"] != payloads(other)["controller/command"]
+
+
+def test_another_rate_settles_too() -> None:
+    # To compile a solver that nothing else uses takes longer than the run without.
+    settings = ["rate=50", "controller.horizon=150", "controller.solver.compile=never"]
+    summary = summarise(simulate(load(None, settings), 500))
+    assert summary.constraint_violations == 0
+    assert summary.final_deviation < 0.02
+
+
+def test_progress_is_told_step_by_step() -> None:
+    told: list[int] = []
+    simulate(load(None, ["controller.oracle=linear"]), 5, progress=told.append)
+    assert told == [1, 2, 3, 4, 5]
+
+
+def test_every_adopted_set_is_one_that_was_trained() -> None:
+    run = simulate(load(None, []), 60)
+    adopted = [result for result in run.results if result.weights_verdict == "adopted"]
+    hashes = [weights.sha256 for weights in run.hidden_weights]
+    assert [result.hidden_sha256 for result in adopted] == hashes[: len(adopted)]
+    assert np.all(np.diff([result.hidden_version for result in adopted]) == 1)

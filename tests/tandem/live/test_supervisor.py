@@ -1,0 +1,267 @@
+"""`tandem run` with its real processes: what it leaves, what it survives, and that nothing is left running."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from run_log.reading.reader import read_run
+from tandem.live.files import claimed
+from tandem.terminal import Refused
+from tests.helpers.live import wait_for
+
+pytestmark = pytest.mark.live
+PATIENCE_S = 180.0
+"""A limit only ends a hang: torch alone takes half a minute to load where four others want the same core."""
+SMALL = {
+    "network.hidden": "[16, 16]",
+    "trainer.steps": "50",
+    "controller.horizon": "30",
+    "controller.solver.compile": "never",
+}
+RUN = [sys.executable, "-m", "tandem", "run"]
+
+
+def small(**more: str) -> list[str]:
+    """Arguments for a run that starts quickly."""
+    return [word for key, value in (SMALL | more).items() for word in ("--set", f"{key}={value}")]
+
+
+class Launched:
+    """One `tandem run` in a process of its own, its last lines followed as they come."""
+
+    def __init__(self, folder: Path, *arguments: str):
+        self.folder = folder
+        self.said: list[str] = []
+        self._news = threading.Condition()
+        self._popen = subprocess.Popen(
+            [*RUN, "--json", "--seconds", "600", "--log", str(folder / "run.mcap"), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._popen.stderr is not None
+        for text in self._popen.stderr:
+            with self._news:
+                self.said.append(text)
+                self._news.notify_all()
+
+    def hears(self, text: str, times: int = 1, after: str = "") -> None:
+        """Wait until it has said this so often, counted from the first line with `after`."""
+
+        def heard() -> bool:
+            begin = next((k for k, line in enumerate(self.said) if after in line), len(self.said))
+            return sum(text in line for line in self.said[begin:]) >= times
+
+        with self._news:
+            assert self._news.wait_for(heard, PATIENCE_S), self.said
+
+    def signal(self, number: signal.Signals) -> None:
+        self._popen.send_signal(number)
+
+    def pids(self, command: str = "") -> list[int]:
+        """Processes that it started, of one tandem command or of all."""
+        config = str(self.folder / "run.processes" / "config.toml").encode()
+        found = []
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit():
+                continue
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+            except OSError:  # it ended meanwhile
+                continue
+            if config in words and (not command or command.encode() in words):
+                found.append(int(entry.name))
+        return found
+
+    def kill(self, command: str) -> None:
+        (pid,) = self.pids(command)
+        os.kill(pid, signal.SIGKILL)
+
+    def ends(self) -> tuple[int, dict]:
+        """The exit code, and the one object on standard output."""
+        assert self._popen.stdout is not None
+        hangs = threading.Timer(PATIENCE_S, self._popen.kill)
+        hangs.start()
+        out = self._popen.stdout.read()
+        hangs.cancel()
+        code = self._popen.wait(PATIENCE_S)
+        self._reader.join(PATIENCE_S)
+        assert self.pids() == []
+        return code, json.loads(out)
+
+    def close(self) -> None:
+        self._popen.kill()
+        self._popen.wait()
+        for pid in self.pids():
+            os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def launched(folder: Path, *arguments: str) -> Iterator[Launched]:
+    run = Launched(folder, *arguments)
+    try:
+        yield run
+    finally:
+        run.close()
+
+
+def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path: Path):
+    (tmp_path / "run.mcap").write_text("an older run")
+
+    def trainers() -> set[str]:
+        infos = read_run(tmp_path / "run.mcap").run_infos
+        return {info.run_id for info in infos if info.process == "trainer"}
+
+    with launched(tmp_path, *small()) as run:
+        run.hears("hidden weights 1 adopted")
+        run.kill("trainer")
+        run.hears("the trainer died (killed by SIGKILL); started again in 0.5 s")
+        wait_for(lambda: len(trainers()) == 2, PATIENCE_S, every=0.2)
+        run.signal(signal.SIGINT)
+        code, result = run.ends()
+    assert code == 0, run.said
+    assert "error" not in result
+    assert result["weights_adopted"] >= 1
+    assert result["log"] == str(tmp_path / "run.mcap")
+    log = read_run(tmp_path / "run.mcap")
+    assert not log.truncated
+    assert [tick.seq for tick in log.ticks] == list(range(result["ticks"]))
+    assert {info.process for info in log.run_infos} >= {
+        "router",
+        "plant",
+        "controller",
+        "trainer",
+        "recorder",
+    }
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "run.1.mcap").read_text() == "an older run"
+    assert any("run.1.mcap" in text for text in run.said)
+
+
+def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
+    with launched(tmp_path, "--oracle", "linear") as run:
+        run.hears("the first command")
+        run.signal(signal.SIGINT)
+        code, result = run.ends()
+    assert code == 0, run.said
+    assert result["ticks"] >= 1
+    assert not read_run(tmp_path / "run.mcap").truncated
+    assert (tmp_path / "run.png").exists()
+
+
+def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):
+    with launched(tmp_path, "--oracle", "linear") as run:
+        run.hears("the first command")
+        for pid in run.pids():
+            os.kill(pid, signal.SIGSTOP)
+        run.signal(signal.SIGINT)
+        time.sleep(0.5)  # sooner it would count as the same Ctrl-C
+        run.signal(signal.SIGINT)
+        code, result = run.ends()
+    # Had it waited for them to stop, as after a first Ctrl-C, it would have ended otherwise.
+    assert code == 130, run.said
+    assert "tandem recover" in result["error"]
+
+
+def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
+    with launched(tmp_path) as run:
+        run.hears("the first command")
+        started = run.pids()
+        assert len(started) == 5
+        run.signal(signal.SIGKILL)
+        wait_for(lambda: run.pids() == [], PATIENCE_S, every=0.05)
+    assert read_run(tmp_path / "run.mcap").ticks
+
+
+def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
+    with launched(tmp_path, "--oracle", "linear") as run:
+        run.hears("the first command")
+        run.kill("plant")
+        code, result = run.ends()
+    assert code == 1
+    assert "the plant died (killed by SIGKILL)" in result["error"]
+    assert result["ticks"] >= 1
+
+
+def test_a_dead_recorder_is_said_loudly_and_the_loop_goes_on(tmp_path: Path):
+    loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop goes on"
+    with launched(tmp_path, "--oracle", "linear") as run:
+        run.hears("the first command")
+        run.kill("record")
+        run.hears(" ticks, ", times=3, after=loudly)
+        run.signal(signal.SIGINT)
+        code, result = run.ends()
+    begin = next(k for k, line in enumerate(run.said) if loudly in line)
+    ticks = [
+        int(line.partition(" ticks, ")[0].split()[-1]) for line in run.said[begin:] if " ticks, " in line
+    ]
+    assert ticks[-1] > ticks[0]
+    assert code == 1
+    assert "the recorder did not end well" in result["error"]
+
+
+def test_a_process_that_cannot_start_is_named_with_its_own_words(tmp_path: Path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with launched(tmp_path, "--set", f'bus.endpoint="tcp/127.0.0.1:{port}"') as run:
+            code, result = run.ends()
+    assert code == 1
+    assert "the router did not get ready" in result["error"]
+    assert f"127.0.0.1:{port} is taken" in result["error"]
+
+
+def test_a_configuration_that_admits_no_controller_is_a_mistake_in_the_configuration(tmp_path: Path):
+    arguments = ("--oracle", "linear", "--set", "controller.W=[1.0, 1.0, 1.0, 50.0]")
+    with launched(tmp_path, *arguments) as run:
+        code, result = run.ends()
+    assert code == 2, result
+    assert "the controller did not get ready" in result["error"]
+
+
+def test_files_are_moved_aside_together_and_two_runs_do_not_meet(tmp_path: Path):
+    log = tmp_path / "a.mcap"
+    for name in ("a.mcap", "a.part2.mcap", "a.png", "a.1.png", "ab.part2.mcap"):
+        (tmp_path / name).write_text(name)
+    with claimed(log) as (files, moved):
+        assert files.folder.is_dir()
+        assert not log.exists()
+        assert len(moved) == 3
+        assert not (tmp_path / "a.part2.mcap").exists()
+        assert (tmp_path / "a.2.part2.mcap").read_text() == "a.part2.mcap"
+        assert (tmp_path / "ab.part2.mcap").exists()
+        assert (tmp_path / "a.2.mcap").read_text() == "a.mcap"
+        assert (tmp_path / "a.2.png").read_text() == "a.png"
+        assert (tmp_path / "a.1.png").read_text() == "a.1.png"
+        log.write_text("growing")
+        with pytest.raises(Refused, match="another run is writing it"), claimed(log):
+            pass
+        assert log.read_text() == "growing"
+    with claimed(log) as (_, moved):
+        assert len(moved) == 1
+
+
+@pytest.mark.parametrize("name", ["a.png", "folder", "file/x.mcap"])
+def test_places_where_no_log_can_be(tmp_path: Path, name: str):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Refused, match=name.split("/")[0]), claimed(tmp_path / name):
+        pass

@@ -1,0 +1,192 @@
+"""One trainer, plants with a router each: every link has its own certificate, and none holds up another."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from node_runtime.config.sections import Config, from_json, load, override, to_json, to_toml
+from node_runtime.config.strict import ConfigError
+from node_runtime.tls import credentials
+from protocol.messages import Health
+from tandem import certificate_authority
+from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
+from tests.trainer_node.test_node import TRAINING, Controller
+from trainer_node.fleet.discovery import OwnRouters
+from trainer_node.main import main
+from trainer_node.node import TrainerNode
+
+pytestmark = pytest.mark.live
+
+
+def site(folder: Path, name: str, *more: str) -> Config:
+    """The configuration of one plant's machine: a router with a local endpoint and one for others, and its keys."""
+    certificate_authority.create(name, [], folder / name, 30)
+    door = free_endpoint().replace("tcp/", "tls/")
+    return live_config(
+        f"name={name}", f'bus.remote="{door}"', f'bus.tls.keys="{folder / name / "router"}"', *more
+    )
+
+
+def fleet(folder: Path, *sites: Config) -> Config:
+    """The trainer's configuration: all sites, with the trainer's folder of each."""
+    places = ", ".join(
+        f'{{name="{one.name}", endpoint="{one.bus.remote}", keys="{folder / one.name / "trainer"}"}}'
+        for one in sites
+    )
+    return override(Config(trainer=TRAINING), [f"trainer.fleet=[{places}]"])
+
+
+@contextmanager
+def routing(config: Config) -> Iterator[None]:
+    with Process("node_runtime.router", config) as process:
+        assert any("with certificates, on" in line for line in process.lines())
+        # Read on: a full pipe would stop it.
+        threading.Thread(target=lambda: list(process.lines()), daemon=True).start()
+        yield
+
+
+@contextmanager
+def training(config: Config) -> Iterator[None]:
+    stop = threading.Event()
+    ended: list[int] = []
+    thread = threading.Thread(target=lambda: ended.append(main(config, stop)))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(HANG_S)
+    assert ended == [0]
+
+
+def published(health: Health) -> bool:
+    return health.counters.get("published", 0) > 0
+
+
+def test_plants_behind_routers_of_their_own_get_weights_from_one_trainer(tmp_path: Path) -> None:
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    absent = site(tmp_path, "jet3")  # its router never runs
+    with ExitStack() as stack:
+        for one in sites:
+            stack.enter_context(routing(one))
+        plants = [
+            stack.enter_context(Controller(one, f"controller-{k}", seed=k)) for k, one in enumerate(sites)
+        ]
+        stack.enter_context(training(fleet(tmp_path, *sites, absent)))
+        for plant in plants:
+            plant.until(published, tick=True)
+        for plant in plants:
+            plant.until(lambda health: health.counters.get("adopted", 0) > 0, tick=True)
+            assert plant.adopted[-1].for_run == plant.run_id
+
+
+def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_relent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN", 0.2)
+    good, other = site(tmp_path, "jet1"), site(tmp_path, "jet2")
+    right = tmp_path / "jet2" / "trainer"
+    kept = tmp_path / "kept"
+    right.rename(kept)
+    with ExitStack() as stack:
+        for one in (good, other):
+            stack.enter_context(routing(one))
+        first = stack.enter_context(Controller(good, "controller-1"))
+        second = stack.enter_context(Controller(other, "controller-2"))
+        stack.enter_context(training(fleet(tmp_path, good, other)))
+        first.until(published, tick=True)
+        assert any("jet2" in text and "no such folder" in text for text in caplog.messages)
+        # Its folder is copied there at last.
+        kept.rename(right)
+        second.until(published, tick=True)
+
+
+def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.fleet.fleet.SHUNNED_S", 0.5)
+    listen = TrainerNode.listen
+    looks: list[float] = []
+
+    def fails_once(node: TrainerNode, now: float) -> None:
+        if node._config.name == "jet1":
+            looks.append(now)
+            if len(looks) == 1:
+                raise MemoryError("a network for a larger machine")
+        listen(node, now)
+
+    monkeypatch.setattr(TrainerNode, "listen", fails_once)
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    with ExitStack() as stack:
+        for one in sites:
+            stack.enter_context(routing(one))
+        plants = [stack.enter_context(Controller(one, f"controller-{k}")) for k, one in enumerate(sites)]
+        stack.enter_context(training(fleet(tmp_path, *sites)))
+        for plant in reversed(plants):
+            plant.until(published, tick=True)
+    assert looks[1] - looks[0] >= 0.5
+    assert any("jet1 is left alone" in text for text in caplog.messages)
+
+
+def test_no_plant_is_told_of_the_others(tmp_path: Path) -> None:
+    sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
+    config = fleet(tmp_path, *sites)
+    said = to_json(OwnRouters(config, config.trainer.fleet, threading.Event()).config("jet1"))
+    assert sites[0].bus.remote in said
+    assert sites[1].bus.remote not in said
+
+
+def test_a_pattern_chooses_from_the_list(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert main(fleet(tmp_path, Config(name="jet1")), threading.Event(), "pump*") == 2
+    assert "no plant of trainer.fleet matches 'pump*'; it has jet1" in caplog.text
+
+
+def test_the_list_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.toml"
+    text = '[[trainer.fleet]]\nname = "jet1"\nendpoint = "tls/10.0.0.5:7448"\n'
+    file.write_text(text)
+    config = load(file)
+    assert config.trainer.fleet[0].endpoint == "tls/10.0.0.5:7448"
+    assert from_json(to_json(config)) == config
+    (tmp_path / "again.toml").write_text(to_toml(config))
+    assert load(tmp_path / "again.toml") == config
+    for wrong, says in (
+        (text + 'kees = "k"\n', "did you mean 'trainer.fleet[0].keys'"),
+        (text + text, "'jet1' is there twice"),
+        (text.replace("jet1", "jet 1"), "name"),
+        (text.replace("endpoint", "#"), "endpoint"),
+    ):
+        file.write_text(wrong)
+        with pytest.raises(ConfigError, match="trainer") as raised:
+            load(file)
+        assert says in str(raised.value)
+        assert str(file) in str(raised.value)
+
+
+def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN", 0.2)
+    only = site(tmp_path, "jet1")
+    folder = tmp_path / "jet1"
+    authority = folder / "authority"
+    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
+    assert isinstance(key, EllipticCurvePrivateKey)
+    issuer = credentials.load_certificate(authority / "certificate.pem")
+    certificate_authority.issue(folder / "trainer", "trainer.jet1", key, issuer, 3.0 / 86400.0, [])
+    with ExitStack() as stack:
+        stack.enter_context(routing(only))
+        plant = stack.enter_context(Controller(only, "controller-1"))
+        stack.enter_context(training(fleet(tmp_path, only)))
+        first = plant.until(published, tick=True)
+        wait_for(lambda: any("expired on" in text for text in caplog.messages))
+        certificate_authority.renew("trainer", folder, [], 30, None)
+        plant.until(published, tick=True, ignored=first.run_id)
+    assert any("our links to" in text for text in caplog.messages)

@@ -1,0 +1,300 @@
+"""The slow timescale: what a training does, what it never touches, when it keeps the old hidden layers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from network_model.description import NetworkDescription, hash_layers, initial_hidden
+from node_runtime.config.sections import TrainerConfig
+from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
+from tests.helpers.paths import ROOT
+from trainer_node import training
+from trainer_node.network import DenseLoss, Network
+from trainer_node.training import Trainer, TrainerError, pick_device
+
+DESCRIPTION = NetworkDescription(
+    states=4,
+    inputs=1,
+    hidden=[32, 32],
+    activations=["tanh", "tanh"],
+    input_scale=[0.5, 0.5, 1.0, 20.0, 1.0],
+    output_scale=[0.01, 0.01, 0.02, 0.01],
+)
+CONFIG = TrainerConfig(capacity=600, batch=256, device="cpu")
+HIDDEN = initial_hidden(DESCRIPTION, np.random.default_rng(0))
+K = np.random.default_rng(1).normal(size=(DESCRIPTION.features, 4)) * 0.1
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    before = torch.get_num_threads()
+    training.use_one_thread()
+    yield
+    torch.set_num_threads(before)
+
+
+def samples(first: int, number: int, seed: int = 2) -> list[Sample]:
+    """Samples of a smooth h of the size that the compressor's has."""
+    rng = np.random.default_rng([seed, first])
+    found = []
+    for seq in range(first, first + number):
+        v = rng.uniform(-1, 1, 5)
+        x, u = v[:4] * DESCRIPTION.input_scale[:4], v[4:] * DESCRIPTION.input_scale[4:]
+        h = np.array([-0.01 * v[0] ** 2, 0.01 * v[1] * v[4], 1e-5 * v[2], 0.0])
+        found.append(Sample(seq=seq, x=x.tolist(), u=u.tolist(), h=h.tolist()))
+    return found
+
+
+def output(
+    trainer: Trainer, seq: int = 40, weights: np.ndarray = K, sha256: str | None = None
+) -> OutputWeights:
+    return OutputWeights(
+        run_id="controller-1",
+        seq=seq,
+        hidden_version=0,
+        hidden_sha256=trainer.sha256 if sha256 is None else sha256,
+        K=Array.of(weights),
+    )
+
+
+def make(config: TrainerConfig = CONFIG, number: int = 300, **changes: Any) -> Trainer:
+    trainer = Trainer(DESCRIPTION, msgspec.structs.replace(config, **changes), 5, "trainer-1", HIDDEN)
+    trainer.add("controller-1", samples(0, number))
+    return trainer
+
+
+def trained(trainer: Trainer, seq: int = 40) -> HiddenWeights:
+    weights = trainer.train(output(trainer, seq), "controller-1")
+    assert weights is not None, trainer.counters
+    return weights
+
+
+def losses(weights: list[np.ndarray]) -> float:
+    """The loss over all 300 samples, written out in numpy."""
+    total = 0.0
+    for sample in samples(0, 300):
+        activation = np.concatenate([sample.x, sample.u]) / DESCRIPTION.input_scale
+        for layer in weights:
+            activation = np.tanh(layer[0] + activation @ layer[1:])
+        h_hat = DESCRIPTION.output_scale * (K.T @ np.concatenate([[1.0], activation]))
+        total += float(np.sum(((h_hat - sample.h) / DESCRIPTION.output_scale) ** 2))
+    return total / 300
+
+
+def test_a_training_lowers_the_loss_of_the_paper_with_K_as_it_was() -> None:
+    trainer = make(batch=300)
+    asked = output(trainer)
+    before = asked.K.data
+    weights = trainer.train(asked, "controller-1")
+    assert weights is not None
+    assert asked.K.data == before
+    assert weights.loss_before == pytest.approx(losses(HIDDEN), rel=1e-5)
+    assert weights.loss_after == pytest.approx(losses(trainer.hidden), rel=1e-4)
+    assert weights.loss_after < 0.5 * weights.loss_before
+    assert weights.samples == 300
+
+
+def test_what_is_published_names_what_it_was_trained_on() -> None:
+    trainer = make()
+    first = trained(trainer, 40)
+    second = trained(trainer, 60)
+    assert (first.run_id, first.for_run, first.trained_on) == ("trainer-1", "controller-1", 40)
+    assert [first.seq, second.seq] == [1, 2]
+    assert first.base_sha256 == hash_layers(HIDDEN)
+    assert second.base_sha256 == first.sha256
+    assert first.network_sha256 == DESCRIPTION.sha256()
+    layers = [layer.numpy() for layer in second.layers]
+    assert [layer.dtype for layer in second.layers] == ["<f4", "<f4"]
+    assert hash_layers(layers) == second.sha256 == trainer.sha256
+    assert all((a == b).all() for a, b in zip(layers, trainer.hidden, strict=True))
+    assert first.samples == CONFIG.batch
+
+
+def run_of_trainings(config: TrainerConfig, seed: int = 5) -> list[HiddenWeights]:
+    trainer = Trainer(DESCRIPTION, config, seed, "trainer-1", HIDDEN)
+    found = []
+    for start in range(0, 900, 150):
+        trainer.add("controller-1", samples(start, 150))
+        found.append(trained(trainer, start))
+    return found
+
+
+@pytest.mark.parametrize("strategy", ["fifo", "reservoir", "novelty"])
+def test_the_same_seed_gives_the_same_weights_bit_for_bit(strategy: Any) -> None:
+    config = TrainerConfig(capacity=200, batch=64, steps=20, strategy=strategy, device="cpu")
+    assert run_of_trainings(config) == run_of_trainings(config)
+    assert run_of_trainings(config)[-1].sha256 != run_of_trainings(config, seed=6)[-1].sha256
+
+
+def test_another_process_trains_the_same_bits() -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
+        "import tests.trainer_node.test_training as t\n"
+        "t.training.use_one_thread()\n"
+        "sys.stdout.write(t.trained(t.make()).sha256)"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert found.stdout == trained(make()).sha256
+
+
+def test_it_is_due_after_enough_new_samples_and_not_before() -> None:
+    trainer = make(number=0, train_every=20, min_samples=50)
+    for first in range(0, 40, 20):
+        trainer.add("controller-1", samples(first, 20))
+        assert not trainer.due()
+    trainer.add("controller-1", samples(40, 10))
+    assert trainer.due()
+    trained(trainer)
+    assert not trainer.due()
+    trainer.add("controller-1", samples(30, 20))
+    assert trainer.counters["samples met before"] == 20
+    trainer.add("controller-1", samples(50, 19))
+    assert not trainer.due()
+    trainer.add("controller-1", samples(69, 1))
+    assert trainer.due()
+
+
+def test_samples_that_cannot_be_right_never_reach_the_buffer() -> None:
+    trainer = make(number=30)
+    good = samples(30, 1)[0]
+    bad = [
+        msgspec.structs.replace(good, x=[float("nan"), 0.0, 0.0, 0.0]),
+        msgspec.structs.replace(good, h=[0.0, float("inf"), 0.0, 0.0]),
+        msgspec.structs.replace(good, u=[]),
+        msgspec.structs.replace(good, h=[0.0]),
+    ]
+    assert trainer.add("controller-1", [*bad, good]) == 1
+    assert trainer.counters["bad samples"] == 4
+    assert len(trainer.buffer) == 31
+    assert np.isfinite(trained(trainer).loss_after)
+
+
+def broken_loss(value: float) -> Callable[[DenseLoss], torch.Tensor]:
+    def gradient(self: DenseLoss) -> torch.Tensor:
+        return torch.full_like(self._gradient, value)
+
+    return gradient
+
+
+def flipped(self: DenseLoss, right: Callable[[DenseLoss], torch.Tensor] = DenseLoss.gradient) -> torch.Tensor:
+    return right(self).neg()
+
+
+@pytest.mark.parametrize(
+    ("gradient", "reason"),
+    [
+        (broken_loss(float("nan")), "kept: not finite"),
+        (flipped, "kept: loss not lower"),
+        (broken_loss(0.0), "kept: loss not lower"),
+    ],
+)
+def test_a_training_that_goes_wrong_leaves_the_old_layers(
+    monkeypatch: pytest.MonkeyPatch, gradient: Any, reason: str
+) -> None:
+    trainer = make()
+    monkeypatch.setattr(DenseLoss, "gradient", gradient)
+    assert trainer.train(output(trainer), "controller-1") is None
+    assert trainer.counters[reason] == 1
+    assert trainer.sha256 == hash_layers(HIDDEN)
+    assert trainer.version == 0
+    monkeypatch.undo()
+    assert trained(trainer).base_sha256 == hash_layers(HIDDEN)
+
+
+@pytest.mark.parametrize(
+    ("weights", "reason"),
+    [
+        (np.full_like(K, np.nan), "kept: K is not finite"),
+        (np.full_like(K, 1e300), "kept: K is too large"),
+        (K[:, :3], "kept: K has the wrong shape"),
+        (K[:-1], "kept: K has the wrong shape"),
+    ],
+)
+def test_output_weights_that_cannot_be_used_are_named(weights: np.ndarray, reason: str) -> None:
+    trainer = make()
+    assert trainer.train(output(trainer, weights=weights), "controller-1") is None
+    assert trainer.counters[reason] == 1
+
+
+def test_layers_that_the_controller_would_refuse_are_not_published() -> None:
+    norm = float(np.linalg.norm(HIDDEN[1]))
+    tight = msgspec.structs.replace(DESCRIPTION, max_layer_norm=norm * 1.0001)
+    trainer = Trainer(tight, CONFIG, 5, "trainer-1", HIDDEN)
+    trainer.add("controller-1", samples(0, 300))
+    assert trainer.train(output(trainer), "controller-1") is None
+    assert trainer.counters["kept: norm bound"] == 1
+
+
+def test_it_goes_on_from_the_layers_that_K_belongs_to() -> None:
+    """The controller did not adopt the last weights: K was adapted to the ones before."""
+    trainer = make()
+    first = trained(trainer)
+    second = trained(trainer)
+    again = trainer.train(output(trainer, sha256=first.sha256), "controller-1")
+    assert again is not None
+    assert again.base_sha256 == first.sha256
+    assert again.seq == second.seq + 1
+    # Other samples were drawn, so the layers differ; but both began at the same loss, nearly.
+    assert again.loss_before == pytest.approx(second.loss_before, rel=0.3)
+    assert trainer.train(output(trainer, sha256="0" * 64), "controller-1") is None
+    assert trainer.counters["kept: K belongs to unknown hidden weights"] == 1
+
+
+def test_it_goes_on_from_a_snapshot_with_its_samples() -> None:
+    trainer = make()
+    trained(trainer)
+    other = initial_hidden(DESCRIPTION, np.random.default_rng(9))
+    trainer.resume(other, version=17)
+    weights = trained(trainer)
+    assert weights.seq == 18
+    assert weights.base_sha256 == hash_layers(other)
+    assert len(trainer.buffer) == 300
+    with pytest.raises(ValueError, match="shapes"):
+        trainer.resume(other[:1])
+
+
+def test_a_device_that_is_not_there_is_named() -> None:
+    if torch.cuda.is_available():
+        assert pick_device("cuda").type == "cuda"
+    else:
+        with pytest.raises(TrainerError, match=r"trainer\.device"):
+            pick_device("cuda")
+        assert pick_device("auto").type == "cpu"
+    assert pick_device("cpu").type == "cpu"
+
+
+@pytest.mark.parametrize("activations", [["tanh", "sigmoid"], ["relu", "softsign"], ["softplus", "tanh"]])
+def test_the_gradient_written_out_is_that_of_autograd(activations: Any) -> None:
+    description = msgspec.structs.replace(DESCRIPTION, hidden=[7, 5], activations=activations)
+    rng = np.random.default_rng(3)
+    network = Network(description, torch.float64)
+    network.load([rng.normal(size=shape) for shape in description.layer_shapes])
+    weights, xu, h = rng.normal(size=(6, 4)), rng.normal(size=(50, 5)), 0.01 * rng.normal(size=(50, 4))
+    by_hand = DenseLoss(network, xu, h, weights)
+    error = network.scaled_targets(network(network.tensor(xu), network.tensor(weights)) - network.tensor(h))
+    loss = error.square().sum(dim=1).mean()
+    loss.backward()
+    assert by_hand.value() == pytest.approx(loss.item(), rel=1e-12)
+    torch.testing.assert_close(by_hand.gradient(), network.flat.grad, rtol=1e-10, atol=1e-12)
+
+
+def test_a_training_is_quick() -> None:
+    """200 steps on 512 samples: about 40 ms of one core; the limit leaves room for slow machines."""
+    trainer = make(batch=512, capacity=2000, number=600)
+    taken = []
+    for _ in range(3):
+        start = time.thread_time()
+        trained(trainer)
+        taken.append(time.thread_time() - start)
+    assert min(taken) < 0.3, taken

@@ -1,0 +1,24 @@
+"""A recurrent network in the real processes: samples with their past reach the trainer, its weights come back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
+from tests.tandem.live.test_supervisor import launched, small
+
+
+@pytest.mark.live
+def test_a_recurrent_network_learns_live_and_its_log_replays(tmp_path: Path) -> None:
+    with launched(tmp_path, "--seconds", "5", *small(**{"network.architecture": "rnn"})) as run:
+        code, result = run.ends()
+    assert code == 0, run.said
+    assert result["weights_adopted"] >= 1
+    log = read_run(tmp_path / "run.mcap")
+    assert {len(sample.past) for sample in log.samples} == {4}
+    # Slots are counted by the clock, the ones that a busy machine made the controller miss included.
+    assert 90 <= log.ticks[-1].slot <= 200
+    assert replay(log).equal

@@ -1,0 +1,1 @@
+"""Programs that try to break Tandem and report the outcome. Not installed."""

@@ -1,0 +1,400 @@
+"""One run of the real processes, to be killed, frozen and cut off; what dies it starts again, as a supervisor would."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from benchmarks.live import stalls
+from node_runtime.bus.zenoh_bus import Bus, Mailbox
+from node_runtime.config.sections import Config, override, to_toml
+from node_runtime.lifecycle import new_run_id
+from node_runtime.realtime import clock
+from protocol import codec, topics
+from protocol import messages as m
+
+from . import link as links
+from .scenes import Surroundings
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+COMMANDS = {
+    "router": "router",
+    "recorder": "record",
+    "trainer": "trainer",
+    "controller": "controller",
+    "plant": "",
+}
+STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
+RESTARTED = ("router", "trainer", "controller")
+"""A recorder that has died stays dead, as under `tandem run`: its log is never overwritten."""
+RESTART_S = 0.5
+"""As `tandem run` waits before it starts a dead process again."""
+READY_S = 60.0
+STOP_S = 8.0
+LOOK_S = 0.01
+LISTENING = "router listening on"
+
+Place = Literal["loopback", "veth", "wire"]
+
+
+class RigError(RuntimeError):
+    """The run did not come about, whatever the fault: a process did not start, no command came."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """One message as the suite heard it on the bus."""
+
+    at: float
+    """Seconds on the monotonic clock."""
+    topic: str
+    payload: bytes
+
+
+@dataclass
+class Running:
+    """One process, and when it was started and killed; seconds on the monotonic clock."""
+
+    name: str
+    words: list[str]
+    environment: dict[str, str]
+    output: Path
+    popen: subprocess.Popen[bytes] | None = None
+    started: list[float] = field(default_factory=list)
+    killed: list[float] = field(default_factory=list)
+    restart_at: float | None = None
+
+    def start(self) -> None:
+        with self.output.open("ab") as output:
+            self.popen = subprocess.Popen(
+                self.words,
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=os.environ | self.environment,
+                process_group=0,
+            )
+        self.started.append(clock.now())
+
+    @property
+    def alive(self) -> bool:
+        return self.popen is not None and self.popen.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        if self.popen is not None and self.alive:
+            os.killpg(self.popen.pid, number)
+
+    def said(self) -> str:
+        return self.output.read_text(errors="replace") if self.output.exists() else ""
+
+
+class Rig:
+    """A router, recorder, trainer, controller and plant, started on entry, all gone on exit.
+
+    Args:
+        folder: everything is written here: configurations, outputs, the log, the plant's trace.
+        config: the run's; endpoint and log are set here.
+        places: where "plant" and "trainer" are: beside the others, as the rest is, or behind a link.
+        around: what its scene adds to environment and configurations.
+        seed: of what happens on a lossy link.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        places: dict[str, Place] | None = None,
+        *,
+        around: Surroundings | None = None,
+        seed: int = 0,
+    ):
+        self.folder, self._places = folder, places or {}
+        self._seed, self._around = seed, around or Surroundings()
+        port = _free_port()
+        while f":{port}" in str(self._around.settings):
+            # The scene's door for other machines has it, though nobody listens there yet.
+            port = _free_port()
+        self.config = override(
+            config,
+            [
+                f'bus.endpoint="tcp/127.0.0.1:{port}"',
+                f'log.path="{folder / "disk" / "run.mcap"}"',
+                f'controller.checkpoint="{folder / "controller.checkpoint"}"',
+            ],
+        )
+        self.log = folder / "disk" / "run.mcap"
+        self.trace = folder / "trace.jsonl"
+        self.heard: list[Heard] = []
+        self.events: list[tuple[float, str]] = []
+        """What was done to the run, and when; seconds on the monotonic clock."""
+        self.first_command: float | None = None
+        self.processes: dict[str, Running] = {}
+        self.links: dict[str, links.Link] = {}
+        self._port = port
+        self._stack = ExitStack()
+        self._mailbox: Mailbox | None = None
+        self._command_key = topics.COMMAND.name
+        self.restarts = True
+        self.door: str | None = None
+        """Where the router listens for other machines."""
+        self.ended_at = math.inf
+        """When all were told to stop."""
+        self.listening_at: dict[int, float] = {}
+        """When the router listened after its n-th start."""
+
+    # -- begin and end -----------------------------------------------
+
+    def __enter__(self) -> Rig:
+        try:
+            self._begin()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _begin(self) -> None:
+        (self.folder / "disk").mkdir(parents=True, exist_ok=True)
+        for number, (name, place) in enumerate(self._places.items()):
+            if place != "loopback":
+                self.links[name] = self._stack.enter_context(links.link(place, number, self._seed))
+        self._stack.callback(self._kill_all)
+        for name in COMMANDS:
+            self.processes[name] = self._prepare(name)
+        self._stack.enter_context(stalls.watched(self.folder / "stalls.txt", self.config.realtime.priority))
+        for name, running in self.processes.items():
+            if name != "controller":
+                running.start()
+        deadline = clock.now() + READY_S
+        while LISTENING not in self.processes["router"].said():
+            if clock.now() > deadline or not self.processes["router"].alive:
+                raise RigError(f"the router did not start: {self.processes['router'].said()[-800:]}")
+            clock.sleep_until(clock.now() + LOOK_S)
+        bus = Bus(self.config, "monitor", new_run_id("witness"))
+        bus.open()
+        self._stack.callback(bus.close, 0.5)
+        self._mailbox = bus.everything()
+        # The log begins with the memory that the controller begins with.
+        self.wait(lambda: self._ready("recorder"), READY_S, "the recorder ready")
+        self.processes["controller"].start()
+        self.wait(
+            lambda: all(self._ready(name) for name in COMMANDS if name != "plant"), READY_S, "all ready"
+        )
+        plant = self.processes["plant"].popen
+        assert plant is not None
+        assert plant.stdin is not None
+        plant.stdin.write(b"begin\n")
+        plant.stdin.flush()
+        self.wait(lambda: self.first_command is not None, READY_S, "the first command")
+
+    def _prepare(self, name: str) -> Running:
+        """What its process will be; the router is not at the same address everywhere, so each has its configuration."""
+        config = self.config
+        prefix: list[str] = []
+        if name in self.links:
+            prefix = self.links[name].prefix
+            config = override(config, [f'bus.endpoint="tcp/{self.links[name].here}:{self._port}"'])
+        elif name == "router" and self.links:
+            config = override(config, [f'bus.endpoint="tcp/0.0.0.0:{self._port}"', "bus.insecure=true"])
+        config = override(config, self._around.settings.get(name, []))
+        if name == "router":
+            self.door = config.bus.remote
+        file = self.folder / f"{name}.toml"
+        file.write_text(to_toml(config), encoding="utf-8")
+        if name == "plant":
+            words = [
+                sys.executable,
+                str(HERE / "traced_plant.py"),
+                str(os.getpid()),
+                str(file),
+                str(self.trace),
+            ]
+        else:
+            child = [sys.executable, "-m", "tandem.live.child", str(os.getpid())]
+            words = [*child, COMMANDS[name], "--config", str(file)]
+        return Running(name, [*prefix, *words], self._around.environment, self.folder / f"{name}.txt")
+
+    def end(self) -> None:
+        """Stop all politely, in the order of a supervisor; what does not stop is killed, and is an event."""
+        self.restarts = False
+        self.ended_at = clock.now()
+        for name in STOP_ORDER:
+            running = self.processes[name]
+            running.signal(signal.SIGTERM)
+            deadline = clock.now() + STOP_S
+            while running.alive and clock.now() < deadline:
+                self.look()
+            if running.alive:
+                self.note(f"{name} did not stop")
+                running.signal(signal.SIGKILL)
+
+    def _kill_all(self) -> None:
+        for running in self.processes.values():
+            running.signal(signal.SIGKILL)
+        for running in self.processes.values():
+            if running.popen is not None:
+                running.popen.communicate()
+
+    # -- time ----------------------------------------------------------
+
+    def look(self) -> None:
+        """A hundredth of a second: hear what was said, start again what has died."""
+        clock.sleep_until(clock.now() + LOOK_S)
+        assert self._mailbox is not None
+        prefix = topics.everything(self.config.name).removesuffix("**")
+        for delivery in self._mailbox.drain():
+            at, topic = delivery.received_ns * 1e-9, delivery.key.removeprefix(prefix)
+            if self.first_command is None and topic == self._command_key:
+                self.first_command = at
+            self.heard.append(Heard(at, topic, delivery.payload))
+        router = self.processes["router"]
+        if (starts := len(router.started)) not in self.listening_at and router.said().count(
+            LISTENING
+        ) >= starts:
+            self.listening_at[starts] = clock.now()
+        for name in RESTARTED if self.restarts else ():
+            running = self.processes[name]
+            if not running.started or running.alive:
+                continue
+            if running.restart_at is None:
+                running.restart_at = clock.now() + RESTART_S
+            elif clock.now() >= running.restart_at:
+                running.restart_at = None
+                running.start()
+                self.note(f"{running.name} started again")
+
+    def run_for(self, seconds: float) -> None:
+        """Let the run go on."""
+        self.run_until(clock.now() + seconds)
+
+    def run_until(self, moment: float) -> None:
+        """Let the run go on until `moment` on the monotonic clock."""
+        while clock.now() < moment:
+            self.look()
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Let the run go on until something is so. Raises `RigError` when it is not in time."""
+        deadline = clock.now() + timeout_s
+        while not condition():
+            if clock.now() > deadline:
+                dead = [f"{p.name}:\n{p.said()[-800:]}" for p in self.processes.values() if not p.alive]
+                raise RigError(f"not within {timeout_s:g} s: {what}. {' '.join(dead)}")
+            self.look()
+
+    # -- faults --------------------------------------------------------
+
+    def note(self, text: str) -> None:
+        """Remember that something was done now."""
+        self.events.append((clock.now(), text))
+
+    def kill(self, *names: str) -> None:
+        """kill -9 of these at once."""
+        self.note(f"kill {' and '.join(names)}")
+        for name in names:
+            self.processes[name].killed.append(clock.now())
+            self.processes[name].signal(signal.SIGKILL)
+
+    def await_restarted(self, timeout_s: float) -> None:
+        """Let the run go on until all that was killed and is started again has spoken, at most for `timeout_s`."""
+        killed = [name for name in RESTARTED if self.processes[name].killed]
+        deadline = clock.now() + timeout_s
+        while clock.now() < deadline and not all(self.back_at(name) for name in killed):
+            self.look()
+
+    def back_at(self, name: str) -> float | None:
+        """When a process that was killed spoke again; None: not yet."""
+        running = self.processes[name]
+        if len(running.started) <= len(running.killed):
+            return None
+        if name == "router":
+            # Its own first word travels through itself; what it writes is as early as it can be known.
+            return self.listening_at.get(len(running.started))
+        return next((at for at, _ in self.health(name) if at > running.started[-1]), None)
+
+    def freeze(self, name: str, seconds: float) -> None:
+        """SIGSTOP, and SIGCONT after a while."""
+        self.note(f"stop {name}")
+        self.processes[name].signal(signal.SIGSTOP)
+        self.run_for(seconds)
+        self.processes[name].signal(signal.SIGCONT)
+        self.note(f"{name} goes on")
+
+    def shape(self, name: str, shape: links.Shape, seconds: float) -> None:
+        """What happens to the packets of the plant's or the trainer's link for a while."""
+        self.note(f"{name}'s link: {shape}")
+        self.links[name].shape(shape)
+        self.run_for(seconds)
+        self.links[name].shape(links.Shape())
+        self.note(f"{name}'s link is back")
+
+    def attack(self, kind: str, rate: float, seconds: float, seed: int) -> dict[str, float]:
+        """Let a stranger send bad messages for a while; how many it sent, by topic."""
+        sent = self._beside(
+            "attacker", self.config, kind, str(rate), str(seconds), str(seed), seconds=seconds
+        )
+        return {f"sent {topic}": count for topic, count in sent.items()}
+
+    def knock(self, kind: str, folder: Path, seconds: float) -> dict[str, float]:
+        """Let a stranger try the router's door for other machines for a while; what it was told."""
+        far = override(self.config, [f'bus.endpoint="{self.door}"'])
+        return self._beside("stranger", far, kind, str(folder), str(seconds), seconds=seconds)
+
+    def _beside(
+        self, program: str, config: Config, kind: str, *words: str, seconds: float
+    ) -> dict[str, float]:
+        """Run a program of this folder beside the run until it ends; the counts that it prints."""
+        file = self.folder / f"{program}.toml"
+        file.write_text(to_toml(config), encoding="utf-8")
+        command = [sys.executable, "-m", f"verification.faults.{program}", str(file), kind, *words]
+        self.note(f"{program}: {kind}")
+        out, err = self.folder / f"{program}.json", self.folder / f"{program}.txt"
+        with out.open("wb") as stdout, err.open("wb") as stderr:
+            process = subprocess.Popen(command, stdout=stdout, stderr=stderr, cwd=ROOT)
+            self._stack.callback(process.wait)
+            self._stack.callback(process.kill)
+            self.wait(lambda: process.poll() is not None, seconds + 15.0, f"the {program}'s end")
+        if process.returncode:
+            raise RigError(f"the {program} failed: {err.read_text()[-800:]}")
+        self.note("that is over")
+        return msgspec.json.decode(out.read_bytes(), type=dict[str, float])
+
+    # -- what is known while it runs -------------------------------------
+
+    def health(self, process: str) -> list[tuple[float, m.Health]]:
+        """All that a process said of itself so far, and when it was heard."""
+        topic = topics.HEALTH[process]
+        return [
+            (heard.at, message)
+            for heard in self.heard
+            if heard.topic == topic.name and isinstance(message := _decoded(topic, heard), m.Health)
+        ]
+
+    def _ready(self, name: str) -> bool:
+        return any(health.status in ("ready", "running") for _, health in self.health(name))
+
+
+def _decoded(topic: topics.Topic, heard: Heard) -> m.Message | None:
+    try:
+        return codec.decode(topic, heard.payload)
+    except codec.BadMessage:
+        return None
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

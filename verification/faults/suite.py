@@ -1,0 +1,151 @@
+"""Runs faults: which moment, which seed, what is kept. One run is one line of a file, so that a suite can go on."""
+
+from __future__ import annotations
+
+import shutil
+import zlib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from node_runtime.config.sections import Config, override
+from node_runtime.realtime import clock
+from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
+from run_log.errors import LogError
+
+from .catalogue import Fault, Stage
+from .facts import Facts, gather
+from .rig import Place, Rig, RigError
+from .scenes import nothing
+
+EARLIEST_S = 0.3
+"""After the first command; what comes before concerns no run."""
+SETTLED_S = 4.0
+"""The fault comes within so many seconds of the beginning, where the plant moves most."""
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """One run, as it stands in the file."""
+
+    fault: str
+    """Empty: without one."""
+    stage: str
+    index: int
+    seed: int
+    at: float
+    """When, in seconds after the first command."""
+    wall_s: float
+    facts: Facts | None
+    error: str = ""
+    """Why there are no facts."""
+    not_held: list[str] = []
+
+    def folder(self, out: Path) -> Path:
+        """Where its run's files are, below the suite's folder."""
+        return folder_of(out, self.fault or self.stage, self.index)
+
+
+def moment(fault: Fault, index: int, seed: int) -> float:
+    """When the fault comes in its `index`-th run, seconds after the first command."""
+    rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode()), index])
+    return float(rng.uniform(EARLIEST_S, SETTLED_S))
+
+
+def folder_of(out: Path, name: str, index: int) -> Path:
+    """The folder of one run of a fault or, without one, of a stage."""
+    return out / f"{name}-{index}".replace(" ", "-").replace("/", "-").replace(":", "")
+
+
+def run(stage: Stage, fault: Fault | None, index: int, seed: int, out: Path, settings: list[str]) -> Outcome:
+    """One run with a fault, or one without, in a folder of its own below `out`."""
+    folder = folder_of(out, stage.name if fault is None else fault.name, index)
+    began = clock.now()
+    at = 0.0 if fault is None else moment(fault, index, seed)
+    config = override(Config(seed=seed + index), [*stage.settings, *settings])
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    facts, error = None, ""
+    try:
+        facts = _live(stage, fault, at, config, folder)
+    except (RigError, LogError) as problem:
+        error = str(problem)
+    return Outcome(
+        fault="" if fault is None else fault.name,
+        stage=stage.name,
+        index=index,
+        seed=seed,
+        at=at,
+        wall_s=clock.now() - began,
+        facts=facts,
+        error=error,
+    )
+
+
+def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: Path) -> Facts:
+    scene = nothing if fault is None else fault.scene
+    with scene(folder) as around:
+        places: dict[str, Place] = {"plant": stage.plant, "trainer": stage.trainer}
+        rig = Rig(folder, config, places, around=around, seed=config.seed)
+        with punctual(min(READER_PRIORITY, config.realtime.priority), silent=True):
+            extra = _hurt(rig, stage, fault, at)
+        # While the log's disk is still there.
+        return gather(rig, stage.seconds, extra)
+
+
+def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, float]:
+    """The run itself, from the start of its processes to their end; what the fault measured."""
+    extra: dict[str, float] = {}
+    with rig:
+        assert rig.first_command is not None
+        if fault is not None:
+            rig.run_until(rig.first_command + at)
+            extra = fault.inflict(rig, rig.config.seed) or {}
+            rig.run_for(fault.after)
+        rig.run_until(rig.first_command + stage.seconds)
+        rig.end()
+    return extra
+
+
+def judged(outcome: Outcome, fault: Fault, calm: Facts) -> Outcome:
+    """With what did not hold."""
+    if outcome.facts is None:
+        return msgspec.structs.replace(outcome, not_held=[outcome.error])
+    found = [why for held in fault.holds if (why := held(outcome.facts, calm)) is not None]
+    return msgspec.structs.replace(outcome, not_held=found)
+
+
+class ResultsError(Exception):
+    """The results of an earlier run cannot be gone on from; the text says why and what to do."""
+
+
+class Results:
+    """The file of outcomes; what is in it is not run again."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = path.read_bytes() if path.exists() else b""
+        whole = text[: text.rfind(b"\n") + 1]
+        if whole != text:
+            # The suite was killed while it wrote a line.
+            path.write_bytes(whole)
+        decoder = msgspec.json.Decoder(Outcome)
+        try:
+            self.outcomes = [decoder.decode(line) for line in whole.splitlines()]
+        except msgspec.ValidationError as error:
+            raise ResultsError(
+                f"{path} is of another version of the suite ({error}); begin again with --fresh"
+            ) from None
+
+    def find(self, fault: str, stage: str, index: int, seed: int) -> Outcome | None:
+        for outcome in reversed(self.outcomes):
+            if (outcome.fault, outcome.stage, outcome.index, outcome.seed) == (fault, stage, index, seed):
+                return outcome
+        return None
+
+    def put(self, made: Outcome) -> None:
+        """In the file from now on, in the place of an earlier one of the same run."""
+        self.outcomes.append(made)
+        with self.path.open("ab") as file:
+            file.write(msgspec.json.encode(made) + b"\n")

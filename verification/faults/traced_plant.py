@@ -1,0 +1,88 @@
+"""`tandem plant` with a witness: every sample and every command it takes is also written to a file of this machine.
+
+    python traced_plant.py SUPERVISOR CONFIG TRACE
+
+What the true plant does while the router is dead or its link is cut is not on the bus. The plant's own code is
+`plant_sim.node.main`, unchanged; here it only gets a `PlantSim` that writes down what it is asked and what it answers.
+A line on standard input lets it begin.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from node_runtime.config.sections import load
+from node_runtime.realtime import clock
+from plant_sim import node
+from plant_sim.simulator import CommandVerdict, PlantSim
+from protocol.messages import Command, PlantState
+from tandem.live.child import end_with
+
+
+class Sampled(msgspec.Struct, frozen=True, tag="sample"):
+    """One sample, and when the plant's loop got to it; seconds on the monotonic clock."""
+
+    at: float
+    state: PlantState
+
+
+class Commanded(msgspec.Struct, frozen=True, tag="command"):
+    """One command that reached the plant's own checks."""
+
+    at: float
+    """When it arrived."""
+    run_id: str
+    seq: int
+    verdict: str
+
+
+Traced = Sampled | Commanded
+
+
+def read(path: Path) -> list[Traced]:
+    """A trace; what a killed plant left unfinished at its end is left out."""
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    decoder = msgspec.json.Decoder(Traced)
+    return [decoder.decode(line) for line in lines]
+
+
+class TracedPlant(PlantSim):
+    """A `PlantSim` that writes down what happens."""
+
+    file: BinaryIO
+    encoder = msgspec.json.Encoder()
+
+    def sample(self, t: float) -> PlantState:
+        began = clock.now()
+        state = super().sample(t)
+        self._note(Sampled(began, state))
+        return state
+
+    def command(self, command: Command, t: float) -> CommandVerdict:
+        verdict = super().command(command, t)
+        self._note(Commanded(t, command.run_id, command.seq, verdict))
+        return verdict
+
+    def _note(self, what: Traced) -> None:
+        self.file.write(self.encoder.encode(what) + b"\n")
+
+
+def main(supervisor: int, config: str, trace: str) -> int:
+    """The plant, until it is told to stop."""
+    end_with(supervisor)
+    logging.basicConfig(format="%(message)s", level="INFO")
+    with open(trace, "ab", buffering=0) as file:
+        TracedPlant.file = file
+        node.PlantSim = TracedPlant  # type: ignore[misc]
+        if not sys.stdin.readline():
+            return 1
+        return node.main(load(config))
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]), sys.argv[2], sys.argv[3]))

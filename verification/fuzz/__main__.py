@@ -1,0 +1,150 @@
+"""`make fuzz`: millions of bad payloads through every reader; nothing may crash, hang or grow.
+
+python -m verification.fuzz --payloads 10000000 --document docs/faults.md
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import shlex
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+
+import msgspec
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from benchmarks.document_block import DocumentError, Marks
+from node_runtime import provenance
+from verification.fuzz.work import Finding, Report, Work, merge
+
+MARKS = Marks.of("fuzz", "make fuzz")
+GROWTH_KB = 8 * 1024
+"""What a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
+
+
+@dataclass(frozen=True)
+class Fuzz:
+    """Bad payloads through everything that reads bytes from outside."""
+
+    payloads: int = 10_000_000
+    """In all."""
+    jobs: int = 2
+    """Processes."""
+    seed: int = 0
+    out: Path = Path("runs/fuzz")
+    """Where the figures go, and payloads that were not dealt with."""
+    document: Path | None = None
+    """Where the table goes between its two marks."""
+
+
+def main(settings: Fuzz) -> int:
+    """0 when nothing crashed, hung or grew; 1 when something did; 2 when the document lacks the marks."""
+    console = Console(stderr=True)
+    try:
+        MARKS.check(settings.document)
+    except DocumentError as error:
+        console.print(str(error), markup=False)
+        return 2
+    settings.out.mkdir(parents=True, exist_ok=True)
+    reports = measure(settings, console)
+    (settings.out / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(reports)))
+    for finding in (finding for report in reports for finding in report.findings):
+        _keep(finding, settings.out, console)
+    lines = table(reports, settings)
+    sys.stdout.write("\n".join(lines) + "\n")
+    MARKS.put(settings.document, "\n".join(lines))
+    grown = any(growth(report) > GROWTH_KB for report in reports)
+    return int(grown or any(report.findings or not report.ended for report in reports))
+
+
+def measure(settings: Fuzz, console: Console) -> list[Report]:
+    """One report a process; what a process that hung or died had done until then is in its own."""
+    share = settings.payloads // settings.jobs
+    context = multiprocessing.get_context("spawn")
+    latest: dict[Connection, Report] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        processes = []
+        for job in range(settings.jobs):
+            here, there = context.Pipe(duplex=False)
+            work = Work(share, settings.seed * settings.jobs + job, folder)
+            process = context.Process(target=work.run, args=(there,), daemon=True)
+            process.start()
+            there.close()
+            processes.append(process)
+            latest[here] = Report()
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console) as bar:
+            task = bar.add_task(f"{settings.payloads:,} payloads", total=share * settings.jobs)
+            open_ = set(latest)
+            while open_:
+                for ready in wait(list(open_)):
+                    assert isinstance(ready, Connection)
+                    try:
+                        latest[ready] = msgspec.json.decode(ready.recv_bytes(), type=Report)
+                    except EOFError:
+                        open_.discard(ready)
+                bar.update(task, completed=sum(report.payloads for report in latest.values()))
+        for process in processes:
+            process.join()
+    return list(latest.values())
+
+
+def growth(report: Report) -> int:
+    """kB from after the first tenth to the end."""
+    kept = report.rss_kb[max(1, len(report.rss_kb) // 10) :]
+    return kept[-1] - kept[0] if len(kept) > 1 else 0
+
+
+def table(reports: list[Report], settings: Fuzz) -> list[str]:
+    """The figures as Markdown."""
+    facts = provenance.describe()
+    command = shlex.join(["python", "-m", "verification.fuzz", *sys.argv[1:]])
+    found = merge(reports)
+    lines = [
+        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}: "
+        f"{sum(report.payloads for report in reports):,} payloads in {settings.jobs} processes, "
+        f"{max((report.seconds for report in reports), default=0.0):.0f} s.",
+        "",
+        "| reader | payloads | accepted | refused | slowest, ms | crashed |",
+        "| --- | ---: | ---: | --- | ---: | ---: |",
+    ]
+    for name, one in found.items():
+        refused = Counter(
+            {kind: count for kind, count in one.kinds.items() if not kind.startswith("accepted")}
+        )
+        accepted = sum(one.kinds.values()) - sum(refused.values())
+        why = ", ".join(f"{kind} {count:,}" for kind, count in refused.most_common(6))
+        total = sum(one.kinds.values()) + one.crashed
+        lines.append(
+            f"| {name} | {total:,} | {accepted:,} | {why} | {one.slowest_ns / 1e6:.1f} | {one.crashed} |"
+        )
+    lines.append("")
+    for report in reports:
+        rss = (
+            [f"{value / 1024:.1f}" for value in (report.rss_kb[0], report.rss_kb[-1])]
+            if report.rss_kb
+            else []
+        )
+        after = f"{growth(report) / 1024:+.1f} MB after its first tenth"
+        lines.append(f"Memory of a process, first and last: {' and '.join(rss)} MB, {after}.")
+        if not report.ended:
+            lines.append("A process did not end: it hung or died.")
+    return lines
+
+
+def _keep(finding: Finding, out: Path, console: Console) -> None:
+    path = out / f"crash-{finding.digest[:12]}"
+    path.write_bytes(finding.payload)
+    console.print(f"{finding.target}: {finding.error}; the payload is in {path}", markup=False, style="red")
+
+
+if __name__ == "__main__":
+    logging.disable()
+    sys.exit(main(tyro.cli(Fuzz)))

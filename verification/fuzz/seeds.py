@@ -1,0 +1,126 @@
+"""One or more valid messages of every topic, from a controller and a plant that run a few steps: what is mutated."""
+
+from __future__ import annotations
+
+from controller_node.core import ControllerCore
+from controller_node.outbox import Outbox
+from node_runtime.bus.batches import Gathered, Gathering
+from node_runtime.config.sections import Config, override
+from node_runtime.health import run_info
+from plant_sim.node import build
+from protocol import codec, topics
+from protocol import messages as m
+from protocol.topics import Topic
+
+SETTINGS = [
+    "controller.solver.compile=never",
+    "controller.horizon=8",
+    "network.hidden=[6, 5]",
+    "log.path=fuzz.mcap",
+]
+STEPS = 6
+
+ANSWERS = (
+    Topic(topics.HIDDEN_QUERY, m.HiddenSnapshot, "bulk", "controller", topics.WEIGHTS_LIMIT),
+    Topic(topics.OUTBOX_QUERY, m.Samples, "bulk", "controller", topics.SAMPLES.max_bytes),
+)
+"""What comes back to a trainer's questions is read like messages of a topic."""
+
+
+def config() -> Config:
+    """Of the controller that the messages come from."""
+    return override(Config(), SETTINGS)
+
+
+def seeds() -> dict[str, list[bytes]]:
+    """By topic or answer, payloads that every reader accepts."""
+    settings = config()
+    core = ControllerCore(settings, "controller-1")
+    plant = build(settings, "plant-1")
+    outbox = Outbox("controller-1")
+    out: dict[str, list[bytes]] = {topic.name: [] for topic in (*topics.ALL, *ANSWERS)}
+
+    def said(topic: Topic, message: m.Message) -> None:
+        out[topic.name].append(codec.encode(message))
+
+    said(topics.KEYFRAME, core.keyframe(-1))
+    for step in range(STEPS):
+        state = plant.sample(step * settings.period)
+        weights = _weights(core, step) if step == STEPS - 1 else None
+        tick = m.Tick(
+            run_id="controller-1",
+            seq=step,
+            slot=step,
+            t=step * settings.period,
+            skipped=0,
+            lateness=1e-4,
+            late=False,
+            state_verdict="fresh",
+            state=state,
+            weights=weights,
+        )
+        outputs = core.step(tick)
+        # Acting a little after the sample, so that there are pieces in the next state.
+        plant.command(outputs.command, step * settings.period + 0.003)
+        said(topics.PLANT_STATE, state)
+        said(topics.COMMAND, outputs.command)
+        if (backup := core.backup(outputs.command)) is not None:
+            said(topics.BACKUP, backup)
+        said(topics.TICK, tick)
+        said(topics.RESULT, outputs.result)
+        timing = m.TickTiming(
+            run_id="controller-1", seq=step, solve_ms=1.0, tick_ms=2.0, lateness_ms=0.1, state_age_ms=1.0
+        )
+        said(topics.TIMING, timing)
+        if outputs.sample is not None:
+            outbox.add(outputs.sample)
+        if outputs.output_weights is not None:
+            said(topics.OUTPUT_WEIGHTS, outputs.output_weights)
+        if weights is not None:
+            said(topics.HIDDEN_WEIGHTS, weights)
+    for batch in outbox.batches(outbox.since(-1)):
+        said(topics.SAMPLES, batch)
+        said(ANSWERS[1], batch)
+    said(topics.KEYFRAME, core.keyframe(STEPS - 1))
+    snapshot = core.hidden_snapshot(STEPS - 1)
+    assert snapshot is not None
+    said(ANSWERS[0], snapshot)
+    said(
+        topics.SETS, m.CertifiedSets(run_id="controller-1", seq=0, kind="box", sha256="0" * 64, content=b"{}")
+    )
+    for process in topics.PROCESSES:
+        said(topics.RUN_INFO[process], run_info(settings, process, f"{process}-1", {"z": "1"}))
+        health = m.Health(
+            run_id=f"{process}-1",
+            seq=3,
+            process=process,
+            status="running",
+            counters={"ticks": 7},
+            note="well",
+        )
+        said(topics.HEALTH[process], health)
+    for name, topic in topics.BATCH.items():
+        inside = topics.PLANT_STATE if name == "plant" else topics.COMMAND
+        parts = [Gathered(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
+        out[topic.name].append(Gathering(f"{name}-1").encode(parts))
+    return out
+
+
+def _weights(core: ControllerCore, seq: int) -> m.HiddenWeights:
+    """Acceptable ones."""
+    snapshot = core.hidden_snapshot(seq)
+    assert snapshot is not None
+    assert core.description is not None
+    return m.HiddenWeights(
+        run_id="trainer-1",
+        seq=1,
+        for_run="controller-1",
+        trained_on=seq - 1,
+        base_sha256=snapshot.hidden_sha256,
+        samples=20,
+        loss_before=1e-3,
+        loss_after=1e-4,
+        network_sha256=core.description.sha256(),
+        sha256=snapshot.hidden_sha256,
+        layers=snapshot.layers,
+    )

@@ -1,0 +1,245 @@
+"""Everything that reads bytes from outside, as one function each: it accepts, or raises what it declares."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from controller_node.certified_sets import CertifiedSets, Found
+from controller_node.core import ControllerCore
+from controller_node.outbox import Outbox
+from lbmpc.sets.certificate import CertificateError
+from network_model.description import NetworkDescription
+from node_runtime.bus.batches import separate
+from node_runtime.bus.mailbox import Delivery
+from node_runtime.config.sections import Config, from_json, from_tree, to_json, to_toml
+from node_runtime.config.strict import ConfigError
+from node_runtime.rejected import BadMessages
+from protocol import codec, topics
+from protocol import messages as m
+from protocol.codec import BadMessage
+from protocol.topics import Topic
+from run_log.errors import LogError
+from run_log.reading.reader import read_run
+from run_log.writing.writer import LogWriter
+from verification.fuzz import mutate
+from verification.fuzz.mutate import Mutator
+from verification.fuzz.seeds import ANSWERS, config, seeds
+
+SHARE_OF_SLOW = 0.01
+"""Of the payloads, for readers of whole files: a thousand times slower than a message."""
+
+Read = Callable[[bytes], str]
+"""Reads; what became of it, "accepted" or why not, in a few words that can be counted."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One reader."""
+
+    name: str
+    read: Read
+    make: Mutator
+    weight: float
+    """Of the payloads, as a share relative to the others'."""
+
+
+def targets(seed: int, folder: Path) -> list[Target]:
+    """All of them. folder: where those that read files may put one."""
+    payloads = seeds()
+    everything = [payload for known in payloads.values() for payload in known]
+    found: list[Target] = []
+
+    def add(name: str, read: Read, known: Sequence[bytes], weight: float, textual: bool = False) -> None:
+        mutations = mutate.TEXTUAL if textual else mutate.BINARY
+        make = Mutator(known, known if textual else everything, mutations, seed * 1000 + len(found))
+        found.append(Target(name, read, make, weight))
+
+    batches = {topic.name for topic in topics.BATCH.values()}
+    for topic in (*topics.ALL, *ANSWERS):
+        weight = 1.0 if topic.type not in (m.Tick, m.Keyframe) else 0.5
+        if topic.name not in batches:
+            add(topic.name, _decoding(topic), payloads[topic.name], weight)
+    for topic in topics.BATCH.values():
+        add(topic.name, _separating(topic), payloads[topic.name], 1.0)
+    add("head of a message", _glancing, everything, 0.5)
+    settings = config()
+    core = ControllerCore(settings, "controller-1")
+    add("hidden weights: adoption", _adopting(core), payloads[topics.HIDDEN_WEIGHTS.name], 0.5)
+    add("keyframe: restored", _restoring(core), payloads[topics.KEYFRAME.name], 0.2)
+    add(
+        "outbox: a question", _asking(), [b"run=controller-1;since=3;last=10", b"since=-1"], 0.5, textual=True
+    )
+    described = msgspec.json.encode(core.description)
+    add("network description", _describing, [described], 0.2, textual=True)
+    add("configuration, TOML", _configuring, [to_toml(settings).encode(), b"rate = 20\n"], 0.02, textual=True)
+    add("configuration, JSON", _reconfiguring, [to_json(settings).encode()], 0.02, textual=True)
+    sets = _sets()
+    add("certified sets", _certifying, [sets, gzip.compress(sets, mtime=0)], 0.1)
+    log = _log(settings, payloads, folder)
+    add("log file", _logging(folder / f"fuzzed-{seed}.mcap"), [log], SHARE_OF_SLOW)
+    return found
+
+
+def _decoding(topic: Topic) -> Read:
+    def read(payload: bytes) -> str:
+        try:
+            message = codec.decode(topic, payload)
+            codec.check_dimensions(topic, message, 4, 1)
+        except BadMessage as error:
+            return error.reason
+        return "accepted"
+
+    return read
+
+
+def _glancing(payload: bytes) -> str:
+    return "malformed" if codec.head_of(payload) is None else "accepted"
+
+
+def _separating(topic: Topic) -> Read:
+    bad = BadMessages()
+    key = topic.key("jet1")
+
+    def read(payload: bytes) -> str:
+        parts = list(separate(Delivery(key, payload, 10**9), bad))
+        return "accepted" if parts and parts[0].key != key else "malformed"
+
+    return read
+
+
+def _adopting(core: ControllerCore) -> Read:
+    """From the bus to the controller's memory, through a whole step."""
+    before = core.state
+    states = [codec.decode(topics.TICK, payload) for payload in seeds()[topics.TICK.name]]
+    tick = states[-1]
+    assert isinstance(tick, m.Tick)
+
+    def read(payload: bytes) -> str:
+        try:
+            weights = codec.decode(topics.HIDDEN_WEIGHTS, payload)
+        except BadMessage as error:
+            return error.reason
+        assert isinstance(weights, m.HiddenWeights)
+        core.state = before
+        seen = core._observe(msgspec.structs.replace(tick, weights=weights))
+        _, verdict = core.controller._adopt(before.oracle, seen.hidden)
+        return "accepted" if verdict == "adopted" else _kind(verdict)
+
+    return read
+
+
+def _restoring(core: ControllerCore) -> Read:
+    def read(payload: bytes) -> str:
+        try:
+            keyframe = codec.decode(topics.KEYFRAME, payload)
+        except BadMessage as error:
+            return error.reason
+        assert isinstance(keyframe, m.Keyframe)
+        try:
+            # Weights that no float32 holds are infinite in a hash of float32; numpy says so, and it is no mistake.
+            with np.errstate(over="ignore"):
+                core.restore(keyframe)
+        except ValueError:
+            return "does not fit"
+        return "accepted"
+
+    return read
+
+
+def _asking() -> Read:
+    outbox = Outbox("controller-1")
+    for seq in range(20):
+        outbox.add(m.Sample(seq, [0.0] * 4, [0.0], [0.0] * 4))
+
+    def read(payload: bytes) -> str:
+        words = payload.decode(errors="replace").split(";")
+        parameters = dict(word.partition("=")[::2] for word in words)
+        try:
+            answers = outbox.answer(parameters)
+        except ValueError:
+            return "bad question"
+        return "accepted" if answers else "nothing to answer"
+
+    return read
+
+
+def _describing(payload: bytes) -> str:
+    try:
+        msgspec.json.decode(payload, type=NetworkDescription)
+    except ValueError:
+        return "refused"
+    return "accepted"
+
+
+def _configuring(payload: bytes) -> str:
+    try:
+        from_tree(tomllib.loads(payload.decode()))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return "not TOML"
+    except ConfigError:
+        return "refused"
+    return "accepted"
+
+
+def _reconfiguring(payload: bytes) -> str:
+    try:
+        from_json(payload.decode(errors="replace"))
+    except ConfigError:
+        return "refused"
+    return "accepted"
+
+
+def _certifying(payload: bytes) -> str:
+    try:
+        CertifiedSets.from_bytes(payload)
+    except CertificateError:
+        return "refused"
+    return "accepted"
+
+
+def _logging(path: Path) -> Read:
+    def read(payload: bytes) -> str:
+        path.write_bytes(payload)
+        try:
+            run = read_run(path)
+        except LogError:
+            return "refused"
+        return "accepted, cut short" if run.truncated else "accepted"
+
+    return read
+
+
+def _kind(verdict: str) -> str:
+    """Without its figures."""
+    return re.sub(r"\(.*|\[.*|-?\d[\d.e+-]*", "", verdict)[:40].strip(" ,")
+
+
+def _sets() -> bytes:
+    """A small file of certified sets, of those that are shipped."""
+    from controller_node.certified_sets import SHIPPED
+
+    path = min(SHIPPED.glob("*.json*"), key=lambda path: path.stat().st_size)
+    whole = CertifiedSets.from_bytes(path.read_bytes())
+    few = msgspec.structs.replace(whole.certificate, pieces=whole.certificate.pieces[:1])
+    return CertifiedSets.of(few, Found(0.5, 0.1, True, 1.0)).to_bytes()
+
+
+def _log(settings: Config, payloads: dict[str, list[bytes]], folder: Path) -> bytes:
+    from lbmpc.plants import get_plant
+
+    path = folder / "seed.mcap"
+    path.unlink(missing_ok=True)
+    with LogWriter(path, settings, get_plant(settings.plant.model), versions={"python": "3.11"}) as writer:
+        for name, known in payloads.items():
+            for at, payload in enumerate(known):
+                writer.write(name, payload, 10**9 + at)
+        writer.flush()
+    return path.read_bytes()

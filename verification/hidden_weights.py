@@ -1,0 +1,81 @@
+"""What the trial of hidden weights lets through: `python -m verification.hidden_weights` prints decision 0020's table.
+
+Lock-step runs of the paper's start: undisturbed, with measurement noise, and under a stolen trainer that sends a set at
+every tick, at every seventh, or in place of each set that the real one trained; each with the trial and without it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from rich.console import Console
+from rich.table import Table
+
+from node_runtime.config.sections import load
+from run_log.reading.reader import Run
+from run_log.reporting.summary import summarise
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow
+from verification.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise, random, reversed_sign
+
+STEPS = 200
+SEEDS = range(3)
+DISTURBANCES: dict[str, Faults] = {
+    "none": Faults(),
+    "noise of 3e-4 on z and y": Faults(noise=[3e-4, 3e-4, 0.0, 0.0]),
+    "noise of 1e-3 on z and y": Faults(noise=[1e-3, 1e-3, 0.0, 0.0]),
+}
+ATTACKS: dict[str, Forge] = {
+    "NaN, huge, wrong shape, reversed, random": crude,
+    "random": random,
+    "last hidden layer reversed": reversed_sign,
+    "1 % noise": noise(0.01),
+    "10 % noise": noise(0.1),
+    "30 % noise": noise(0.3),
+    "drift": drift,
+    "right here, wrong elsewhere": elsewhere(1.0),
+}
+SENT = {"every tick": (1, False), "every 7th": (7, False), "instead": (1, True)}
+
+
+def measure(seeds: range) -> Table:
+    """One row a case: means over the seeds."""
+    table = Table(
+        "what is sent", "when", "trial", "adopted", "refused", "rolled back", "cost", "overshoot", "outside"
+    )
+    for trial in (True, False):
+        for name, faults in DISTURBANCES.items():
+            runs = [follow(load(None, _settings(seed, trial)), STEPS, faults).run for seed in seeds]
+            _row(table, (name, "-"), trial, runs)
+        for name, forge in ATTACKS.items():
+            for when, (every, instead) in SENT.items():
+                runs = [
+                    follow_attacked(load(None, _settings(seed, trial)), STEPS, forge, every, instead)
+                    for seed in seeds
+                ]
+                _row(table, (name, when), trial, runs)
+    return table
+
+
+def _settings(seed: int, trial: bool) -> list[str]:
+    return [f"seed={seed}", f"adaptation.trial.enabled={'true' if trial else 'false'}"]
+
+
+def _row(table: Table, words: tuple[str, str], trial: bool, runs: list[Run]) -> None:
+    found = [summarise(run) for run in runs]
+
+    def mean(name: str) -> float:
+        return sum(getattr(one, name) for one in found) / len(found)
+
+    table.add_row(
+        *words,
+        "on" if trial else "off",
+        *(f"{mean(name):.1f}" for name in ("weights_adopted", "weights_refused", "weights_rolled_back")),
+        f"{mean('cost'):.2f}",
+        f"{mean('overshoot'):.4f}",
+        f"{mean('constraint_violations'):.1f}",
+    )
+
+
+if __name__ == "__main__":
+    Console(width=140).print(measure(range(int(sys.argv[1])) if len(sys.argv) > 1 else SEEDS))
