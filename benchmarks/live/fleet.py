@@ -295,9 +295,9 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
 _DESCENT = """
 import json, sys, time
 import numpy as np
-from benchmarks.fleet import NETWORK
-from node_runtime.config import TrainerConfig
-from protocol.network import initial_hidden
+from benchmarks.live.fleet import NETWORK
+from node_runtime.config.sections import TrainerConfig
+from network_model.description import initial_hidden
 from trainer_node.descent import Problem, descend, descend_together
 from trainer_node.network import Network
 from trainer_node.training import use_one_thread

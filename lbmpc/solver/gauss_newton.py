@@ -15,7 +15,8 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.oracles.base import LinearOracle, Oracle, remembered
+from lbmpc.oracles.base import Oracle, remembered
+from lbmpc.oracles.linear import LinearOracle
 from lbmpc.solver.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
 from lbmpc.solver.nominal_rollout import build_nominal
 from lbmpc.solver.problem import Problem

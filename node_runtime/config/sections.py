@@ -16,7 +16,8 @@ import msgspec
 import tomli_w
 
 from network_model.description import LAYERS, Width
-from network_model.operations import BOUNDED, Activation, get_architecture
+from network_model.operations import BOUNDED, Activation
+from network_model.registry import get_architecture
 from node_runtime.config.literals import (
     AdoptionName,
     AwakeMode,

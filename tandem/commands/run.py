@@ -11,6 +11,7 @@ import msgspec
 from rich.console import Console
 from rich.status import Status
 
+from controller_node.build import build_model
 from controller_node.guarantee import guarantee
 from node_runtime.config.sections import Config, to_toml
 from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
@@ -42,7 +43,7 @@ def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool, tra
         raise terminal.Refused(f"--seconds {seconds:g}: less than one period of {config.period:g} s")
     plant = plant_of(config)
     console = terminal.console(as_json)
-    said = guarantee(config)
+    said = guarantee(config, build_model(config))
     with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
         for text in moved:
             console.print(text, style="dim", markup=False, soft_wrap=True)

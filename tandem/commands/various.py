@@ -88,6 +88,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
         raise Refused(f"--steps {steps}: at least 1")
     if log is not None and log.exists():
         raise Refused(f"{log}: exists already, and a log never overwrites anything; choose another name")
+    from controller_node.build import build_model
     from controller_node.guarantee import guarantee
     from lbmpc.plants import PlantError
     from run_log.errors import LogError
@@ -98,7 +99,7 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
     plant_of(config)
     console = terminal.console(as_json)
-    console.print(guarantee(config), markup=False, soft_wrap=True)
+    console.print(guarantee(config, build_model(config)), markup=False, soft_wrap=True)
     with progress_bar(console) as bar:
         task = bar.add_task(f"simulating, {config.controller.oracle}", total=steps)
         try:

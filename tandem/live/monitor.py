@@ -235,10 +235,10 @@ class Monitor:
         if result.weights_rolled_back:
             self._rolled_back += 1
             self.say(f"tick {result.seq}: hidden weights {result.weights_rolled_back}", now, "bad")
-        if result.weights_verdict == "adopted":
+        if result.weights_outcome == "adopted":
             self._adopted += 1
             self.say(f"tick {result.seq}: hidden weights {result.hidden_version} adopted", now, "good")
-        elif result.weights_verdict.startswith("refused"):
+        elif result.weights_outcome == "refused":
             self._refused += 1
             self.say(f"tick {result.seq}: hidden weights {result.weights_verdict}", now, "bad")
         if result.prediction_error is not None:

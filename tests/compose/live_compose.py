@@ -115,7 +115,7 @@ def say(text: str) -> None:
 
 
 def adopted(message: m.Message) -> bool:
-    return isinstance(message, m.TickResult) and message.weights_verdict == "adopted"
+    return isinstance(message, m.TickResult) and message.weights_outcome == "adopted"
 
 
 def assert_steady(sources: list[str]) -> None:

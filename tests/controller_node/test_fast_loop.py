@@ -103,7 +103,7 @@ def test_at_twenty_hertz_every_tick_says_everything() -> None:
 def test_the_trainer_hears_of_an_adoption_at_once() -> None:
     loop = Loop("rate=1000", "adaptation.trial.enabled=false")
     loop.tick(5)
-    description = loop.core.description
+    description = loop.core.controller.oracle.description
     assert description is not None
     layers = [np.full(shape, 0.125) for shape in description.layer_shapes]
     loop.node._weights = m.HiddenWeights(
@@ -138,7 +138,7 @@ def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else()
     loop.bus.said.clear()
     loop.tick()
     assert [name for name, _ in loop.bus.said][:3] == [topics.COMMAND.name, "prepare", topics.TICK.name]
-    assert loop.core.controller._prepared_for is loop.core.state
+    assert loop.core.controller._prepared_for is loop.core.memory.state
 
 
 def test_however_many_samples_come_a_training_begins_at_most_every_so_often(

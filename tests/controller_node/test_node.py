@@ -197,7 +197,7 @@ def test_samples_come_in_batches_and_the_outbox_has_them_all(run: Run) -> None:
 def test_the_ticks_alone_give_every_command_again(run: Run) -> None:
     with one_blas_thread():
         core = ControllerCore(run.config, run.run_id)
-        core.restore(run.of(topics.KEYFRAME)[0])
+        core.memory.restore(run.of(topics.KEYFRAME)[0])
         again = [codec.encode(core.step(tick).command) for tick in run.of(topics.TICK)]
     assert again == [codec.encode(command) for command in run.of(topics.COMMAND)]
 
@@ -207,7 +207,7 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     latched = [tick.weights.seq for tick in run.of(topics.TICK) if tick.weights is not None]
     assert latched == [2, 3]
     verdicts = [
-        result.weights_verdict for result in run.of(topics.RESULT) if result.weights_verdict != "none"
+        result.weights_verdict for result in run.of(topics.RESULT) if result.weights_outcome != "none"
     ]
     assert len(verdicts) == 2
     assert verdicts[0].startswith("refused: ")

@@ -356,8 +356,8 @@ def test_a_wire_delays_drops_and_cuts() -> None:
 LINGER_S = 10.0
 FAR = """
 import sys, threading
-from node_runtime.bus import Bus
-from node_runtime.config import from_json
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import from_json
 from protocol import topics
 with Bus(from_json(sys.argv[1]), "plant", "plant-far") as bus:
     kept = [bus.queue(topics.OUTPUT_WEIGHTS), bus.queue(topics.COMMAND)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from controller_node.build import model_for
+from controller_node.build import build_model
 from controller_node.certified_sets import read_sets
 from lbmpc.model import Model
 from lbmpc.sets.certificate import Certificate, CertificateError, require_match
@@ -41,7 +41,7 @@ def run(config: Config, file: Path, samples: int, as_json: bool) -> int:
     if samples < 1:
         raise terminal.Refused(f"--samples {samples}: at least 1")
     plant_of(config)
-    model, console = model_for(config), terminal.console(as_json)
+    model, console = build_model(config), terminal.console(as_json)
     result: dict[str, Any] = {"file": str(file), "certificate": "ok"}
     reason = ""
     try:

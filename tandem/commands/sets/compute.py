@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import TaskID
 from rich.table import Table
 
-from controller_node.build import model_for
+from controller_node.build import build_model
 from controller_node.certified_sets import (
     CertifiedSets,
     Found,
@@ -60,7 +60,7 @@ def run(config: Config, kinds: Sequence[Kind], out: Path, slack: float, fresh: b
     if out.is_dir():
         raise Refused(f"{out}: is a folder; name a file")
     plant_of(config)
-    model = model_for(config)
+    model = build_model(config)
     W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
     asked = _Asked(model, start_of(config, model), W, slack, fresh, default_cache())
     console = terminal.console(as_json)

@@ -79,7 +79,7 @@ def page(
         own = [result for result in results if result.case.group == group.name]
         if own:
             parts.append(_part(group, own, plant, command))
-    loader = jinja2.PackageLoader("experiments", "")
+    loader = jinja2.PackageLoader("tandem.experiments.reporting", "")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     found = {
         **provenance.describe(),
@@ -96,7 +96,7 @@ def page(
         runs=sum(len(result.rows) for result in results),
         quick=quick,
     )
-    return environment.get_template("report.html.j2").render(page=whole)
+    return environment.get_template("page.html.j2").render(page=whole)
 
 
 def _part(group: Group, results: list[CaseResult], plant: Plant, command: str) -> Part:

@@ -6,11 +6,8 @@ import os
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
-from controller_node.build import build_oracle, build_plant
-from lbmpc.model import build_model
-from lbmpc.oracles import DnnOracle
+from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
 from run_log.reading.reader import Run
 from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
@@ -106,10 +103,9 @@ def _traces(run: Run) -> Traces:
 
 
 def _lemma(run: Run, config: Config) -> Lemma | None:
-    settings = config.controller
-    weights = (None if w is None else np.array(w, dtype=float) for w in (settings.Q, settings.R))
-    oracle = build_oracle(config, build_model(build_plant(config), config.period, *weights))
-    return measure(run, oracle) if isinstance(oracle, DnnOracle) else None
+    if config.controller.oracle != "dnn":
+        return None
+    return measure(run, build_network_oracle(config, build_plant(config)))
 
 
 def write_whole(path: Path, data: bytes) -> None:
