@@ -83,7 +83,7 @@ class Loop:
             self.node._tick(Slot(k, k * period, 0), 0.0, Latched("fresh", received, 0.0))
 
 
-def test_ticks_commands_and_results_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
+def test_ticks_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
     loop = Loop("rate=1000")
     loop.tick(250)
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.TIMING):
