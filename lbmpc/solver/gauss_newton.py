@@ -116,10 +116,13 @@ class Solver:
         self._rows.bound_first(first)
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
-            solution = self._solve(self._learned, x, oracle_parameters, warm_start, xr, ur)
+            start = self._rows.clip(_numbers(warm_start))
+            self._learned.load(x, oracle_parameters, xr, ur)
+            solution = self._solve(self._learned, x, start)
             if solution.usable or self._learned is self._nominal:
                 return solution
-            nominal = self._solve(self._nominal, x, np.zeros(0), warm_start, xr, ur)
+            self._nominal.load(x, np.zeros(0), xr, ur)
+            nominal = self._solve(self._nominal, x, start)
             return replace(nominal, status=Status.ORACLE_REFUSED) if nominal.usable else nominal
 
     # -- real-time iteration --------------------------------------------------------------------------------
@@ -200,17 +203,9 @@ class Solver:
 
     # -- to convergence --------------------------------------------------------------------------------------
 
-    def _solve(
-        self,
-        subproblem: Subproblem,
-        x: np.ndarray,
-        theta: np.ndarray,
-        warm_start: np.ndarray,
-        xr: np.ndarray | None,
-        ur: np.ndarray | None,
-    ) -> Solution:
-        subproblem.load(x, theta, xr, ur)
-        v, merit = self._rows.clip(_numbers(warm_start)), np.inf
+    def _solve(self, subproblem: Subproblem, x: np.ndarray, v: np.ndarray) -> Solution:
+        """Step after step from inputs v, (N, m), inside their bounds, with what was loaded."""
+        merit = np.inf
         subproblem.linearise(v)
         status, values, seen = Status.ITERATION_LIMIT, self._rollout(x, v)["values"][:, 0].copy(), NO_ROWS
         iterations, size = 0, 0.0
@@ -220,8 +215,9 @@ class Solver:
             if target is None:
                 break
             seen = target.seen
+            arrived = Status.CONVERGED if target.feasible else Status.INFEASIBLE
             if not target.feasible:
-                status = Status.INFEASIBLE
+                status = arrived
             step = target.v - v
             size, before = float(np.abs(step).max()), size
             rate = size / before if before > 0 else np.inf
@@ -229,7 +225,7 @@ class Solver:
                 size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
             ):
                 # What is left to go is not worth another linearisation. v is feasible already.
-                v, status = target.v, Status.CONVERGED if target.feasible else status
+                v, status = target.v, arrived
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
             trial, trial_values = target.v, target.values
@@ -238,7 +234,7 @@ class Solver:
                 break
             if subproblem is self._nominal:
                 # The model is linear, and the step exact.
-                v, merit, status = trial, trial_merit, Status.CONVERGED if target.feasible else status
+                v, merit, status = trial, trial_merit, arrived
                 break
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and np.abs(step).max() >= self.tolerance:
@@ -248,11 +244,11 @@ class Solver:
                 trial_merit = self._merit(subproblem, trial, trial_values)
             if not trial_merit <= merit:
                 # No descent is left at this precision: v is as good as this linearisation can tell.
-                status = Status.CONVERGED if target.feasible else status
+                status = arrived
                 break
             v, values, merit = trial, trial_values, trial_merit
             if np.abs(step).max() < self.tolerance:
-                status = Status.CONVERGED if target.feasible else status
+                status = arrived
                 break
         return self._finish(status, x, v, merit, iterations)
 
