@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -175,6 +174,3 @@ class WholeTick:
 
 def _part(mode: str, seconds: float, solution: Solution, expected: Status) -> Part:
     return Part(mode, seconds, solution.v[0], solution.iterations, solution.status is expected)
-
-
-Build = Callable[[], Candidate]

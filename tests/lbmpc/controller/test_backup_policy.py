@@ -115,7 +115,7 @@ def test_a_margin_that_costs_nothing_is_kept(
         solved.append(arguments)
         return least_distance(*arguments)
 
-    monkeypatch.setattr("lbmpc.controller.backup_policy.least_distance", counted)
+    monkeypatch.setattr("lbmpc.solver.rows.least_distance", counted)
     theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
     policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
     assert policy is not None

@@ -245,9 +245,7 @@ LOOSE = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adap
 SMALL = ["controller.horizon=15", "controller.keyframe_every=10", "network.hidden=[8, 8]", "trainer.steps=20"]
 
 
-def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> (
-    None
-):
+def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> None:
     run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = [result.seq for result in run.results if result.weights_rolled_back]
     assert back
