@@ -15,7 +15,7 @@ from node_runtime.realtime import clock
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # Ctrl-C reaches a whole process group, and a supervisor may repeat it at once: still one wish to stop.
-SAME_WISH = 1.0
+REPEATED_SIGNAL_S = 1.0
 
 
 def new_run_id(process: str) -> str:
@@ -40,7 +40,7 @@ def stopped_by_signals(stop: threading.Event | None = None) -> Iterator[threadin
             first.append(clock.now())
             # Event.set from a handler could wait for a lock that the interrupted code holds.
             threading.Thread(target=event.set, name="stop", daemon=True).start()
-        elif clock.now() - first[0] > SAME_WISH:
+        elif clock.now() - first[0] > REPEATED_SIGNAL_S:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 

@@ -21,7 +21,7 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime.scheduling import punctual
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from node_runtime.tls import zenoh_log
 from protocol import topics
 
@@ -110,7 +110,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it cannot be used."""
     # Read when the first session opens, and nowhere else to be said.
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
-    bad = BadMessages()
+    bad = RejectedMessages()
     if open_to_all(config.bus.endpoint) and not config.bus.insecure:
         log.warning(
             "%s is neither encrypted nor authenticated: whoever reaches it may command the plant. Let it listen on "
@@ -125,7 +125,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     ):
         if remote(config):
             # At a thousand ticks a second a line of log for each message would cost more than the messages.
-            fast = config.rate > topics.GATHER_ABOVE
+            fast = config.rate > topics.BATCH_ABOVE_HZ
             filters = zenoh_log.REFUSED if fast else zenoh_log.DENIED
             while_listening.enter_context(zenoh_log.listening(bad, filters))
         try:

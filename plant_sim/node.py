@@ -17,7 +17,7 @@ from node_runtime.health import HealthPublisher, run_info
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer
-from node_runtime.realtime.scheduling import GarbageCollection, core_for, on_core, punctual, said_of
+from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual
 from plant_sim.simulator import PlantSim
 from protocol import topics
 from protocol.messages import Backup, Command, InputSource
@@ -126,7 +126,7 @@ def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | No
             with (
                 Bus(config, "plant", run_id, stopping) as bus,
                 HealthPublisher(
-                    bus, info, lambda: counts, "; ".join(filter(None, (note, said_of(place))))
+                    bus, info, lambda: counts, "; ".join(filter(None, (note, core_note(place))))
                 ) as health,
             ):
                 try:

@@ -104,7 +104,7 @@ def on_core(core: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def said_of(core: int | None) -> str:
+def core_note(core: int | None) -> str:
     """For `Health.note`."""
     return "" if core is None else f"its loop stays on core {core}"
 

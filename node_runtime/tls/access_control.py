@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from node_runtime.bus.zenoh_bus import LARGEST_QUESTION
 from node_runtime.tls.credentials import Credentials
 from protocol import topics
 from protocol.rights import ROLES, common_name, rights_of
@@ -58,12 +57,14 @@ def access_control(plant: str) -> dict[str, Any]:
 
     Default deny. "ingress" is what the router receives from the holder of a certificate, "egress" what it sends it.
     """
-    rules = [_rule("plain", MESSAGES, ["ingress", "egress"], ["**", f"{topics.PREFIX}/*/{topics.DIRECT}/**"])]
+    rules = [
+        _rule("plain", MESSAGES, ["ingress", "egress"], ["**", topics.below("*", f"{topics.DIRECT}/**")])
+    ]
     subjects: list[dict[str, Any]] = [{"id": "plain", "link_protocols": PLAIN}]
     policies = [{"rules": ["plain"], "subjects": ["plain"]}]
     # Who listens where: without it a publisher believes that nobody does, and sends nothing.
-    below = [topics.everything(plant), f"{topics.PREFIX}/{plant}/{topics.DIRECT}/**"]
-    rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], below))
+    all_keys = [topics.everything(plant), topics.below(plant, f"{topics.DIRECT}/**")]
+    rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], all_keys))
     for role in ROLES:
         rights = rights_of(role)
         own = [
@@ -95,15 +96,11 @@ def size_limits(plant: str) -> list[dict[str, Any]]:
     """What comes in by a certificate is no larger than its topic allows, already at the router."""
     limits: dict[int, list[str]] = {}
     for topic in topics.ALL:
-        keys = limits.setdefault(topic.max_bytes, [])
-        keys.append(topic.key(plant))
-        if topic.gathered and topic.lane == "control":
-            keys.append(topic.direct_key(plant))
+        limits.setdefault(topic.max_bytes, []).extend(topic.keys(plant))
     filters = [_limit(f"up to {size}", ["put"], keys, size) for size, keys in limits.items()]
-    below = [topics.everything(plant)]
-    largest = max(topic.max_bytes for topic in topics.ALL)
-    filters.append(_limit("questions", ["query"], below, LARGEST_QUESTION))
-    filters.append(_limit("answers", ["reply"], below, largest))
+    all_keys = [topics.everything(plant)]
+    filters.append(_limit("questions", ["query"], all_keys, topics.LARGEST_QUESTION))
+    filters.append(_limit("answers", ["reply"], all_keys, topics.LARGEST_MESSAGE))
     return filters
 
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 
 import zenoh
 
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import topics
 
 REFUSED = "error,zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info"
@@ -60,7 +60,7 @@ _REASONS = (
 class Refusals:
     """Reads Zenoh's log line by line. `bad` counts what was refused and logs the first of each kind."""
 
-    def __init__(self, bad: BadMessages):
+    def __init__(self, bad: RejectedMessages):
         self._bad = bad
         self._wondering: set[str] = set()
         self._names: OrderedDict[str, str] = OrderedDict()
@@ -105,7 +105,7 @@ class Refusals:
 
 
 @contextlib.contextmanager
-def listening(bad: BadMessages, filters: str) -> Iterator[None]:
+def listening(bad: RejectedMessages, filters: str) -> Iterator[None]:
     """While a router listens for other machines: `bad` counts what it refuses. Once in a process, before it opens.
 
     filters: `REFUSED` or `DENIED`; the environment's RUST_LOG goes before.

@@ -82,7 +82,17 @@ class Process:
             self._popen.communicate()
 
 
-class Ear:
+def matched(bus: Bus, topic: Topic) -> bool:
+    """Whether somebody is subscribed to this topic; a message sent before that reaches nobody."""
+    return bus._publisher(topic).matching_status.matching
+
+
+def connected(bus: Bus) -> bool:
+    """Whether both lanes have the router at this moment."""
+    return all(list(lane.info.routers_zid()) for lane in (bus._lanes.control, bus._lanes.bulk))
+
+
+class BusListener:
     """Remembers every message that it hears, in order of arrival."""
 
     def __init__(self, bus: Bus):
