@@ -11,7 +11,6 @@ from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
-from protocol.topics import Topic
 
 BATCH_TOPICS = {topic.name for topic in topics.BATCH.values()}
 
@@ -21,38 +20,15 @@ class Waiting(NamedTuple):
 
     topic: str
     published_ns: int
+    """On the monotonic clock."""
     payload: bytes
 
 
-class OutgoingBatch:
-    """What one process has published and not sent yet, in order. The caller keeps threads apart."""
-
-    def __init__(self, run_id: str):
-        self._run_id = run_id
-        self._waiting: list[Waiting] = []
-        self._size = 0
-        self._seq = 0
-
-    def add(self, topic: Topic, payload: bytes, now_ns: int) -> bool:
-        """Let a message wait, published at `now_ns` on the monotonic clock; whether it is time to send them all."""
-        self._waiting.append(Waiting(topic.name, now_ns, payload))
-        self._size += len(payload)
-        waited = now_ns - self._waiting[0].published_ns
-        return waited >= topics.BATCH_S * 1e9 or self._size > topics.BATCH_BYTES
-
-    def take(self) -> tuple[list[Waiting], int]:
-        """All that waits, and its bytes; nothing waits afterwards."""
-        taken = self._waiting, self._size
-        self._waiting, self._size = [], 0
-        return taken
-
-    def encode(self, waiting: list[Waiting]) -> bytes:
-        """The `Batch` of these messages, sent now."""
-        now_ns = clock.now_ns()
-        parts = [m.Gathered(topic, max(0, now_ns - at), payload) for topic, at, payload in waiting]
-        batch = m.Batch(run_id=self._run_id, seq=self._seq, messages=parts)
-        self._seq += 1
-        return codec.encode(batch)
+def encode_batch(run_id: str, seq: int, waiting: list[Waiting]) -> bytes:
+    """The `Batch` of these messages, sent now."""
+    now_ns = clock.now_ns()
+    parts = [m.Gathered(topic, max(0, now_ns - at), payload) for topic, at, payload in waiting]
+    return codec.encode(m.Batch(run_id=run_id, seq=seq, messages=parts))
 
 
 def unbatch(delivery: Delivery, bad: RejectedMessages) -> Iterator[Delivery]:

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
-from node_runtime.bus.batches import OutgoingBatch
-from node_runtime.realtime import clock
+from node_runtime.bus.batches import Waiting, encode_batch
+from protocol import topics
 from protocol.topics import Topic
 
 MAX_MESSAGES = 2000
@@ -25,9 +25,10 @@ class BulkQueue:
         send: Callable[[Topic, bytes], None],
     ):
         """`batch`: the process's own topic for batches; `post`: leaves a call of `send` to the thread that sends."""
-        self._batch_topic = batch
-        self._batch = OutgoingBatch(run_id)
-        self._post, self._send = post, send
+        self._run_id, self._batch_topic, self._post, self._send = run_id, batch, post, send
+        self._waiting: list[Waiting] = []
+        self._waiting_bytes = 0
+        self._batches = 0
         self._empty = threading.Condition()
         self._messages = 0
         self._bytes = 0
@@ -41,10 +42,13 @@ class BulkQueue:
             self._put_batch()
             self._put(topic, len(payload), 1, lambda: payload)
 
-    def put_batched(self, topic: Topic, payload: bytes) -> None:
-        """Let a message wait for others, and send them all when it is time."""
+    def put_batched(self, topic: Topic, payload: bytes, now_ns: int) -> None:
+        """Let a message wait for others, published at `now_ns` (monotonic); send them all when it is time."""
         with self._empty:
-            if self._batch.add(topic, payload, clock.now_ns()):
+            self._waiting.append(Waiting(topic.name, now_ns, payload))
+            self._waiting_bytes += len(payload)
+            waited_ns = now_ns - self._waiting[0].published_ns
+            if waited_ns >= topics.BATCH_S * 1e9 or self._waiting_bytes > topics.BATCH_BYTES:
                 self._put_batch()
 
     def flush(self, timeout_s: float) -> bool:
@@ -60,9 +64,10 @@ class BulkQueue:
 
     def _put_batch(self) -> None:
         """With the lock held: what has waited is one message more to send. Its parts count one by one if lost."""
-        waiting, size = self._batch.take()
+        waiting, size = self._waiting, self._waiting_bytes
+        self._waiting, self._waiting_bytes = [], 0
         if waiting and self._batch_topic is not None:
-            self._put(self._batch_topic, size, len(waiting), partial(self._batch.encode, waiting))
+            self._put(self._batch_topic, size, len(waiting), partial(self._encode, waiting))
 
     def _put(self, topic: Topic, size: int, messages: int, encode: Callable[[], bytes]) -> None:
         """With the lock held."""
@@ -75,9 +80,15 @@ class BulkQueue:
         self._bytes += size
         self._post(partial(self._send_one, topic, size, encode))
 
+    # -- in the thread that sends, where nobody waits for it ---------------------------------------------
+
+    def _encode(self, waiting: list[Waiting]) -> bytes:
+        batch = encode_batch(self._run_id, self._batches, waiting)
+        self._batches += 1
+        return batch
+
     def _send_one(self, topic: Topic, size: int, encode: Callable[[], bytes]) -> None:
         try:
-            # A batch is put together here, where nobody waits for it.
             self._send(topic, encode())
         finally:
             with self._empty:

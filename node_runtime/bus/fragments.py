@@ -53,17 +53,6 @@ class BadFragmentError(ValueError):
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Fragment)
 
 
-def split(payload: bytes, writer: str, number: int) -> Iterator[bytes]:
-    """What to send instead of a payload: itself, or its fragments in order."""
-    if len(payload) <= FRAGMENT_BYTES:
-        yield payload
-        return
-    crc32, view = zlib.crc32(payload), memoryview(payload)
-    for index, begin in enumerate(range(0, len(payload), FRAGMENT_BYTES)):
-        data = bytes(view[begin : begin + FRAGMENT_BYTES])
-        yield MARK + _encoder.encode(Fragment(writer, number, index, len(payload), crc32, data))
-
-
 class Fragmenter:
     """Cuts what one process sends; any thread may call."""
 
@@ -72,27 +61,33 @@ class Fragmenter:
         self._numbers = itertools.count()
 
     def split(self, payload: bytes) -> Iterator[bytes]:
-        """What to send instead of a payload, in order."""
-        return split(payload, self._run_id, next(self._numbers))
+        """What to send instead of a payload: itself, or its fragments in order."""
+        number = next(self._numbers)
+        if len(payload) <= FRAGMENT_BYTES:
+            yield payload
+            return
+        crc32, view = zlib.crc32(payload), memoryview(payload)
+        for index, begin in enumerate(range(0, len(payload), FRAGMENT_BYTES)):
+            data = bytes(view[begin : begin + FRAGMENT_BYTES])
+            yield MARK + _encoder.encode(Fragment(self._run_id, number, index, len(payload), crc32, data))
 
 
 class _Incomplete:
-    def __init__(self, fragment: Fragment):
-        self.like = (fragment.size, fragment.crc32)
-        self.number = fragment.number
+    def __init__(self, first: Fragment):
+        self.first = first
         self.parts: dict[int, bytes] = {}
         self.held = 0
 
-    def add(self, fragment: Fragment) -> bool:
-        """Whether the message is whole now."""
-        if fragment.index not in self.parts:
-            self.parts[fragment.index] = fragment.data
-            self.held += len(fragment.data)
-        return self.held == self.like[0]
+    def add(self, fragment: Fragment) -> int:
+        """How many bytes more are held now."""
+        new = 0 if fragment.index in self.parts else len(fragment.data)
+        self.parts.setdefault(fragment.index, fragment.data)
+        self.held += new
+        return new
 
     def whole(self) -> bytes:
         payload = b"".join(self.parts[index] for index in range(len(self.parts)))
-        if zlib.crc32(payload) != self.like[1]:
+        if zlib.crc32(payload) != self.first.crc32:
             raise BadFragmentError("pieces do not make the message")
         return payload
 
@@ -142,22 +137,21 @@ class Reassembler:
         fragment = _read(payload, largest)
         at = (name, fragment.writer)
         message = self._incomplete.get(at)
-        if message is not None and fragment.number != message.number:
-            if fragment.number < message.number:
-                raise BadFragmentError("late piece")
+        if message is not None and fragment.number > message.first.number:
             # A writer sends one after the other, so the rest of the one before is not coming.
             self._forget(at)
             message = None
         if message is None:
             message = self._incomplete[at] = _Incomplete(fragment)
-        elif message.like != (fragment.size, fragment.crc32):
+        first = message.first
+        if fragment.number < first.number:
+            raise BadFragmentError("late piece")
+        if (fragment.size, fragment.crc32) != (first.size, first.crc32):
             raise BadFragmentError("pieces of two messages")
-        before = message.held
-        whole = message.add(fragment)
-        self._held += message.held - before
-        if whole:
-            del self._incomplete[at]
+        self._held += message.add(fragment)
+        if message.held == first.size:
             self._held -= message.held
+            del self._incomplete[at]
             return message.whole()
         while self._held > self.limit or len(self._incomplete) > INCOMPLETE:
             self._forget(next(iter(self._incomplete)))

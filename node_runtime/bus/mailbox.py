@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 
 # A queue of the largest messages must not take the machine's memory.
@@ -69,7 +68,3 @@ class Mailbox:
 
     def __len__(self) -> int:
         return len(self._items)
-
-
-OnDelivery = Callable[[Delivery], None]
-"""What a receiving thread calls; it must be short."""

@@ -9,20 +9,19 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-import time
 from typing import Any
 
 import zenoh
 
-from node_runtime.bus import queries
 from node_runtime.bus.batches import UnbatchingMailbox
 from node_runtime.bus.bulk_queue import BulkQueue
 from node_runtime.bus.fragments import Fragmenter, Reassembler
 from node_runtime.bus.lanes import Lanes
-from node_runtime.bus.mailbox import Delivery, Mailbox, OnDelivery
-from node_runtime.bus.queries import Handler, QueryThread
+from node_runtime.bus.mailbox import Delivery, Mailbox
+from node_runtime.bus.queries import Handler, Queries
 from node_runtime.bus.session import OpenInterrupted, session_config
 from node_runtime.config.sections import Config
+from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol.messages import Message
@@ -66,7 +65,7 @@ class Bus:
         self._closed = False
         self._fragmenter = Fragmenter(run_id)
         self._outgoing = BulkQueue(run_id, topics.BATCH.get(process), self._lanes.post, self._send_bulk)
-        self._queries = QueryThread(self._fragmenter, self.bad, lambda: self._count("answers not sent"))
+        self._queries = Queries(self._lanes, config.name, self._fragmenter, self.bad, self._count)
 
     # -- opening and closing -----------------------------------------------------------------------------
 
@@ -112,7 +111,7 @@ class Bus:
         if topic.lane == "control":
             self._put(topic, payload)
         if topic.batched_at(self.config.rate):
-            self._outgoing.put_batched(topic, payload)
+            self._outgoing.put_batched(topic, payload, clock.now_ns())
         elif topic.lane == "bulk":
             self._outgoing.put(topic, payload)
 
@@ -162,9 +161,9 @@ class Bus:
         """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
         mailbox = self._remember(Mailbox(topic.name, capacity))
         session, name = self._session(topic), self.config.name
-        self._subscribe(session, topic.key(name), mailbox.put, topic)
+        self._subscribe(session, topic.key(name), mailbox, topic)
         if topic.lane == "control" and topic.batched_at(self.config.rate):
-            self._subscribe(session, topic.direct_key(name), mailbox.put, topic)
+            self._subscribe(session, topic.direct_key(name), mailbox, topic)
         return mailbox
 
     def everything(self, capacity: int = 100_000) -> Mailbox:
@@ -173,7 +172,7 @@ class Bus:
         What travelled in a `Batch` is here one by one, as if it had travelled alone.
         """
         mailbox = self._remember(UnbatchingMailbox("everything", capacity, self.bad))
-        self._subscribe(self._session(), topics.everything(self.config.name), mailbox.put)
+        self._subscribe(self._session(), topics.everything(self.config.name), mailbox)
         return mailbox
 
     def _remember(self, mailbox: Mailbox) -> Mailbox:
@@ -182,7 +181,7 @@ class Bus:
         return mailbox
 
     def _subscribe(
-        self, session: zenoh.Session, key: str, deliver: OnDelivery, only: Topic | None = None
+        self, session: zenoh.Session, key: str, mailbox: Mailbox, only: Topic | None = None
     ) -> None:
         """`only`: what `key` is the key of, None where it covers many."""
         bad = self.bad
@@ -191,7 +190,7 @@ class Bus:
 
         # Runs on the link's receiving thread, so it must be short: a stamp, a copy, an append.
         def arrived(sample: zenoh.Sample) -> None:
-            received_ns = time.monotonic_ns()
+            received_ns = clock.now_ns()
             key = plain or str(sample.key_expr)
             topic = only or topics.topic_of(key)
             limit = LARGEST_MESSAGE if topic is None else topic.max_bytes
@@ -204,7 +203,7 @@ class Bus:
                 arrived_now = payload.to_bytes()
                 whole = arrived_now if topic is None else reassembler.whole(topic.name, arrived_now, limit)
                 if whole is not None:
-                    deliver(Delivery(key, whole, received_ns))
+                    mailbox.put(Delivery(key, whole, received_ns))
 
         callback = zenoh.handlers.Callback(arrived, indirect=False)
         self._declared.append(session.declare_subscriber(key, callback))
@@ -218,17 +217,11 @@ class Bus:
         asker's fault: counted, named once, answered with the text. Queries beyond a few pending ones go
         unanswered.
         """
-        self._declared.append(self._queries.declare(self._session(), self.config.name, name, handler))
+        self._declared.append(self._queries.serve(name, handler))
 
     def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
         """Payloads of all answers to a query at `tandem/<plant>/<name>`; [] when nobody answers in time."""
-        session, plant = self._session(), self.config.name
-        try:
-            return queries.ask(session, plant, name, parameters, timeout_s, self._lanes.stop, self.bad)
-        except zenoh.ZError as error:
-            if self._count(f"not asked {name}") == 1:
-                log.warning("%s could not be asked: %s", name, error)
-            return []
+        return self._queries.ask(name, parameters, timeout_s)
 
     # -- figures -----------------------------------------------------------------------------------------
 

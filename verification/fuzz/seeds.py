@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
-from node_runtime.bus.batches import OutgoingBatch, Waiting
+from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.sections import Config, override
 from node_runtime.health import run_info
 from plant_sim.node import build
@@ -102,7 +102,7 @@ def seeds() -> dict[str, list[bytes]]:
     for name, topic in topics.BATCH.items():
         inside = topics.PLANT_STATE if name == "plant" else topics.COMMAND
         parts = [Waiting(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
-        out[topic.name].append(OutgoingBatch(f"{name}-1").encode(parts))
+        out[topic.name].append(encode_batch(f"{name}-1", 0, parts))
     return out
 
 

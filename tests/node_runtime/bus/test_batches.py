@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from node_runtime.bus.batches import OutgoingBatch, UnbatchingMailbox
+from node_runtime.bus.batches import UnbatchingMailbox
+from node_runtime.bus.bulk_queue import BulkQueue
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
@@ -15,6 +16,7 @@ from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
+from protocol.topics import Topic
 from tests.helpers.live import HANG_S, live_config, matched, wait_for
 
 BATCH = topics.BATCH["controller"]
@@ -38,15 +40,28 @@ def hear(heard: list[Delivery], new: list[Delivery]) -> list[Delivery]:
     return heard
 
 
+class Sent:
+    """A queue whose messages are sent at once, to here."""
+
+    def __init__(self) -> None:
+        self.batches: list[bytes] = []
+        self.queue = BulkQueue("controller-a", BATCH, lambda send: send(), self._send)
+
+    def _send(self, topic: Topic, payload: bytes) -> None:
+        assert topic is BATCH
+        self.batches.append(payload)
+
+
 def batched(count: int) -> tuple[bytes, list[bytes]]:
-    outgoing = OutgoingBatch("controller-a")
+    sent = Sent()
     payloads = [codec.encode(timing(seq)) for seq in range(count)]
     for k, payload in enumerate(payloads):
-        outgoing.add(topics.TIMING, payload, 1_000_000 * k)
-    waiting, size = outgoing.take()
-    assert size == sum(map(len, payloads))
-    assert outgoing.take() == ([], 0)
-    return outgoing.encode(waiting), payloads
+        sent.queue.put_batched(topics.TIMING, payload, 100_000 * k)
+    assert sent.batches == []
+    assert sent.queue.flush(0.0)
+    assert sent.queue.flush(0.0)
+    (batch,) = sent.batches
+    return batch, payloads
 
 
 def test_a_batch_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
@@ -62,14 +77,16 @@ def test_a_batch_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
     assert [one.payload for one in rest] == payloads
     assert {one.key for one in rest} == {topics.TIMING.key("jet1")}
     steps = {b.received_ns - a.received_ns for a, b in itertools.pairwise(rest)}
-    assert steps == {1_000_000}
+    assert steps == {100_000}
     assert rest[-1].received_ns <= 10**9
 
 
 def test_messages_wait_twenty_milliseconds_and_no_longer() -> None:
-    outgoing = OutgoingBatch("controller-a")
-    due = [outgoing.add(topics.TIMING, b"x", 1_000_000 * k) for k in range(21)]
-    assert due == [False] * 20 + [True]
+    sent, due = Sent(), []
+    for k in range(21):
+        sent.queue.put_batched(topics.TIMING, b"x", 1_000_000 * k)
+        due.append(len(sent.batches))
+    assert due == [0] * 20 + [1]
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", codec.encode(timing(0))])

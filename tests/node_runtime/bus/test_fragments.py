@@ -16,8 +16,8 @@ from node_runtime.bus.fragments import (
     INCOMPLETE,
     MARK,
     Fragment,
+    Fragmenter,
     Reassembler,
-    split,
 )
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
@@ -32,7 +32,9 @@ LIMIT = 64 * FRAGMENT_BYTES
 
 
 def fragments(message: bytes = MESSAGE, writer: str = "trainer-a", number: int = 0) -> list[bytes]:
-    return list(split(message, writer, number))
+    """Of the process's message with that number, which counts from 0."""
+    sending = Fragmenter(writer)
+    return [list(sending.split(message)) for _ in range(number + 1)][-1]
 
 
 def altered(payload: bytes, **changes: object) -> bytes:

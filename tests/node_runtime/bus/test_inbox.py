@@ -12,10 +12,11 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from node_runtime.bus.inbox import AgeEstimate, Follower, Inbox, RejectedMessages
+from node_runtime.bus.inbox import AgeEstimate, Follower, Inbox
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.realtime import clock
+from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
