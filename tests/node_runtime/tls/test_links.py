@@ -435,17 +435,17 @@ def test_zenoh_s_questions_to_itself_are_no_denials():
         who + "Declare Liveliness Subscriber (ingress) on tandem/jet1/controller/samples",
         "Using cached result: a6 is authorized to Declare Subscriber (ingress) on tandem/jet1/controller/samples",
     ):
-        assert refusals.hear(head + text)
+        assert refusals.read(head + text)
     assert bad.total == 0
-    assert refusals.hear(
+    assert refusals.read(
         head + "Using cached result: a6 is unauthorized to Put (ingress) on tandem/jet1/controller/tick"
     )
-    assert refusals.hear(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
+    assert refusals.read(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
     assert bad.counters() == {
         "bad from trainer.jet1: denied, put controller/tick": 1,
         "bad from trainer.jet1: denied, put elsewhere": 1,
     }
-    assert not refusals.hear("a line of somebody else")
+    assert not refusals.read("a line of somebody else")
 
 
 def test_who_was_denied_is_known_after_any_number_of_sessions():
@@ -455,13 +455,13 @@ def test_who_was_denied_is_known_after_any_number_of_sessions():
     head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
     who = "+CertCommonName({})+Transport(Tls)+a6 is {}authorized to "
     for k in range(MAX_NAMES + 500):
-        refusals.hear(
+        refusals.read(
             head
             + f"{k:x} on Interface(lo)"
             + who.format("operator.jet1", "")
             + "Put (ingress) on tandem/jet1/x"
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
-    refusals.hear(last + "Put (ingress) on tandem/jet1/controller/command")
+    refusals.read(last + "Put (ingress) on tandem/jet1/controller/command")
     assert bad.counters() == {"bad from trainer.jet1: denied, put controller/command": 1}
     assert len(refusals._names) == MAX_NAMES
