@@ -195,16 +195,12 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                     expect(f"plan[{i}]", entry, m_inputs)
             if not message.plan:
                 raise wrong("the plan is empty")
-            if not 0.0 < message.period < 3600.0:
-                raise wrong(f"period {message.period} s")
         case m.Backup():
             if len(message.gain) != m_inputs or not message.inputs:
                 raise wrong("no entry in inputs, or in gain not one an input")
             for name, rows, length in (("gain", message.gain, d), ("inputs", message.inputs, m_inputs)):
                 for i, row in enumerate(rows):
                     expect(f"{name}[{i}]", row, length)
-            if not 0.0 < message.period < 3600.0:
-                raise wrong(f"period {message.period} s")
         case m.Samples():
             for sample in message.samples:
                 expect("x", sample.x, d)
@@ -215,3 +211,5 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
         case m.OutputWeights():
             if len(message.K.shape) != 2 or message.K.shape[1] != d:
                 raise wrong(f"K is {message.K.shape}, the plant has {d} states")
+    if isinstance(message, m.Command | m.Backup) and not 0.0 < message.period < 3600.0:
+        raise wrong(f"period {message.period} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -28,7 +29,7 @@ class BulkQueue:
         self._run_id, self._batch_topic, self._post, self._send = run_id, batch, post, send
         self._waiting: list[Waiting] = []
         self._waiting_bytes = 0
-        self._batches = 0
+        self._batches = itertools.count()
         self._empty = threading.Condition()
         self._messages = 0
         self._bytes = 0
@@ -67,7 +68,11 @@ class BulkQueue:
         waiting, size = self._waiting, self._waiting_bytes
         self._waiting, self._waiting_bytes = [], 0
         if waiting and self._batch_topic is not None:
-            self._put(self._batch_topic, size, len(waiting), partial(self._encode, waiting))
+            # Numbered only when it is sent: a batch that finds no place leaves no gap.
+            def encode() -> bytes:
+                return encode_batch(self._run_id, next(self._batches), waiting)
+
+            self._put(self._batch_topic, size, len(waiting), encode)
 
     def _put(self, topic: Topic, size: int, messages: int, encode: Callable[[], bytes]) -> None:
         """With the lock held."""
@@ -80,14 +85,8 @@ class BulkQueue:
         self._bytes += size
         self._post(partial(self._send_one, topic, size, encode))
 
-    # -- in the thread that sends, where nobody waits for it ---------------------------------------------
-
-    def _encode(self, waiting: list[Waiting]) -> bytes:
-        batch = encode_batch(self._run_id, self._batches, waiting)
-        self._batches += 1
-        return batch
-
     def _send_one(self, topic: Topic, size: int, encode: Callable[[], bytes]) -> None:
+        """In the thread that sends, where nobody waits for it."""
         try:
             self._send(topic, encode())
         finally:

@@ -106,12 +106,8 @@ class Reassembler:
         self._bad = bad
         self._lock = threading.Lock()
         self._incomplete: OrderedDict[tuple[str, str], _Incomplete] = OrderedDict()
-        self._held = 0
-
-    @property
-    def held(self) -> int:
+        self.held = 0
         """Bytes that wait for the rest of their messages."""
-        return self._held
 
     def whole(self, name: str, payload: bytes, largest: int) -> bytes | None:
         """The message that a payload is, or that it completes if it is a fragment; None if it completes none.
@@ -148,17 +144,17 @@ class Reassembler:
             raise BadFragmentError("late piece")
         if (fragment.size, fragment.crc32) != (first.size, first.crc32):
             raise BadFragmentError("pieces of two messages")
-        self._held += message.add(fragment)
+        self.held += message.add(fragment)
         if message.held == first.size:
-            self._held -= message.held
+            self.held -= message.held
             del self._incomplete[at]
             return message.whole()
-        while self._held > self.limit or len(self._incomplete) > INCOMPLETE:
+        while self.held > self.limit or len(self._incomplete) > INCOMPLETE:
             self._forget(next(iter(self._incomplete)))
         return None
 
     def _forget(self, at: tuple[str, str]) -> None:
-        self._held -= self._incomplete.pop(at).held
+        self.held -= self._incomplete.pop(at).held
         self._bad.count(at[0], "pieces lost", f"a message of {at[1]}")
 
 

@@ -11,6 +11,7 @@ import zenoh
 
 from node_runtime.bus.session import connect
 from node_runtime.config.sections import Config
+from protocol.topics import Lane
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ class Lanes:
         """`stop`: when set, a pending `open` gives up with `OpenInterrupted`."""
         self._config, self._process = config, process
         self.stop = stop or threading.Event()
-        self._sessions: tuple[zenoh.Session, ...] = ()
+        self._sessions: dict[Lane, zenoh.Session] = {}
         self._outgoing: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._sender = threading.Thread(target=self._send, name="bulk", daemon=True)
 
@@ -40,7 +41,8 @@ class Lanes:
         """
         if self._sessions:
             raise RuntimeError("these lanes are open already")
-        self._sessions = connect(self._config, self.stop, self._process, 2)
+        control, bulk = connect(self._config, self.stop, self._process, 2)
+        self._sessions = {"control": control, "bulk": bulk}
         self._sender.start()
 
     def close(self, drain_s: float = 2.0) -> None:
@@ -61,22 +63,15 @@ class Lanes:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def control(self) -> zenoh.Session:
-        return self._session(0)
-
-    @property
-    def bulk(self) -> zenoh.Session:
-        return self._session(1)
+    def session(self, lane: Lane) -> zenoh.Session:
+        """Raises `RuntimeError` before `open`."""
+        if not self._sessions:
+            raise RuntimeError("the bus is not open; call open() first")
+        return self._sessions[lane]
 
     def post(self, send: Callable[[], None]) -> None:
         """Leave it to the thread that sends bulk to call `send`, after all that was left to it before."""
         self._outgoing.put(send)
-
-    def _session(self, index: int) -> zenoh.Session:
-        if not self._sessions:
-            raise RuntimeError("the bus is not open; call open() first")
-        return self._sessions[index]
 
     def _send(self) -> None:
         while (send := self._outgoing.get()) is not None:
@@ -87,5 +82,5 @@ class Lanes:
                 log.exception("a message was not sent")
 
     def _leave(self) -> None:
-        for session in self._sessions:
+        for session in self._sessions.values():
             session.close()

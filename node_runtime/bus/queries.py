@@ -77,7 +77,9 @@ class Queries:
                 self._thread = threading.Thread(target=self._answer, name="queries", daemon=True)
                 self._thread.start()
         callback = zenoh.handlers.Callback(arrived, indirect=False)
-        return self._lanes.bulk.declare_queryable(topics.below(self._plant, name), callback, complete=True)
+        return self._lanes.session("bulk").declare_queryable(
+            topics.below(self._plant, name), callback, complete=True
+        )
 
     def _answer(self) -> None:
         while (item := self._pending.get()) is not None:
@@ -119,7 +121,7 @@ class Queries:
                     answers.put(Delivery(str(reply.ok.key_expr), whole, clock.now_ns()))
 
         try:
-            self._lanes.bulk.get(
+            self._lanes.session("bulk").get(
                 zenoh.Selector(topics.below(self._plant, name), parameters),
                 zenoh.handlers.Callback(arrived, done.set, indirect=False),
                 target=zenoh.QueryTarget.ALL,

@@ -137,7 +137,7 @@ class Bus:
         if publisher is not None:
             return publisher
         control = topic.lane == "control"
-        session, name = self._session(topic), self.config.name
+        session, name = self._lanes.session(topic.lane), self.config.name
         direct = control and topic.batched_at(self.config.rate)
         with self._lock:
             if topic.name not in self._publishers:
@@ -151,16 +151,12 @@ class Bus:
                 )
             return self._publishers[topic.name]
 
-    def _session(self, topic: Topic | None = None) -> zenoh.Session:
-        control = topic is not None and topic.lane == "control"
-        return self._lanes.control if control else self._lanes.bulk
-
     # -- receiving ---------------------------------------------------------------------------------------
 
     def queue(self, topic: Topic, capacity: int = 1000) -> Mailbox:
         """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
         mailbox = self._remember(Mailbox(topic.name, capacity))
-        session, name = self._session(topic), self.config.name
+        session, name = self._lanes.session(topic.lane), self.config.name
         self._subscribe(session, topic.key(name), mailbox, topic)
         if topic.lane == "control" and topic.batched_at(self.config.rate):
             self._subscribe(session, topic.direct_key(name), mailbox, topic)
@@ -172,7 +168,7 @@ class Bus:
         What travelled in a `Batch` is here one by one, as if it had travelled alone.
         """
         mailbox = self._remember(UnbatchingMailbox("everything", capacity, self.bad))
-        self._subscribe(self._session(), topics.everything(self.config.name), mailbox)
+        self._subscribe(self._lanes.session("bulk"), topics.everything(self.config.name), mailbox)
         return mailbox
 
     def _remember(self, mailbox: Mailbox) -> Mailbox:

@@ -70,10 +70,10 @@ def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
 
     where: the file, for messages.
     """
-    return convert(tree, kind, failing(where, None))
+    return convert(tree, kind, failing(where))
 
 
-def failing(where: str, origins: Mapping[str, str] | None) -> Fail:
+def failing(where: str, origins: Mapping[str, str] | None = None) -> Fail:
     """What names the place of a mistake: the file, or for a key that came from elsewhere (`trainer.batch`) that."""
 
     def fail(key: str, text: str) -> NoReturn:
@@ -190,7 +190,6 @@ def _without_none(kind: inspect.Type) -> inspect.Type:
 
 
 def _shown(value: object) -> str:
-    text = (
-        repr(value) if isinstance(value, str | float) else msgspec.json.encode(value, enc_hook=str).decode()
-    )
+    plain = isinstance(value, str | float)
+    text = repr(value) if plain else msgspec.json.encode(value, enc_hook=str).decode()
     return text if len(text) <= 60 else text[:57] + "..."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from node_runtime.tls.credentials import Credentials
 from protocol import topics
@@ -23,32 +23,27 @@ MESSAGES = [
 ]
 
 
-def client_settings(credentials: Credentials) -> dict[str, Any]:
+def client_settings(own: Credentials) -> dict[str, Any]:
     """For a session that connects by `tls/` or `quic/`."""
+    return {"transport/link/tls": _link("connect", own) | {"verify_name_on_connect": True}}
+
+
+def router_settings(own: Credentials, plant: str) -> dict[str, Any]:
+    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
     return {
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.authority),
-            "enable_mtls": True,
-            "connect_private_key": str(credentials.key),
-            "connect_certificate": str(credentials.certificate),
-            "verify_name_on_connect": True,
-            "close_link_on_expiration": True,
-        }
+        "transport/link/tls": _link("listen", own),
+        "access_control": access_control(plant),
+        "low_pass_filter": size_limits(plant),
     }
 
 
-def router_settings(credentials: Credentials, plant: str) -> dict[str, Any]:
-    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
+def _link(way: Literal["connect", "listen"], own: Credentials) -> dict[str, Any]:
     return {
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.authority),
-            "enable_mtls": True,
-            "listen_private_key": str(credentials.key),
-            "listen_certificate": str(credentials.certificate),
-            "close_link_on_expiration": True,
-        },
-        "access_control": access_control(plant),
-        "low_pass_filter": size_limits(plant),
+        "root_ca_certificate": str(own.authority),
+        "enable_mtls": True,
+        f"{way}_private_key": str(own.key),
+        f"{way}_certificate": str(own.certificate),
+        "close_link_on_expiration": True,
     }
 
 

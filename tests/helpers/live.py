@@ -12,13 +12,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from typing import get_args
 
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
 from node_runtime.config.sections import Config, override, to_json
 from node_runtime.realtime import clock
 from protocol import codec
 from protocol import messages as m
-from protocol.topics import Topic, topic_of
+from protocol.topics import Lane, Topic, topic_of
 
 PROGRAM = (
     "import logging, sys; logging.basicConfig(format='%(message)s', level='INFO');"
@@ -89,7 +90,7 @@ def matched(bus: Bus, topic: Topic) -> bool:
 
 def connected(bus: Bus) -> bool:
     """Whether both lanes have the router at this moment."""
-    return all(list(lane.info.routers_zid()) for lane in (bus._lanes.control, bus._lanes.bulk))
+    return all(list(bus._lanes.session(lane).info.routers_zid()) for lane in get_args(Lane))
 
 
 class BusListener:

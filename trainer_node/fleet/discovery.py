@@ -108,7 +108,7 @@ class OneRouter:
 
     def __enter__(self) -> OneRouter:
         if not self._named:
-            self._subscribers = self._heard.listen(self._lanes.bulk, "*", FOUND_BY)
+            self._subscribers = self._heard.listen(self._lanes.session("bulk"), "*", FOUND_BY)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -179,7 +179,7 @@ class OwnRouters:
             try:
                 valid_s = _valid_s(config)
                 with Lanes(config, "trainer", self._stop) as lanes:
-                    subscribers = self._heard.listen(lanes.bulk, name, READABLE)
+                    subscribers = self._heard.listen(lanes.session("bulk"), name, READABLE)
                     with self._lock:
                         self._reached[name] = lanes
                         self._open.add(name)

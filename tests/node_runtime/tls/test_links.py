@@ -273,7 +273,10 @@ def test_what_a_role_may_not_publish_reaches_nobody(site: Site, role: str):
     """The last message is one that it may publish, so all before it have arrived or never will."""
     with Bus(site.local, "operator", "o-1") as ear, site.session(role) as session:
         heard, block = ear.everything(), zenoh.CongestionControl.BLOCK
-        fast = [ear._session().declare_subscriber(topic.direct_key("jet1")) for topic in (topics.COMMAND,)]
+        fast = [
+            ear._lanes.session("bulk").declare_subscriber(topic.direct_key("jet1"))
+            for topic in (topics.COMMAND,)
+        ]
         # Only now does the router know that somebody listens.
         _until(heard, topics.HEALTH["router"].key("jet1"))
         for name, topic in FOREIGN:
@@ -328,7 +331,7 @@ def test_a_trainer_hears_no_commands_and_answers_no_questions(site: Site):
 def test_a_message_beyond_its_topic_s_size_ends_at_the_router(site: Site):
     health = topics.HEALTH["trainer"]
     with Bus(site.local, "recorder", "r-1") as ear, site.session("trainer") as session:
-        heard = ear._session().declare_subscriber(health.key("jet1"))
+        heard = ear._lanes.session("bulk").declare_subscriber(health.key("jet1"))
         own = session.declare_publisher(health.key("jet1"))
         wait_for(lambda: own.matching_status.matching)
         block = zenoh.CongestionControl.BLOCK
@@ -360,7 +363,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
         heard = trainer.queue(topics.SAMPLES), brief.queue(topics.SAMPLES)
         # The rights are the same by either protocol.
         wait_for(lambda: matched(trainer, topics.HIDDEN_WEIGHTS))
-        trainer._session().put(topics.COMMAND.key("jet1"), b"bad")
+        trainer._lanes.session("bulk").put(topics.COMMAND.key("jet1"), b"bad")
         trainer._put(topics.HIDDEN_WEIGHTS, b"weights")
         arrived = weights.get(HANG_S)
         assert arrived is not None
