@@ -17,7 +17,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
-from node_runtime.lifecycle import REPEATED_SIGNAL_S, new_run_id, stopped_by_signals
+from node_runtime.lifecycle import REPEATED_SIGNAL_S, new_run_id, run_process, stopped_by_signals
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import (
     GarbageCollection,
@@ -101,6 +101,24 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [given]
+
+
+def test_a_process_ends_well_when_told_to_stop_before_there_is_a_router() -> None:
+    def body(stopping: threading.Event) -> int:
+        with Bus(live_config(), "plant", "plant-a", stopping):
+            return 7
+
+    stop = threading.Event()
+    threading.Timer(0.2, stop.set).start()
+    assert run_process(body, stop) == 0
+
+
+def test_a_configuration_that_cannot_be_used_is_an_exit_code(caplog: pytest.LogCaptureFixture) -> None:
+    def body(_stopping: threading.Event) -> int:
+        raise ConfigError("rate = -1.0 is not a number above 0")
+
+    assert run_process(body) == 2
+    assert "rate = -1.0 is not a number above 0" in caplog.text
 
 
 def test_without_the_privilege_one_warning_and_a_note() -> None:
