@@ -25,10 +25,10 @@ from node_runtime.realtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime.scheduling import (
     GarbageCollection,
     core_for,
+    core_note,
     on_core,
     one_blas_thread,
     punctual,
-    said_of,
 )
 from protocol import codec, topics
 from protocol import messages as m
@@ -335,7 +335,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                     bus,
                     core.run_info(time.time()),
                     lambda: counts,
-                    "; ".join(filter(None, (note, said_of(place)))),
+                    "; ".join(filter(None, (note, core_note(place)))),
                 ) as health,
             ):
                 saving = None

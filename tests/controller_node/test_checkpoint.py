@@ -34,7 +34,7 @@ from protocol import messages as m
 from run_log.reading.reader import gather
 from run_log.replaying.replay import replay
 from tandem.experiments.simulation.lockstep import simulate
-from tests.helpers.live import HANG_S, Ear, Process, health_of, live_config, wait_for
+from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, wait_for
 
 SMALL = ("controller.horizon=20", "network.hidden=[8, 8]", "controller.solver.compile=never")
 BELONGS = {"plant": "jet1", "rate": "20.0"}
@@ -303,7 +303,7 @@ def test_a_killed_controller_comes_back_with_its_memory(tmp_path: Path) -> None:
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("controller_node.node", live) as first:
             ear.until(waiting, 60.0)
             play(plant, states[:100], live.period)
@@ -355,7 +355,7 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("controller_node.node", live) as process:
             ear.until(health_of("controller", note="no plant: waiting for its states"), 60.0)
             play(plant, states, live.period)

@@ -17,7 +17,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.health import HealthPublisher
 from node_runtime.realtime.pacer import Slot
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
@@ -29,7 +29,7 @@ class BusThatWritesDown:
 
     def __init__(self, config: Config):
         self.config = config
-        self.bad = BadMessages()
+        self.bad = RejectedMessages()
         self.said: list[tuple[str, m.Message | None]] = []
 
     def queue(self, topic: Topic, capacity: int) -> Mailbox:

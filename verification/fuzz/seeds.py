@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
-from node_runtime.bus.batches import Gathered, Gathering
+from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.sections import Config, override
 from node_runtime.health import run_info
 from plant_sim.node import build
@@ -101,8 +101,8 @@ def seeds() -> dict[str, list[bytes]]:
         said(topics.HEALTH[process], health)
     for name, topic in topics.BATCH.items():
         inside = topics.PLANT_STATE if name == "plant" else topics.COMMAND
-        parts = [Gathered(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
-        out[topic.name].append(Gathering(f"{name}-1").encode(parts))
+        parts = [Waiting(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
+        out[topic.name].append(encode_batch(f"{name}-1", 0, parts))
     return out
 
 

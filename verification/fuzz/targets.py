@@ -17,11 +17,11 @@ from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from lbmpc.sets.certificate import CertificateError
 from network_model.description import NetworkDescription
-from node_runtime.bus.batches import separate
+from node_runtime.bus.batches import unbatch
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.config.sections import Config, from_json, from_tree, to_json, to_toml
 from node_runtime.config.strict import ConfigError
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
@@ -105,11 +105,11 @@ def _glancing(payload: bytes) -> str:
 
 
 def _separating(topic: Topic) -> Read:
-    bad = BadMessages()
+    bad = RejectedMessages()
     key = topic.key("jet1")
 
     def read(payload: bytes) -> str:
-        parts = list(separate(Delivery(key, payload, 10**9), bad))
+        parts = list(unbatch(Delivery(key, payload, 10**9), bad))
         return "accepted" if parts and parts[0].key != key else "malformed"
 
     return read
