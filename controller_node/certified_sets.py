@@ -11,7 +11,6 @@ import gzip
 import hashlib
 import io
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, MutableMapping
@@ -27,6 +26,7 @@ from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode
 from lbmpc.sets.certificate import require_match as require_model
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
+from node_runtime.whole_file import write_whole
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
@@ -125,20 +125,7 @@ def write_sets(sets: CertifiedSets, path: Path) -> None:
     """Whole or not at all. Raises `OSError`."""
     data = sets.to_bytes()
     # Without a time of writing in it, so that the same sets are the same file.
-    _write(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 
 
 # -- the cache ----------------------------------------------------------------------------------
@@ -194,11 +181,9 @@ class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
             raise KeyError(name) from error
 
     def __setitem__(self, name: str, arrays: dict[str, np.ndarray]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}.")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(temporary, self._path(name))
+        content = io.BytesIO()
+        np.savez(content, **arrays)  # type: ignore[arg-type]
+        write_whole(self._path(name), content.getvalue())
 
     def __delitem__(self, name: str) -> None:
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -12,6 +11,7 @@ from controller_node.build import build_oracle, build_plant
 from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle
 from node_runtime.config.sections import Config
+from node_runtime.whole_file import write_whole
 from run_log.reading.reader import Run
 from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
 from run_log.writing.save import save
@@ -110,13 +110,6 @@ def _lemma(run: Run, config: Config) -> Lemma | None:
     weights = (None if w is None else np.array(w, dtype=float) for w in (settings.Q, settings.R))
     oracle = build_oracle(config, build_model(build_plant(config), config.period, *weights))
     return measure(run, oracle) if isinstance(oracle, DnnOracle) else None
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Under its name only when all of it is there."""
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_bytes(data)
-    partial.replace(path)
 
 
 def read(path: Path, detail: bool) -> Record | None:
