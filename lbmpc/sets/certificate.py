@@ -73,8 +73,7 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """False: an approximation that claims nothing, kept for comparison."""
     model: ModelOf
     pieces: list[Piece]
-    source_of_W: str
-    """How W was found: "interval arithmetic", or "given"."""
+    source_of_W: Literal["interval arithmetic", "given"]
     slack: float
     """eps of the construction, as a share of X's half-widths."""
     steps: int
