@@ -19,7 +19,7 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from protocol import topics
 from protocol.topics import Topic
-from trainer_node.fleet.plant_bus import Sessions
+from trainer_node.fleet.plant_bus import SharedSessions
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
 """Of these, what a trainer's certificate may read."""
 
 
-class Finder(Protocol):
+class PlantFinder(Protocol):
     """Which plants are there, and how they are reached. Entered before it is asked."""
 
     many: bool
@@ -57,12 +57,12 @@ class Finder(Protocol):
         """With the plant's name, and the address under which it is reached."""
         ...
 
-    def sessions(self, plant: str) -> Sessions:
+    def sessions(self, plant: str) -> SharedSessions:
         """Where it is reached."""
         ...
 
 
-class Heard:
+class LastHeard:
     """Which plants were heard of last when; any thread may write."""
 
     def __init__(self, plants: str):
@@ -95,18 +95,18 @@ class Heard:
         return [session.declare_subscriber(topic.key(plant), callback) for topic in to]
 
 
-class OneRouter:
+class SharedRouter:
     """Plants behind the router of the configuration: one, followed from the start, or all that match a pattern."""
 
-    def __init__(self, config: Config, plants: str, sessions: Sessions):
+    def __init__(self, config: Config, plants: str, sessions: SharedSessions):
         """`plants`: a pattern as of fnmatch, or one name."""
         self._config, self._sessions = config, sessions
         self._named = [plants] if NAME.fullmatch(plants) else []
         self.many, self.looks_for = not self._named, f"a plant that matches {plants!r}"
-        self._heard = Heard(plants)
+        self._heard = LastHeard(plants)
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
-    def __enter__(self) -> OneRouter:
+    def __enter__(self) -> SharedRouter:
         if not self._named:
             self._subscribers = self._heard.listen(self._sessions.bulk, "*", FOUND_BY)
         return self
@@ -120,11 +120,11 @@ class OneRouter:
     def config(self, plant: str) -> Config:
         return msgspec.structs.replace(self._config, name=plant)
 
-    def sessions(self, plant: str) -> Sessions:
+    def sessions(self, plant: str) -> SharedSessions:
         return self._sessions
 
 
-class OwnRouters:
+class RouterPerPlant:
     """Plants with a router each, by the list `trainer.fleet`; one that cannot be reached holds up no other.
 
     Each link has its plant's own certificate, so who takes one of them has one plant's trainer and nothing else.
@@ -136,9 +136,9 @@ class OwnRouters:
         self._config, self._stop = config, stop
         self._places = {place.name: place for place in places}
         self.looks_for = f"the controller of {', '.join(self._places)}"
-        self._heard = Heard("*")
+        self._heard = LastHeard("*")
         self._lock = threading.Lock()
-        self._reached: dict[str, Sessions] = {}
+        self._reached: dict[str, SharedSessions] = {}
         """The latest of each plant, whether they are open still or not."""
         self._open: set[str] = set()
         self._leaving = threading.Event()
@@ -147,7 +147,7 @@ class OwnRouters:
             for name in self._places
         ]
 
-    def __enter__(self) -> OwnRouters:
+    def __enter__(self) -> RouterPerPlant:
         for thread in self._threads:
             thread.start()
         return self
@@ -169,7 +169,7 @@ class OwnRouters:
         trainer = msgspec.structs.replace(self._config.trainer, fleet=[])
         return msgspec.structs.replace(self._config, name=plant, bus=bus, trainer=trainer)
 
-    def sessions(self, plant: str) -> Sessions:
+    def sessions(self, plant: str) -> SharedSessions:
         return self._reached[plant]
 
     def _reach(self, name: str) -> None:
@@ -178,7 +178,7 @@ class OwnRouters:
         while not self._leaving.is_set():
             try:
                 valid_s = _valid_s(config)
-                with Sessions(config, "trainer", self._stop) as sessions:
+                with SharedSessions(config, "trainer", self._stop) as sessions:
                     subscribers = self._heard.listen(sessions.bulk, name, READABLE)
                     with self._lock:
                         self._reached[name] = sessions

@@ -21,9 +21,10 @@ import zenoh
 from node_runtime.health import HealthPublisher, Heart, run_info
 from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
-from trainer_node.fleet.discovery import SILENT, Finder
-from trainer_node.fleet.plant_bus import PlantBus, Sessions
-from trainer_node.node import NAMES, POLL, SHARE, TrainerNode, train_round
+from trainer_node.fleet.discovery import SILENT, PlantFinder
+from trainer_node.fleet.plant_bus import PlantBus, SharedSessions
+from trainer_node.node import COUNTERS, POLL, SHARE, TrainerNode
+from trainer_node.training_round import train_round
 
 log = logging.getLogger(__name__)
 
@@ -45,14 +46,14 @@ def seed_of(seed: int, plant: str) -> int:
 
 class _Followed(NamedTuple):
     node: TrainerNode
-    sessions: Sessions
+    sessions: SharedSessions
     end: ExitStack
 
 
 class Fleet:
     """The plants that are there now. Everything happens in the thread that calls `run`."""
 
-    def __init__(self, finder: Finder):
+    def __init__(self, finder: PlantFinder):
         self._finder = finder
         self._nodes: dict[str, _Followed] = {}
         self._shunned: dict[str, float] = {}
@@ -80,7 +81,7 @@ class Fleet:
 
     def turn(self, now: float) -> None:
         """Who is there, what has arrived for each, and a round of training when it is time."""
-        self._gather(now)
+        self._update_plants(now)
         self._each(lambda node: node.listen(now), now)
         if now >= self._train_at:
             nodes = [followed.node for followed in self._nodes.values()]
@@ -97,7 +98,7 @@ class Fleet:
                 self._shunned[name] = now + SHUNNED_S
                 self._drop(name)
 
-    def _gather(self, now: float) -> None:
+    def _update_plants(self, now: float) -> None:
         self._shunned = {name: until for name, until in self._shunned.items() if now < until}
         present = [name for name in self._finder.present(now) if name not in self._shunned]
         for name in set(self._nodes) - set(present):
@@ -120,7 +121,7 @@ class Fleet:
     def _take_in(self, name: str) -> None:
         said = self._finder.config(name)
         config = msgspec.structs.replace(said, seed=seed_of(said.seed, name))
-        run_id, counts = new_run_id("trainer"), dict.fromkeys(NAMES, 0)
+        run_id, counts = new_run_id("trainer"), dict.fromkeys(COUNTERS, 0)
         with ExitStack() as stack:
             sessions = self._finder.sessions(name)
             bus = stack.enter_context(PlantBus(config, "trainer", run_id, sessions))

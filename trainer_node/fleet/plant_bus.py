@@ -19,7 +19,7 @@ from protocol.topics import Topic
 log = logging.getLogger(__name__)
 
 
-class Sessions:
+class SharedSessions:
     """The two sessions of a process, control and bulk, and one thread that sends the bulk of all its buses.
 
     A context manager; entering waits for the router.
@@ -51,7 +51,7 @@ class Sessions:
         self.control.close()
         self.bulk.close()
 
-    def __enter__(self) -> Sessions:
+    def __enter__(self) -> SharedSessions:
         self.control, self.bulk = connect(self._config, self.stop, self._process, 2)
         self._sender.start()
         return self
@@ -70,7 +70,7 @@ class Sessions:
 class PlantBus(Bus):
     """`Bus` of the plant `config.name` on sessions that others use too; closing it leaves them open."""
 
-    def __init__(self, config: Config, process: str, run_id: str, sessions: Sessions):
+    def __init__(self, config: Config, process: str, run_id: str, sessions: SharedSessions):
         super().__init__(config, process, run_id, sessions.stop)
         self._shared = sessions
 

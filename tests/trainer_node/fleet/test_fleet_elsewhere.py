@@ -18,7 +18,7 @@ from protocol.messages import Health
 from tandem import certificate_authority
 from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
 from tests.trainer_node.test_node import TRAINING, Controller
-from trainer_node.fleet.discovery import OwnRouters
+from trainer_node.fleet.discovery import RouterPerPlant
 from trainer_node.main import main
 from trainer_node.node import TrainerNode
 
@@ -138,7 +138,7 @@ def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
 def test_no_plant_is_told_of_the_others(tmp_path: Path) -> None:
     sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
     config = fleet(tmp_path, *sites)
-    said = to_json(OwnRouters(config, config.trainer.fleet, threading.Event()).config("jet1"))
+    said = to_json(RouterPerPlant(config, config.trainer.fleet, threading.Event()).config("jet1"))
     assert sites[0].bus.remote in said
     assert sites[1].bus.remote not in said
 
