@@ -213,10 +213,9 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     named = config.controller.sets
     if named is not None:
         try:
-            sets = read_sets(Path(named))
-            require_model(sets.certificate, model)
+            sets = _sets_for(model, Path(named))
         except CertificateError as error:
-            raise ConfigError(f"controller.sets: {_with_name(named, str(error))}") from error
+            raise ConfigError(f"controller.sets: {error}") from error
         _require_claim(sets, named)
         return sets
     cache = default_cache() if cache is None else cache
@@ -241,12 +240,21 @@ def start_of(config: Config, model: Model) -> np.ndarray:
     return np.asarray(x0 - plant.x_e)
 
 
+def _sets_for(model: Model, path: Path) -> CertifiedSets:
+    """Raises `CertificateError`, naming the file: it cannot be read, or is about another model."""
+    sets = read_sets(path)
+    try:
+        require_model(sets.certificate, model)
+    except CertificateError as error:
+        raise CertificateError(f"{path}: {error}") from error
+    return sets
+
+
 def _usable(path: Path, model: Model) -> CertifiedSets | None:
     if not path.exists():
         return None
     try:
-        sets = read_sets(path)
-        require_model(sets.certificate, model)
+        sets = _sets_for(model, path)
     except CertificateError:
         return None  # of another model, or a damaged cache: as if it were not there
     return sets if sets.certificate.certified else None
@@ -258,7 +266,3 @@ def _require_claim(sets: CertifiedSets, name: str) -> None:
             f"controller.sets: {name}: is a {sets.certificate.kind} and claims nothing; the tightening `invariant` "
             "needs certified sets"
         )
-
-
-def _with_name(name: str, text: str) -> str:
-    return text if name in text else f"{name}: {text}"

@@ -1,4 +1,7 @@
-"""`make faults`: run every fault many times, print what held, and put the table into the document."""
+"""`make faults`: run every fault many times, print what held, and put the table into the document.
+
+python -m verification.faults --runs 20 --document docs/faults.md
+"""
 
 from __future__ import annotations
 

@@ -36,8 +36,9 @@ from verification.fuzz.seeds import ANSWERS, config, seeds
 SHARE_OF_SLOW = 0.01
 """Of the payloads, for readers of whole files: a thousand times slower than a message."""
 
+ACCEPTED = ("accepted", "accepted, cut short")
 Read = Callable[[bytes], str]
-"""Reads; what became of it, "accepted" or why not, in a few words that can be counted."""
+"""Reads; what became of it, one of `ACCEPTED` or why not, in a few words that can be counted."""
 
 
 @dataclass(frozen=True)
