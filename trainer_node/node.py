@@ -132,7 +132,7 @@ class TrainerNode:
         if self._waits_since is None and self._may_train():
             self._waits_since = now
 
-    def tell(self) -> None:
+    def update_counters(self) -> None:
         """Bring the figures up to date."""
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))

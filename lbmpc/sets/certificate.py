@@ -22,6 +22,8 @@ from lbmpc.sets.geometry.polytope import SetError
 
 Kind = Literal["box", "hull", "regions", "given", "extension"]
 FORMAT = 1
+ROUNDING = 1e-12
+"""Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
 class CertificateError(SetError):
@@ -109,12 +111,12 @@ def hashes(model: ModelOf) -> dict[str, str]:
 
 def require_match(certificate: Certificate, model: Model) -> None:
     """Raise `CertificateError`, naming what differs, unless the certificate is about this model, to rounding."""
-    mine, its = hashes(model_of(model)), hashes(certificate.model)
+    here, there = model_of(model), certificate.model
+    mine, its = hashes(here), hashes(there)
     different = [
         name
         for name in mine
-        if mine[name] != its[name]
-        and not _rounding(getattr(model_of(model), name), getattr(certificate.model, name))
+        if mine[name] != its[name] and not _rounding(getattr(here, name), getattr(there, name))
     ]
     if different:
         parts = "; ".join(
@@ -124,10 +126,6 @@ def require_match(certificate: Certificate, model: Model) -> None:
             f"the certificate is about another model ({parts}). Compute the sets again with this configuration: "
             "tandem sets compute"
         )
-
-
-ROUNDING = 1e-12
-"""Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
 def _rounding(mine: object, its: object) -> bool:

@@ -180,7 +180,7 @@ class RunningTrainer:
             now = clock.now()
             self.node.listen(now)
             train_round([self.node], now)
-            self.node.tell()
+            self.node.update_counters()
 
     def labels(self) -> list[int]:
         """Sequence numbers of all that is in the buffer, ascending."""

@@ -86,7 +86,7 @@ class Fleet:
         if now >= self._train_at:
             nodes = [followed.node for followed in self._nodes.values()]
             self._train_at = now + train_round(nodes, now) / self._share
-        self._each(TrainerNode.tell, now)
+        self._each(TrainerNode.update_counters, now)
 
     def _each(self, do: Callable[[TrainerNode], None], now: float) -> None:
         """For every plant; one with which it ends in an error that nobody foresaw must not end the others."""
