@@ -9,12 +9,12 @@ from trainer_node.descent import descend_together, shape_of
 from trainer_node.node import TrainerNode
 from trainer_node.training import Draw
 
-MOST_PLANTS = 16
+MOST_STACKED = 16
 """Trained in one round: the others' samples wait for as long as it takes."""
 
 
 def train_round(nodes: Sequence[TrainerNode], now: float) -> float:
-    """Train up to `MOST_PLANTS` of one shape; who has waited longest says which shape.
+    """Train up to `MOST_STACKED` of one shape; who has waited longest says which shape.
 
     Returns:
         Seconds that it took.
@@ -28,7 +28,7 @@ def train_round(nodes: Sequence[TrainerNode], now: float) -> float:
         trainer = nodes[k].trainer
         assert trainer is not None
         found = shape_of(trainer.description)
-        if len(chosen) == MOST_PLANTS or (shape is not None and found != shape):
+        if len(chosen) == MOST_STACKED or (shape is not None and found != shape):
             continue
         draw = nodes[k].begin()
         if draw is not None:

@@ -20,7 +20,7 @@ from node_runtime.config.sections import TrainerConfig
 from trainer_node.descent import Problem, descend, descend_together
 from trainer_node.network import Network
 from trainer_node.training import use_one_thread
-from trainer_node.training_round import MOST_PLANTS
+from trainer_node.training_round import MOST_STACKED
 
 TURNS = 5
 """The first of them does not count."""
@@ -29,7 +29,7 @@ TURNS = 5
 def main(batches: Sequence[int], counts: Sequence[int]) -> list[list[float]]:
     """One row a batch and number of networks, up to the most that are ever stacked."""
     use_one_thread()
-    stacks = sorted({min(count, MOST_PLANTS) for count in counts})
+    stacks = sorted({min(count, MOST_STACKED) for count in counts})
     return [[batch, count, *_times(batch, count)] for batch in batches for count in stacks]
 
 

@@ -23,13 +23,13 @@ from trainer_node.fleet.plant_bus import SharedSessions
 
 log = logging.getLogger(__name__)
 
-SILENT = 10.0
+SILENT_S = 10.0
 """Seconds without a word of its controller after which a plant is dropped; it may come back at any time."""
-MOST = 1024
+MOST_PLANTS = 1024
 """Plants followed at once: a stranger who invents names must not fill the memory."""
-TRY_AGAIN = 10.0
+TRY_AGAIN_S = 10.0
 """Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
-LET_GO = 1.0
+LET_GO_S = 1.0
 """Seconds from the end of a certificate until its sessions are closed."""
 NAME = re.compile(PLANT_NAME)
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
@@ -71,18 +71,20 @@ class LastHeard:
         self._lock = threading.Lock()
 
     def note(self, key: str, now: float) -> None:
-        """A message arrived at this key. Names that do not match, and those beyond `MOST`, are ignored."""
+        """A message arrived at this key. Names that do not match, and those beyond `MOST_PLANTS`, are ignored."""
         name = key.split("/", 2)[1]
         with self._lock:
             if name in self._at or (
-                len(self._at) < MOST and NAME.fullmatch(name) and fnmatch.fnmatchcase(name, self._plants)
+                len(self._at) < MOST_PLANTS
+                and NAME.fullmatch(name)
+                and fnmatch.fnmatchcase(name, self._plants)
             ):
                 self._at[name] = now
 
     def present(self, now: float) -> list[str]:
-        """Names heard of within `SILENT`, sorted; the others are forgotten."""
+        """Names heard of within `SILENT_S`, sorted; the others are forgotten."""
         with self._lock:
-            self._at = {name: at for name, at in self._at.items() if now - at <= SILENT}
+            self._at = {name: at for name, at in self._at.items() if now - at <= SILENT_S}
             return sorted(self._at)
 
     def listen(self, session: zenoh.Session, plant: str, to: Iterable[Topic]) -> list[zenoh.Subscriber[None]]:
@@ -189,15 +191,15 @@ class RouterPerPlant:
                         self._open.discard(name)
                     _undeclare(subscribers)
                     # The fleet lets go of the plant first, and says a last word for it.
-                    self._leaving.wait(LET_GO)
+                    self._leaving.wait(LET_GO_S)
             except OpenInterrupted:
                 return
             except (ConfigError, zenoh.ZError) as error:
-                log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN)
-                self._leaving.wait(TRY_AGAIN)
+                log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN_S)
+                self._leaving.wait(TRY_AGAIN_S)
             except Exception:
-                log.exception("%s: trying again every %g s", name, TRY_AGAIN)
-                self._leaving.wait(TRY_AGAIN)
+                log.exception("%s: trying again every %g s", name, TRY_AGAIN_S)
+                self._leaving.wait(TRY_AGAIN_S)
 
 
 def _valid_s(config: Config) -> float | None:

@@ -22,11 +22,11 @@ from protocol.topics import Topic
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import discovery
 from trainer_node.fleet.discovery import LastHeard, SharedRouter
-from trainer_node.fleet.fleet import SAY_EVERY, Fleet, _Followed, seed_of
+from trainer_node.fleet.fleet import SAY_EVERY_S, Fleet, _Followed, seed_of
 from trainer_node.fleet.plant_bus import SharedSessions
 from trainer_node.node import COUNTERS, TrainerNode
 from trainer_node.training import Draw, Trainer, use_one_thread
-from trainer_node.training_round import MOST_PLANTS, train_round
+from trainer_node.training_round import MOST_STACKED, train_round
 
 TRAINING = TrainerConfig(capacity=600, batch=128, steps=40, device="cpu")
 SAMPLES = (128, 40, 300, 77)
@@ -123,16 +123,16 @@ def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
     heard.note("tandem/jet1/controller/samples", 0.0)
     heard.note("tandem/pump/controller/samples", 0.0)
     assert heard.present(1.0) == ["jet1"]
-    assert heard.present(1.0 + discovery.SILENT) == []
+    assert heard.present(1.0 + discovery.SILENT_S) == []
     heard.note("tandem/jet1/controller/samples", 20.0)
     assert heard.present(20.0) == ["jet1"]
 
 
 def test_a_stranger_who_invents_names_fills_no_memory() -> None:
     heard = LastHeard("*")
-    for k in range(discovery.MOST + 100):
+    for k in range(discovery.MOST_PLANTS + 100):
         heard.note(f"tandem/x{k}/controller/samples", 0.0)
-    assert len(heard.present(0.0)) == discovery.MOST
+    assert len(heard.present(0.0)) == discovery.MOST_PLANTS
 
 
 class Nobody(SharedRouter):
@@ -145,7 +145,7 @@ class Nobody(SharedRouter):
 def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     fleet = Fleet(Nobody())
-    for now in (0.0, 1.0, SAY_EVERY - 1.0, SAY_EVERY + 1.0):
+    for now in (0.0, 1.0, SAY_EVERY_S - 1.0, SAY_EVERY_S + 1.0):
         fleet.turn(now)
     assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
 
@@ -208,7 +208,7 @@ def test_who_has_waited_longest_comes_first_and_nobody_is_left_behind() -> None:
         trained.append([k for k, (_, bus) in enumerate(fleet_of) if bus.published > before[k]])
     trained = [round_ for round_ in trained if round_]
     assert len(trained) == 3
-    assert all(len(round_) <= MOST_PLANTS for round_ in trained)
+    assert all(len(round_) <= MOST_STACKED for round_ in trained)
     assert sorted(k for round_ in trained for k in round_) == list(range(40))
     for round_, later in itertools.pairwise(trained):
         # The first of a round has waited longer than everybody who comes later.
