@@ -29,7 +29,7 @@ from lbmpc.model import Model
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, volume_fraction
-from lbmpc.sets.enclosures.search import DisturbanceError
+from lbmpc.sets.enclosures.disturbance import DisturbanceError
 from lbmpc.sets.geometry.polytope import SetError
 from lbmpc.sets.guard import Guard
 from node_runtime.config.sections import Config

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
 
 from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
+from node_runtime.whole_file import write_whole
 from run_log.reading.reader import Run
 from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
 from run_log.writing.save import save
@@ -106,13 +106,6 @@ def _lemma(run: Run, config: Config) -> Lemma | None:
     if config.controller.oracle != "dnn":
         return None
     return measure(run, build_network_oracle(config, build_plant(config)))
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Under its name only when all of it is there."""
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_bytes(data)
-    partial.replace(path)
 
 
 def read(path: Path, detail: bool) -> Record | None:
