@@ -132,7 +132,7 @@ def _adopting(core: ControllerCore) -> Read:
         seen = core.translation.observation(msgspec.structs.replace(tick, weights=weights))
         assert seen.hidden is not None
         _, verdict = core.controller.oracle.adopt(before.oracle, seen.hidden)
-        return ACCEPTED if verdict.outcome == "adopted" else _kind(verdict.reason)
+        return ACCEPTED[0] if verdict.outcome == "adopted" else _kind(verdict.reason)
 
     return read
 
