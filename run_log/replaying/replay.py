@@ -21,8 +21,8 @@ from protocol import messages as m
 from protocol.topics import Topic
 from run_log.errors import LogError
 from run_log.reading.gaps import stretches
-from run_log.reading.reader import Entry, Run
 from run_log.replaying.difference import Difference, first_byte, first_difference
+from run_log.run import Entry, Run
 
 NAMED = 8
 """Tick numbers that a message lists before it says how many more there are."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from run_log.errors import LogError
-from run_log.reading.reader import Run, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting import plots
 from run_log.reporting.traces import traces
+from run_log.run import Run
 
 
 def report(path: str | Path, out_dir: str | Path) -> list[Path]:

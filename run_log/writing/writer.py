@@ -14,7 +14,6 @@ from pathlib import Path
 from types import TracebackType
 
 import msgspec
-from mcap.writer import LIBRARY_IDENTIFIER, CompressionType, Writer
 
 from lbmpc.plants import Plant
 from node_runtime.bus.inbox import Follower
@@ -25,16 +24,10 @@ from protocol.codec import Head
 from protocol.messages import Message
 from protocol.topics import Topic
 from run_log.errors import LogError
-from run_log.writing.durable_file import Sink
+from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PROFILE, RAW, VIEW
+from run_log.writing.durable_file import Sink, mcap_writer
 from run_log.writing.views import View, views
 
-PROFILE = "tandem"
-FORMAT = "1"
-"""Of the log: which channels and attachments there are. Rises when an older reader would be misled."""
-IDENTITY = "tandem"
-"""Metadata that says what a log is of."""
-CONTINUED = "continued"
-"""Metadata of a log that goes on in another file."""
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 COUNTED = ("controller/tick", "controller/result")
 """Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
@@ -86,14 +79,9 @@ class LogWriter:
         self._counted: dict[tuple[str, str], int] = {}
         """The last number of each run on each of the topics `COUNTED`."""
         self._strangers = 0
-        self._mcap = Writer(
-            self._sink,  # write, tell and flush are all it uses
-            chunk_size=config.log.chunk_bytes,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-        )
-        self._mcap.start(profile=PROFILE, library=f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}")
-        identity = {"format": FORMAT, "name": config.name, "plant": plant.name, "part": str(part)}
+        self._mcap = mcap_writer(self._sink, config.log.chunk_bytes)
+        self._mcap.start(profile=PROFILE, library=LIBRARY)
+        identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, identity)
         for name, kind, text in _attachments(
             config, plant, versions if versions is not None else installed()
@@ -200,7 +188,7 @@ class LogWriter:
         encoding, kind = (
             ("msgpack", topic.type.__name__) if topic else ("application/octet-stream", "unknown")
         )
-        self._raw[name] = self._mcap.register_channel(f"raw/{name}", encoding, 0, {"type": kind})
+        self._raw[name] = self._mcap.register_channel(RAW + name, encoding, 0, {"type": kind})
         return self._raw[name]
 
     def _view_channel(self, view: View) -> int:
@@ -209,7 +197,7 @@ class LogWriter:
             schema = self._mcap.register_schema(
                 f"tandem.live.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
             )
-            self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
+            self._shown[name] = self._mcap.register_channel(VIEW + name, "json", schema)
         return self._shown[name]
 
     def _count_lost(self, name: str, message: Message | Head, log_time: int) -> None:
@@ -238,10 +226,10 @@ class LogWriter:
 
 def _attachments(config: Config, plant: Plant, versions: dict[str, str]) -> list[tuple[str, str, str]]:
     _, schemas = msgspec.json.schema_components([topic.type for topic in topics.ALL])
-    channels = {f"raw/{topic.name}": topic.type.__name__ for topic in topics.ALL}
+    channels = {RAW + topic.name: topic.type.__name__ for topic in topics.ALL}
     as_json = "application/json"
     return [
-        ("config.json", as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
+        (CONFIG, as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
         ("config.toml", "application/toml", to_toml(config)),
         ("versions.json", as_json, json.dumps(versions, indent=2)),
         ("seeds.json", as_json, json.dumps({"seed": config.seed})),

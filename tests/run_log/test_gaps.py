@@ -17,8 +17,9 @@ from node_runtime.router import Router
 from protocol import messages as m
 from protocol import topics
 from run_log.reading.gaps import lost_ticks, stretches
-from run_log.reading.reader import gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting.summary import summarise
+from run_log.run import gather
 from run_log.writing.writer import LogWriter
 from tests.helpers.live import HANG_S, Process, live_config, wait_for
 from tests.helpers.run_log_samples import RUN, synthetic

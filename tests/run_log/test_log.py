@@ -22,8 +22,9 @@ from node_runtime.config.sections import Config, from_json, override
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
-from run_log.reading.reader import gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
+from run_log.run import gather
 from run_log.writing.durable_file import Sink
 from run_log.writing.save import save
 from run_log.writing.writer import LogWriter

@@ -21,9 +21,10 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
 from run_log.errors import LogError
-from run_log.reading.reader import Run, read_run
+from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import TOLERANCE
+from run_log.run import Run
 from tandem.live.monitor import Monitor
 from tandem.live.view import render
 

@@ -12,8 +12,8 @@ from controller_node.build import build_oracle, build_plant
 from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle
 from node_runtime.config.sections import Config
-from run_log.reading.reader import Run
-from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
+from run_log.reporting.summary import SOFT, summarise, trajectory
+from run_log.run import Run, plant_of
 from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
