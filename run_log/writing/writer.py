@@ -22,7 +22,6 @@ from node_runtime.health import versions as installed
 from protocol import codec, topics
 from protocol.codec import Head
 from protocol.messages import Message
-from protocol.topics import Topic
 from run_log.errors import LogError
 from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PROFILE, RAW, VIEW
 from run_log.writing.durable_file import Sink, mcap_writer
@@ -107,19 +106,12 @@ class LogWriter:
         """Bytes in the file."""
         return self._sink.written
 
-    def write_message(self, topic: Topic, message: Message, log_time: int) -> None:
-        """Log one message of ours; `log_time` in ns."""
-        self._log(topic.name, codec.encode(message), log_time, message)
-
     def write(self, name: str, payload: bytes, log_time: int) -> None:
         """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
 
         A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
         raises for bad input or a full disk: see `counters`, `bad` and `error`.
         """
-        self._log(name, payload, log_time, None)
-
-    def _log(self, name: str, payload: bytes, log_time: int, message: Message | None) -> None:
         if len(payload) > MAX_MESSAGE or self._sink.pending > self._sink.limit:
             self.counters["dropped"] += 1
             return
@@ -127,19 +119,18 @@ class LogWriter:
         if channel is None:
             self.counters["dropped"] += 1
             return
-        topic = topics.BY_NAME.get(name)
         view = self._views.get(name)
         shown: bytes | None = None
         # Of a message between two views only who wrote it and its number are looked at.
         head: Message | Head | None = None
         if log_time < self._next_view.get(name, 0):
             head = codec.head_of(payload)
-        if head is None and topic is not None and view is not None:
+        if head is None and view is not None:
             try:
-                head = message = message or codec.decode(topic, payload)
+                head = message = codec.decode(view.topic, payload)
                 shown = view.render(message)
-                if math.isfinite(topic.view_hz):
-                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
+                if math.isfinite(view.topic.view_hz):
+                    self._next_view[name] = log_time + int(1e9 / view.topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
         if head is not None and name in COUNTED:
@@ -195,7 +186,7 @@ class LogWriter:
         name = view.topic.name
         if name not in self._shown:
             schema = self._mcap.register_schema(
-                f"tandem.live.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
+                f"tandem.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
             )
             self._shown[name] = self._mcap.register_channel(VIEW + name, "json", schema)
         return self._shown[name]

@@ -254,14 +254,14 @@ def test_after_a_full_disk_the_log_goes_on_where_it_stopped(
     limit = path.stat().st_size + 500
     with file_size_limit(limit):
         for topic, message, log_time in messages[: 2 * third]:
-            writer.write_message(topic, message, log_time)
+            writer.write(topic.name, codec.encode(message), log_time)
         assert not writer.flush()
         assert writer.error is not None
         assert "cannot be written" in writer.error
         assert path.stat().st_size == limit
         assert read_run(path).truncated
     for topic, message, log_time in messages[2 * third :]:
-        writer.write_message(topic, message, log_time)
+        writer.write(topic.name, codec.encode(message), log_time)
     assert writer.flush()
     writer.close()
     assert logged(path) == payloads(messages)
