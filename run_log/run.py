@@ -128,6 +128,12 @@ class Run:
         """The log ends while its run goes on: the last tick may lack some of its messages."""
         return self.truncated or self.recovered or self.continued is not None
 
+    @property
+    def unreadable(self) -> str:
+        """What ends a sentence about something that the log lacks: it may be there, and be no valid message."""
+        found = ", ".join(f"{count} {what}" for what, count in self.bad.items())
+        return f". In the log but not readable: {found}" if found else ""
+
 
 def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], path: str | Path = "") -> Run:
     """A `Run` of messages that never were in a file: (topic, message, log_time in ns)."""
