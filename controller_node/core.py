@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from importlib import metadata
 from typing import Literal
 
 import msgspec
@@ -30,12 +29,12 @@ from lbmpc.oracles.dnn.oracle import IN_USE, NEWEST
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution
 from network_model.description import hash_layers
-from node_runtime.config.sections import Config, to_json
+from node_runtime import provenance
+from node_runtime.config.sections import Config
 from protocol import messages as m
 from protocol.codec import encode
 
 WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
-PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
 
 
 class _Timed:
@@ -255,19 +254,16 @@ class ControllerCore:
 
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
-        versions = {"python": platform.python_version(), "machine": platform.machine()}
-        versions |= {"kernels": self.kernels}
+        facts = {"machine": platform.machine(), "kernels": self.kernels}
         if self.sets is not None:
-            versions |= {"certified sets": self.sets.sha256}
-        versions |= {name: metadata.version(name) for name in PACKAGES}
-        return m.RunInfo(
-            run_id=self.run_id,
-            seq=0,
-            process="controller",
-            config=to_json(self.config),
-            versions=versions,
-            seed=self.config.seed,
-            units=dict(self.plant.units),
+            facts |= {"certified sets": self.sets.sha256}
+        return provenance.run_info(
+            self.config,
+            "controller",
+            self.run_id,
+            self.plant.units,
+            packages=provenance.CONTROLLER,
+            facts=facts,
             unix_time=unix_time,
         )
 

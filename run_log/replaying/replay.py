@@ -10,7 +10,7 @@ from controller_node.certified_sets import CertifiedSets
 from controller_node.core import ControllerCore
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
-from node_runtime.health import versions
+from node_runtime.provenance import versions
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import codec, topics
 from run_log.errors import LogError

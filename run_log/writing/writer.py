@@ -16,9 +16,9 @@ from types import TracebackType
 import msgspec
 
 from lbmpc.plants import Plant
+from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
 from node_runtime.config.sections import Config, to_toml
-from node_runtime.health import versions as installed
 from protocol import codec, topics
 from protocol.codec import Head
 from protocol.messages import Message
@@ -83,7 +83,7 @@ class LogWriter:
         identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, identity)
         for name, kind, text in _attachments(
-            config, plant, versions if versions is not None else installed()
+            config, plant, versions if versions is not None else provenance.versions()
         ):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()

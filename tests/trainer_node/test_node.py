@@ -24,7 +24,8 @@ from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config import sections as configuration
 from node_runtime.config.sections import BusConfig, Config, TrainerConfig
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
+from node_runtime.provenance import run_info
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol.messages import Array, Health, HiddenSnapshot, HiddenWeights, OutputWeights, Sample, Samples

@@ -18,8 +18,9 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from node_runtime.health import HealthPublisher, Heart, run_info
+from node_runtime.health import HealthPublisher, Heart
 from node_runtime.lifecycle import new_run_id
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from trainer_node.fleet.discovery import SILENT, Finder
 from trainer_node.fleet.plant_bus import PlantBus, Sessions
