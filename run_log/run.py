@@ -28,6 +28,19 @@ class Entry(Generic[M]):
     message: M
 
 
+class Messages(Generic[M]):
+    """Of one topic, or of several in the order of their times: an attribute of a `Run`."""
+
+    def __init__(self, *of: Topic):
+        self._of = of
+
+    def __get__(self, run: Run, owner: type[Run]) -> list[M]:
+        entries = [entry for topic in self._of for entry in run.entries(topic)]
+        if len(self._of) > 1:
+            entries.sort(key=lambda entry: entry.log_time)
+        return [entry.message for entry in entries]
+
+
 @dataclass
 class Run:
     """All that a log says. The lists are in the order of the log; `entries` has the bytes as well."""
@@ -50,60 +63,30 @@ class Run:
     note: str = ""
     """What a person should know about the file, e.g. where it was cut."""
 
+    plant_states = Messages[m.PlantState](topics.PLANT_STATE)
+    commands = Messages[m.Command](topics.COMMAND)
+    ticks = Messages[m.Tick](topics.TICK)
+    results = Messages[m.TickResult](topics.RESULT)
+    timings = Messages[m.TickTiming](topics.TIMING)
+    output_weights = Messages[m.OutputWeights](topics.OUTPUT_WEIGHTS)
+    hidden_weights = Messages[m.HiddenWeights](topics.HIDDEN_WEIGHTS)
+    keyframes = Messages[m.Keyframe](topics.KEYFRAME)
+    health = Messages[m.Health](*topics.HEALTH.values())
+    _sample_batches = Messages[m.Samples](topics.SAMPLES)
+    _all_run_infos = Messages[m.RunInfo](*topics.RUN_INFO.values())
+
     def entries(self, topic: Topic) -> list[Entry[Any]]:
         return self.streams.get(topic.name, [])
 
-    def _messages(self, *of: Topic) -> list[Any]:
-        entries = [entry for topic in of for entry in self.entries(topic)]
-        if len(of) > 1:
-            entries.sort(key=lambda entry: entry.log_time)
-        return [entry.message for entry in entries]
-
-    @property
-    def plant_states(self) -> list[m.PlantState]:
-        return self._messages(topics.PLANT_STATE)
-
-    @property
-    def commands(self) -> list[m.Command]:
-        return self._messages(topics.COMMAND)
-
-    @property
-    def ticks(self) -> list[m.Tick]:
-        return self._messages(topics.TICK)
-
-    @property
-    def results(self) -> list[m.TickResult]:
-        return self._messages(topics.RESULT)
-
-    @property
-    def timings(self) -> list[m.TickTiming]:
-        return self._messages(topics.TIMING)
-
     @property
     def samples(self) -> list[m.Sample]:
-        return [sample for batch in self._messages(topics.SAMPLES) for sample in batch.samples]
-
-    @property
-    def output_weights(self) -> list[m.OutputWeights]:
-        return self._messages(topics.OUTPUT_WEIGHTS)
-
-    @property
-    def hidden_weights(self) -> list[m.HiddenWeights]:
-        return self._messages(topics.HIDDEN_WEIGHTS)
-
-    @property
-    def keyframes(self) -> list[m.Keyframe]:
-        return self._messages(topics.KEYFRAME)
-
-    @property
-    def health(self) -> list[m.Health]:
-        return self._messages(*topics.HEALTH.values())
+        return [sample for batch in self._sample_batches for sample in batch.samples]
 
     @property
     def run_infos(self) -> list[m.RunInfo]:
         """One for each process incarnation, the first that it sent."""
         first: dict[str, m.RunInfo] = {}
-        for info in self._messages(*topics.RUN_INFO.values()):
+        for info in self._all_run_infos:
             first.setdefault(info.run_id, info)
         return list(first.values())
 

@@ -88,8 +88,16 @@ def _copy(
     writer.start(header.profile, header.library)
     reason = "whole" if probe.cut_at is None else f"cut at byte {probe.cut_at}"
     writer.add_metadata(RECOVERED, {"from": probe.path.name, "because": "; ".join([reason, *probe.damage])})
-    new_schemas = {0: 0}
-    new_channels: dict[int, int] = {}
+    new_schemas = {
+        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for schema in schemas.values()
+    }
+    new_channels = {
+        channel.id: writer.register_channel(
+            channel.topic, channel.message_encoding, new_schemas.get(channel.schema_id, 0), channel.metadata
+        )
+        for channel in channels.values()
+    }
     for record in Scan(probe.path, keep_going=True):
         match record:
             case Attachment():
@@ -99,19 +107,6 @@ def _copy(
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)
             case Message() if record.channel_id in channels:
-                if record.channel_id not in new_channels:
-                    channel = channels[record.channel_id]
-                    schema = schemas.get(channel.schema_id)
-                    if schema is not None and schema.id not in new_schemas:
-                        new_schemas[schema.id] = writer.register_schema(
-                            schema.name, schema.encoding, schema.data
-                        )
-                    new_channels[channel.id] = writer.register_channel(
-                        channel.topic,
-                        channel.message_encoding,
-                        new_schemas.get(channel.schema_id, 0),
-                        channel.metadata,
-                    )
                 writer.add_message(
                     new_channels[record.channel_id],
                     record.log_time,
