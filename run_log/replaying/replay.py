@@ -14,8 +14,7 @@ from node_runtime.provenance import versions
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import codec, topics
 from run_log.errors import LogError
-from run_log.replaying.comparison import Comparison
-from run_log.replaying.difference import Difference
+from run_log.replaying.comparison import Comparison, Difference
 from run_log.replaying.recorded import RecordedController, recorded_controllers
 from run_log.replaying.segments import replayable
 from run_log.run import Run

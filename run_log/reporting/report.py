@@ -22,10 +22,7 @@ def report(path: str | Path, out_dir: str | Path) -> list[Path]:
     data = traces(run)
     figures = {f"{path.stem}.png": plots.overview(data, title(run))}
     figures |= {f"{path.stem}-{name}.png": figure for name, figure in plots.pictures(data).items()}
-    files = []
-    for name, figure in figures.items():
-        files.append(_save(figure, out_dir / name))
-    return files
+    return [_save(figure, out_dir / name) for name, figure in figures.items()]
 
 
 def picture(run: Run, path: str | Path) -> Path:

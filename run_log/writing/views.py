@@ -7,7 +7,6 @@ null, since plotting tools skip absent fields and choke on others.
 
 from __future__ import annotations
 
-from types import NoneType
 from typing import Annotated, Any, TypeAlias, get_args, get_origin
 
 import msgspec
@@ -201,14 +200,16 @@ class View:
     def __init__(self, topic: Topic, plant: Plant):
         self.topic = topic
         self._kind = VIEW_OF[topic]
-        fields = {field.name: _without_none(field.type) for field in msgspec.structs.fields(self._kind)}
-        self._copied = [name for name in fields if name in topic.type.__struct_fields__]
-        self._vectors = {
-            name: getattr(plant, NAMED_AFTER[kind]) for name, kind in fields.items() if kind in NAMED_AFTER
-        }
-        required = [field.name for field in msgspec.structs.fields(self._kind) if field.required]
+        fields = msgspec.structs.fields(self._kind)
+        # What may be absent is declared as `kind | None`, and stands last in a schema.
+        kinds = {f.name: f.type if f.required else get_args(f.type)[0] for f in fields}
+        required = [field.name for field in fields if field.required]
         schemas = {
-            name: _schema(fields[name], plant) for name in sorted(fields, key=lambda n: n not in required)
+            name: _schema(kinds[name], plant) for name in sorted(kinds, key=lambda n: n not in required)
+        }
+        self._copied = [name for name in kinds if name in topic.type.__struct_fields__]
+        self._vectors = {
+            name: getattr(plant, NAMED_AFTER[kind]) for name, kind in kinds.items() if kind in NAMED_AFTER
         }
         self.schema: Json = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -238,28 +239,17 @@ def views(plant: Plant) -> dict[str, View]:
     return {topic.name: View(topic, plant) for topic in VIEW_OF}
 
 
-def _without_none(kind: Any) -> Any:
-    return (
-        next(part for part in get_args(kind) if part is not NoneType) if NoneType in get_args(kind) else kind
-    )
-
-
 def _schema(kind: Any, plant: Plant) -> Json:
     if kind in NAMED_AFTER:
-        names = getattr(plant, NAMED_AFTER[kind])
+        names = list(getattr(plant, NAMED_AFTER[kind]))
         return _object(dict.fromkeys(names, _schema(float, plant)), names)
     if get_origin(kind) is dict:
         return {"type": "object", "additionalProperties": _schema(get_args(kind)[1], plant)}
     return {"type": JSON_TYPES[kind]}
 
 
-def _object(properties: Json, required: Any) -> Json:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(required),
-        "additionalProperties": False,
-    }
+def _object(properties: Json, required: list[str]) -> Json:
+    return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
 
 def _named(names: tuple[str, ...], values: list[float]) -> dict[str, float]:
