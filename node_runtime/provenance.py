@@ -46,14 +46,8 @@ def run_info(
 ) -> RunInfo:
     """What a log needs to know about a process.
 
-    Args:
-        config: the resolved configuration.
-        process: its role.
-        run_id: its incarnation.
-        units: of its signals, by name.
-        packages: whose versions it says.
-        facts: what it runs with besides, said with the versions, before them.
-        unix_time: when it began; None: now.
+    units: of its signals, by name. packages: whose versions it says. facts: what it runs with besides, said before
+    the versions. unix_time: when it began; None: now.
     """
     found = versions(packages)
     return RunInfo(

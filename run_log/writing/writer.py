@@ -68,7 +68,7 @@ class LogWriter:
         self.last_bad: str | None = None
         self.lost: dict[str, int] = {}
         """By topic, messages that are missing between others: they never arrived here."""
-        self._sink = Sink(path, patient=patient)
+        self.sink = Sink(path, patient=patient)
         self._views = views(plant)
         self._raw: dict[str, int] = {}
         self._shown: dict[str, int] = {}
@@ -78,7 +78,7 @@ class LogWriter:
         self._counted: dict[tuple[str, str], int] = {}
         """The last number of each run on each of the topics `COUNTED`."""
         self._strangers = 0
-        self._mcap = mcap_writer(self._sink, config.log.chunk_bytes)
+        self._mcap = mcap_writer(self.sink, config.log.chunk_bytes)
         self._mcap.start(profile=PROFILE, library=LIBRARY)
         identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, identity)
@@ -90,21 +90,12 @@ class LogWriter:
 
     @property
     def path(self) -> Path:
-        return self._sink.path
+        return self.sink.path
 
     @property
     def error(self) -> str | None:
         """Why the file does not grow at the moment; None when it does."""
-        return self._sink.error
-
-    @property
-    def write_errors(self) -> int:
-        return self._sink.errors
-
-    @property
-    def written(self) -> int:
-        """Bytes in the file."""
-        return self._sink.written
+        return self.sink.error
 
     def write(self, name: str, payload: bytes, log_time: int) -> None:
         """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
@@ -112,7 +103,7 @@ class LogWriter:
         A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
         raises for bad input or a full disk: see `counters`, `bad` and `error`.
         """
-        if len(payload) > MAX_MESSAGE or self._sink.pending > self._sink.limit:
+        if len(payload) > MAX_MESSAGE or self.sink.pending > self.sink.limit:
             self.counters["dropped"] += 1
             return
         channel = self._raw.get(name) or self._register_raw(name)
@@ -145,7 +136,7 @@ class LogWriter:
     def flush(self) -> bool:
         """End the chunk and hand all to the operating system; False when it does not take all of it."""
         self._mcap.flush()
-        return self._sink.error is None
+        return self.sink.error is None
 
     def close(self, continued: Path | None = None) -> None:
         """Write the index and close.
@@ -158,8 +149,8 @@ class LogWriter:
         if continued is not None:
             self._mcap.add_metadata(CONTINUED, {"in": continued.name})
         self._mcap.finish()
-        if not self._sink.close():
-            raise LogError(f"{self._sink.error}; the log is cut short: `tandem recover` saves what there is")
+        if not self.sink.close():
+            raise LogError(f"{self.sink.error}; the log is cut short: `tandem recover` saves what there is")
 
     def __enter__(self) -> LogWriter:
         return self

@@ -272,7 +272,7 @@ def test_a_disk_that_stays_full_costs_messages_not_memory(tmp_path: Path, config
     path = tmp_path / "run.mcap"
     noise = np.random.default_rng(0).bytes(10_000)
     writer = LogWriter(path, config, PLANT)
-    writer._sink.limit = 200_000
+    writer.sink.limit = 200_000
     with file_size_limit(20_000):
         for i in range(100):
             writer.write("controller/keyframe", noise, i)
