@@ -12,7 +12,7 @@ from network_model.description import hash_layers
 from node_runtime.config.sections import Config
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import messages as m
-from run_log.reading.reader import Run
+from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import CONTROLLER, _LockStep
 from trainer_node.node import ADOPTION_PATIENCE

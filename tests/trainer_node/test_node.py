@@ -24,7 +24,8 @@ from network_model.description import LAYERS, NetworkDescription, hash_layers, i
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import BusConfig, Config, TrainerConfig, to_json
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import codec, topics

@@ -20,8 +20,9 @@ import zenoh
 
 from node_runtime.bus.lanes import Lanes
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.health import HealthPublisher, HealthThread, run_info
+from node_runtime.health import HealthPublisher, HealthThread
 from node_runtime.lifecycle import new_run_id
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from trainer_node.fleet.discovery import SILENT_S, PlantFinder
 from trainer_node.node import COUNTERS, POLL, SHARE, TrainerNode

@@ -22,7 +22,8 @@ def run(file: Path, log: Path | None, out: Path | None, as_json: bool) -> int:
     with log_packages():
         from run_log.errors import LogError
         from run_log.reading.reader import read_run
-        from run_log.reporting.summary import plant_of, trajectory
+        from run_log.reporting.summary import trajectory
+        from run_log.run import plant_of
         from tandem.commands.sets.picture import Drawn, picture
     out = file.with_suffix("").with_suffix(".png") if out is None else out
     try:

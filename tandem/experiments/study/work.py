@@ -9,8 +9,8 @@ import msgspec
 from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
 from node_runtime.whole_file import write_whole
-from run_log.reading.reader import Run
-from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
+from run_log.reporting.summary import SOFT, summarise, trajectory
+from run_log.run import Run, plant_of
 from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
