@@ -6,6 +6,7 @@ None is ever overwritten.
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,17 +34,10 @@ class RunFiles:
     def config(self) -> Path:
         return self.folder / "config.toml"
 
-    def all(self) -> list[Path]:
-        return [self.log, self.picture, self.folder, *self.later_parts]
-
-    @property
-    def later_parts(self) -> list[Path]:
-        """Those of its log, after the first, that are there."""
-        return [path for path in existing_parts(self.log) if path != self.log]
-
-    def moved(self, path: Path, to: RunFiles) -> Path:
-        """What one of `all` is called among the files `to`."""
-        return path.with_name(to.log.stem + path.name.removeprefix(self.log.stem))
+    def there(self) -> list[Path]:
+        """Those that exist, all parts of the log among them."""
+        paths = dict.fromkeys([self.log, self.picture, self.folder, *existing_parts(self.log)])
+        return [path for path in paths if os.path.lexists(path)]
 
 
 @contextmanager
@@ -75,26 +69,20 @@ def claimed(log: Path) -> Iterator[tuple[RunFiles, list[str]]]:
 
 
 def _move_aside(files: RunFiles) -> list[str]:
-    if not any(os.path.lexists(path) for path in files.all()):
-        return []
+    there = files.there()
     if files.folder.is_dir():
         lock = _lock(files.folder)
         if lock is None:
             raise Refused(_busy(files.log))
         os.close(lock)
-    number = 1
-    while True:
-        aside = RunFiles.of(files.log.with_suffix(f".{number}{files.log.suffix}"))
-        if not any(os.path.lexists(path) for path in aside.all()):
-            break
-        number += 1
+    names = (files.log.with_suffix(f".{number}{files.log.suffix}") for number in itertools.count(1))
+    aside = next(name for name in names if not RunFiles.of(name).there())
     said = []
-    for old in files.all():
-        if os.path.lexists(old):
-            new = files.moved(old, aside)
-            old.rename(new)
-            if old != files.folder:
-                said.append(f"{old} was there already; it is now {new}")
+    for old in there:
+        new = old.with_name(aside.stem + old.name.removeprefix(files.log.stem))
+        old.rename(new)
+        if old != files.folder:
+            said.append(f"{old} was there already; it is now {new}")
     return said
 
 

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -36,9 +38,9 @@ TABLE = (
     Process("plant", "plant", "end the run", 30.0),
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
-# The recorder hears the others' last words; the router carries them.
-STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
-BY_NAME = {process.name: process for process in TABLE}
+# In the order of stopping, with the seconds that each may take. The recorder hears the others' last words; the router
+# carries them.
+STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
 
 
 class Child:
@@ -46,27 +48,20 @@ class Child:
 
     def __init__(self, process: Process, config: Path, folder: Path):
         """config: the TOML file it reads; folder: where its output goes."""
-        self.process = process
-        self.output = folder / f"{process.name}.txt"
-        self.starts = 0
+        self.process, self.name = process, process.name
+        self.started_at = 0.0
+        """Of the newest start, seconds on the monotonic clock."""
+        self._output = folder / f"{process.name}.txt"
         self._command = [
             *(sys.executable, "-m", "tandem.live.child", str(os.getpid())),
             *(process.command, "--config", str(config)),
         ]
         self._running: subprocess.Popen[bytes] | None = None
 
-    @property
-    def name(self) -> str:
-        return self.process.name
-
-    @property
-    def pid(self) -> int | None:
-        return None if self._running is None else self._running.pid
-
     def start(self) -> None:
         """Start it, for the first time or again; output is appended."""
-        self.starts += 1
-        with self.output.open("ab") as output:
+        self.started_at = time.monotonic()
+        with self._output.open("ab") as output:
             self._running = subprocess.Popen(
                 self._command,
                 stdin=subprocess.DEVNULL,
@@ -80,23 +75,19 @@ class Child:
         return None if self._running is None else self._running.poll()
 
     def alive(self) -> bool:
-        return self._running is not None and self._running.poll() is None
+        return self._running is not None and self.exit_code() is None
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal to its whole process group, if it runs."""
-        if self._running is not None and self._running.poll() is None:
+        if self._running is not None and self.exit_code() is None:
             # Not reaped yet, so the number is still its own.
             os.killpg(self._running.pid, number)
 
-    def wait(self, timeout_s: float) -> bool:
-        """Whether it has ended, after at most `timeout_s`."""
-        if self._running is None:
-            return True
-        try:
-            self._running.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            return False
-        return True
+    def wait(self, timeout_s: float) -> None:
+        """Until it has ended, but at most `timeout_s`."""
+        if self._running is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._running.wait(timeout_s)
 
     def how_it_ended(self) -> str:
         """ "exit code 1" or "killed by SIGKILL"."""
@@ -108,7 +99,7 @@ class Child:
     def last_words(self) -> str:
         """The last lines of its output, indented."""
         try:
-            lines = self.output.read_text(errors="replace").splitlines()
+            lines = self._output.read_text(errors="replace").splitlines()
         except OSError:
             return ""
         return "\n".join(f"    {text}" for text in lines[-TAIL_LINES:])

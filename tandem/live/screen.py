@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
 
 from rich.console import Console
 from rich.live import Live
@@ -18,14 +17,12 @@ class Screen:
     def __init__(self, console: Console, new_events: Callable[[], list[Event]]):
         self._console = console
         self._new_events = new_events
-        self._live: Live | None = None
         self._second: int | None = None
-        if console.is_terminal:
-            self._live = Live(console=console, auto_refresh=False, transient=False, vertical_overflow="crop")
+        self._live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
 
     def show(self, now: Snapshot) -> None:
         """Bring the screen up to date."""
-        if self._live is not None:
+        if self._console.is_terminal:
             width, height = self._console.size
             self._live.update(view.render(now, width, height - 1), refresh=True)
             return
@@ -41,12 +38,9 @@ class Screen:
         self._console.print(text, markup=False, soft_wrap=True)
 
     def __enter__(self) -> Screen:
-        if self._live is not None:
+        if self._console.is_terminal:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None
-    ) -> None:
-        if self._live is not None:
-            self._live.stop()
+    def __exit__(self, *_error: object) -> None:
+        self._live.stop()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 
@@ -17,12 +16,11 @@ from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import new_run_id
 from tandem.live.monitor import Monitor, Snapshot
-from tandem.live.processes import BY_NAME, STOP_ORDER, TABLE, Child
+from tandem.live.processes import STOP_S, TABLE, Child
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # One Ctrl-C may arrive twice (`timeout`, a shell's process group): still one wish.
 SAME_WISH_S = 0.3
-STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 LONG_LIFE_S = 20.0
 SHOW_S = 0.2
@@ -49,27 +47,32 @@ class Wish:
     """What the person's signals ask for."""
 
     stop: bool = False
-    since: float = 0.0
 
 
 @contextmanager
 def wishes() -> Iterator[Wish]:
     """SIGINT, SIGTERM and SIGHUP set `stop`; a second one raises `Impatient` wherever the program is."""
-    wish = Wish()
+    wish, since = Wish(), 0.0
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        now = time.monotonic()
+        nonlocal since
         if not wish.stop:
-            wish.stop, wish.since = True, now
-        elif now - wish.since > SAME_WISH_S:
+            wish.stop, since = True, time.monotonic()
+        elif time.monotonic() - since > SAME_WISH_S:
             raise Impatient
 
-    before = {number: signal.signal(number, handle) for number in SIGNALS}
-    try:
+    with _signals_go_to(handle):
         yield wish
+
+
+@contextmanager
+def _signals_go_to(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in SIGNALS}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 class Supervisor:
@@ -103,7 +106,6 @@ class Supervisor:
         self._next_show = 0.0
         self._end: Snapshot | None = None
         self._restart_at: dict[str, float] = {}
-        self._started_at: dict[str, float] = {}
         self._deaths: dict[str, int] = {}
         self.recorder_died = False
 
@@ -140,7 +142,6 @@ class Supervisor:
         if not self.wish.stop:
             self.monitor.forget(name)
             self.children[name].start()
-            self._started_at[name] = time.monotonic()
 
     def _connect(self) -> None:
         """Become a client of the router; whether it listens is seen by that."""
@@ -156,12 +157,13 @@ class Supervisor:
             opened.set()
 
         threading.Thread(target=connect, name="connect", daemon=True).start()
-        deadline = time.monotonic() + BY_NAME["router"].ready_s
+        router = self.children["router"]
+        deadline = time.monotonic() + router.process.ready_s
         try:
             while not opened.wait(0.02) and not self.wish.stop:
-                self._fail_if_dead("router")
+                self._fail_if_dead(router)
                 if time.monotonic() > deadline:
-                    raise self._not_ready(self.children["router"], "nobody answers at its endpoint")
+                    raise self._not_ready(router, "nobody answers at its endpoint")
         finally:
             stop.set()
         if opened.is_set():
@@ -177,23 +179,22 @@ class Supervisor:
                 explain_at = math.inf
                 self.monitor.phase = f"the {name}: {child.process.slow_because}"
                 self.monitor.say(self.monitor.phase, time.monotonic())
-            self._fail_if_dead(*self.children)
+            self._fail_if_dead(*self.children.values())
             if time.monotonic() > deadline:
                 said = self.monitor.status(name)
                 raise self._not_ready(child, f"its last word was {said!r}" if said else "it said nothing")
             self._listen()
         if not self.wish.stop:
             now = time.monotonic()
-            self.monitor.say(f"{name} ready after {now - self._started_at[name]:.1f} s", now)
+            self.monitor.say(f"{name} ready after {now - child.started_at:.1f} s", now)
 
-    def _fail_if_dead(self, *names: str) -> None:
-        for name in names:
-            child = self.children[name]
+    def _fail_if_dead(self, *children: Child) -> None:
+        for child in children:
             if child.exit_code() is not None:
                 raise self._not_ready(child, f"it ended with {child.how_it_ended()}")
 
     def _not_ready(self, child: Child, why: str) -> StartError:
-        waited = time.monotonic() - self._started_at[child.name]
+        waited = time.monotonic() - child.started_at
         text = f"the {child.name} did not get ready within {waited:.0f} s: {why}"
         words = child.last_words()
         return StartError(f"{text}\n{words}" if words else text, child.exit_code())
@@ -224,35 +225,32 @@ class Supervisor:
 
     def _died(self, child: Child) -> str | None:
         """What to do about a process that has ended: text that ends the run, or None to go on."""
-        process, now = child.process, time.monotonic()
-        if process.when_it_dies == "end the run":
-            return f"the {child.name} died ({child.how_it_ended()})\n{child.last_words()}"
-        if process.when_it_dies == "go on":
+        now, died = time.monotonic(), f"the {child.name} died ({child.how_it_ended()})"
+        if child.process.when_it_dies == "end the run":
+            return f"{died}\n{child.last_words()}"
+        if child.process.when_it_dies == "go on":
             if not self.recorder_died:
                 self.recorder_died = True
                 self.monitor.ended(child.name)
-                text = f"NOT LOGGED from here on: the {child.name} died ({child.how_it_ended()})"
-                self.monitor.say(f"{text}; the loop goes on", now, "bad")
+                self.monitor.say(f"NOT LOGGED from here on: {died}; the loop goes on", now, "bad")
             return None
         if child.name not in self._restart_at:
-            if now - self._started_at[child.name] > LONG_LIFE_S:
+            if now - child.started_at > LONG_LIFE_S:
                 self._deaths[child.name] = 0
             deaths = self._deaths.get(child.name, 0)
             wait = BACKOFF_S[min(deaths, len(BACKOFF_S) - 1)]
             self._deaths[child.name] = deaths + 1
             self._restart_at[child.name] = now + wait
             self.monitor.ended(child.name)
-            self.monitor.say(
-                f"the {child.name} died ({child.how_it_ended()}); started again in {wait:g} s", now, "bad"
-            )
+            self.monitor.say(f"{died}; started again in {wait:g} s", now, "bad")
         elif now >= self._restart_at[child.name]:
             del self._restart_at[child.name]
             self._start(child.name)
         return None
 
-    def _listen(self, timeout_s: float = 0.02) -> None:
+    def _listen(self, wait_s: float = 0.02) -> None:
         """Take what arrives within a little time, together, and show it now and then."""
-        time.sleep(timeout_s)
+        time.sleep(wait_s)
         if self._mailbox is not None:
             self.monitor.feed_all(self._mailbox.drain())
         now = time.monotonic()
@@ -266,45 +264,36 @@ class Supervisor:
         """In order, politely, then not. The screen keeps the last moment of the run."""
         ended = time.monotonic()
         last = self._end = self.monitor.snapshot(ended)
-        for name in STOP_ORDER:
+        for name, patience_s in STOP_S.items():
             child = self.children.get(name)
             if child is None or not child.alive():
                 continue
             child.signal(signal.SIGTERM)
-            self._show(dataclasses.replace(last, phase=f"the {name} to stop"))
-            deadline = time.monotonic() + STOP_S[name]
+            self._show(replace(last, phase=f"the {name} to stop"))
+            deadline = time.monotonic() + patience_s
             while child.alive() and time.monotonic() < deadline:
                 self._listen(0.01)
             if child.alive():
                 child.signal(signal.SIGKILL)
-                self.monitor.say(
-                    f"the {name} did not stop within {STOP_S[name]:g} s and was killed",
-                    time.monotonic(),
-                    "bad",
-                )
-                self.recorder_died |= name == "recorder"
+                how = f"did not stop within {patience_s:g} s and was killed"
             elif child.exit_code() != 0:
-                self.monitor.say(f"the {name} ended with {child.how_it_ended()}", time.monotonic(), "bad")
-                self.recorder_died |= name == "recorder"
+                how = f"ended with {child.how_it_ended()}"
+            else:
+                continue
+            self.monitor.say(f"the {name} {how}", time.monotonic(), "bad")
+            self.recorder_died |= name == "recorder"
         # With what was still on its way: the last tick, and anything that went wrong in stopping.
         frozen = ("states", "inputs", "source", "processes", "phase")
-        self._show(
-            dataclasses.replace(
-                self.monitor.snapshot(ended), **{name: getattr(last, name) for name in frozen}
-            )
-        )
+        whole = self.monitor.snapshot(ended)
+        self._show(replace(whole, **{name: getattr(last, name) for name in frozen}))
 
     def _kill_all(self) -> None:
         """Whatever still runs. Signals are ignored meanwhile, so that nothing interrupts this."""
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in SIGNALS}
-        try:
+        with _signals_go_to(signal.SIG_IGN):
             for child in self.children.values():
                 child.signal(signal.SIGKILL)
             for child in self.children.values():
                 child.wait(5.0)
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def trains(config: Config) -> bool:

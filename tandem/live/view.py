@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
@@ -44,9 +44,7 @@ def render(now: Snapshot, width: int, height: int) -> RenderableType:
     if width < NARROW:
         parts += [(loop, FIGURES + 2), (learning, FIGURES + 2)]
     else:
-        both = Table.grid(expand=True, padding=0)
-        both.add_column(ratio=1)
-        both.add_column(ratio=1)
+        both = Table.grid(Column(ratio=1), Column(ratio=1), expand=True)
         both.add_row(loop, learning)
         parts.append((both, FIGURES + 2))
     parts.append((_panel("processes", _processes(now.processes)), len(now.processes) + 2))
@@ -99,9 +97,9 @@ def _panel(title: str, body: RenderableType) -> Panel:
 
 
 def _heading(now: Snapshot, width: int) -> Text:
-    left = Text.assemble(
-        (" Tandem ", "bold reverse"), f" {now.name}  ", (f"{now.plant}, {now.oracle}, {now.rate:g} Hz", "dim")
-    )
+    config = now.config
+    about = f"{now.plant.name}, {config.controller.oracle}, {config.rate:g} Hz"
+    left = Text.assemble((" Tandem ", "bold reverse"), f" {config.name}  ", (about, "dim"))
     if now.phase or now.elapsed is None:
         right = Text(f"waiting for {now.phase or 'the first command'} ", "yellow")
     else:
@@ -118,25 +116,19 @@ def _heading(now: Snapshot, width: int) -> Text:
 
 
 def _gauges(now: Snapshot, width: int) -> Table:
-    table = Table.grid(padding=(0, 1))
-    table.add_column(justify="left", style="bold")
-    table.add_column(justify="right")
-    table.add_column(justify="right", style="dim")
-    table.add_column()
-    table.add_column(justify="left", style="dim")
-    table.add_column(justify="left", style="dim")
+    right, dim = Column(justify="right"), Column(style="dim")
+    low = Column(justify="right", style="dim")
+    table = Table.grid(Column(style="bold"), right, low, Column(), dim, dim.copy(), padding=(0, 1))
     roomy = width >= NARROW
     cells = width - (46 if roomy else 30)
     for gauge in (*now.states, *now.inputs):
-        value = "-" if gauge.value is None else _number(gauge)
-        error = "" if gauge.value is None else f"{gauge.value - gauge.target:+.4f}"
         table.add_row(
             gauge.name,
-            Text(value, _gauge_style(gauge)),
+            Text(_number(gauge), _gauge_style(gauge)),
             f"{gauge.low:.4g}",
-            _bar(gauge, cells) if cells >= 8 else Text(""),
+            _bar(gauge, cells) if cells >= 8 else "",
             f"{gauge.high:.4g}",
-            f"off by {error}" if roomy and error else "",
+            f"off by {gauge.value - gauge.target:+.4f}" if roomy and gauge.value is not None else "",
         )
     return table
 
@@ -175,11 +167,9 @@ def _bar(gauge: Gauge, cells: int) -> Text:
 
 
 def _pairs(rows: Sequence[tuple[str, RenderableType]]) -> Table:
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis")
-    for name, value in rows:
-        table.add_row(name, value)
+    table = Table.grid(Column(style="dim", no_wrap=True), Column(no_wrap=True), padding=(0, 2))
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -195,23 +185,16 @@ def _loop(now: Snapshot) -> Table:
         "plan": Text("follows the last plan", "bold yellow"),
         "safe": Text("its own safe input", "bold red"),
     }
-    gives = f"{now.slack:.1e} {now.slack_row}" if now.slack else "none"
-    slack = Text.assemble(gives, "   ", _counted(now.soft, "soft ticks"))
+    mode = now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"
+    slack = f"{now.slack:.1e} {now.slack_row}" if now.slack else "none"
     return _pairs(
         [
-            ("ticks", Text.assemble(f"{now.ticks}   {rate}")),
+            ("ticks", Text(f"{now.ticks}   {rate}")),
             ("punctual", Text.assemble(_counted(now.late, "late"), "   ", _counted(now.skipped, "skipped"))),
             ("solve", _milliseconds(now.solve_ms)),
             ("tick", _milliseconds(now.tick_ms)),
-            (
-                "mode",
-                Text.assemble(
-                    (now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"),
-                    "   ",
-                    _counted(now.fallback, "fallback"),
-                ),
-            ),
-            ("slack", slack),
+            ("mode", Text.assemble(mode, "   ", _counted(now.fallback, "fallback"))),
+            ("slack", Text.assemble(slack, "   ", _counted(now.soft, "soft ticks"))),
             ("sets", Text.assemble(_sets(now), "   ", _counted(now.outside, "ticks outside", "bold red"))),
             ("plant", source.get(now.source, now.source or "-")),
         ]
@@ -233,7 +216,7 @@ def _learning(now: Snapshot, width: int) -> Table:
         [
             ("pred. error", Text(error)),
             ("each second", spark(now.trend, max(4, width - 18))),
-            ("weights", Text.assemble(f"version {_version(now)}   {now.adopted} adopted")),
+            ("weights", Text(f"version {_version(now)}   {now.adopted} adopted")),
             ("refused", _counted(now.refused, "sets")),
             ("rolled back", _counted(now.rolled_back, "sets")),
             ("loss", Text(loss)),
@@ -254,37 +237,30 @@ def spark(values: Sequence[float], cells: int) -> Text:
 
 
 def _processes(rows: Sequence[ProcessRow]) -> Table:
-    table = Table.grid(padding=(0, 2), expand=True)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
+    name, rest = Column(style="bold", no_wrap=True), Column(no_wrap=True, ratio=1)
+    table = Table.grid(name, Column(no_wrap=True), rest, padding=(0, 2), expand=True)
     for row in rows:
         calm = row.status in ("running", "ready")
-        words = [Text(f"{name} {row.counters[name]}", "bold yellow") for name in _trouble(row.counters)]
+        trouble, usual = _counters(row.counters)
+        words = [Text(f"{name} {row.counters[name]}", "bold yellow") for name in trouble]
         words += [Text(row.note, "default" if calm else "yellow")] if row.note else []
-        words += [Text(f"{name} {row.counters[name]}", "dim") for name in _usual(row.counters)]
+        words += [Text(f"{name} {row.counters[name]}", "dim") for name in usual]
         status = Text(row.status, STATUS_STYLE.get(row.status, "default"))
         table.add_row(row.name, status, Text(", ").join(words))
     return table
 
 
-def _trouble(counters: dict[str, int]) -> list[str]:
-    """Counters that ought to be zero and are not."""
-    return sorted(name for name in counters if counters[name] and name.startswith(TROUBLE))
-
-
-def _usual(counters: dict[str, int]) -> list[str]:
-    """The other counters, the telling ones first; zeros are left out."""
-    rest = sorted(
-        name for name in counters if name not in (*COUNTERS, *DULL) and not name.startswith(TROUBLE)
-    )
-    return [name for name in (*COUNTERS, *rest, *DULL) if counters.get(name)]
+def _counters(counters: dict[str, int]) -> tuple[list[str], list[str]]:
+    """Those that are not zero: what ought to be, and the others, the telling ones first."""
+    counted = sorted(name for name in counters if counters[name])
+    trouble = [name for name in counted if name.startswith(TROUBLE)]
+    rest = [name for name in counted if name not in (*trouble, *COUNTERS, *DULL)]
+    return trouble, [name for name in (*COUNTERS, *rest, *DULL) if name in counted]
 
 
 def _events(events: Sequence[Event]) -> Table:
-    table = Table.grid(padding=(0, 2), expand=True)
-    table.add_column(justify="right", style="dim", no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
+    when = Column(justify="right", style="dim", no_wrap=True)
+    table = Table.grid(when, Column(no_wrap=True, ratio=1), padding=(0, 2), expand=True)
     for event in events:
         at = "" if event.at < 0 else f"{event.at:.1f} s"
         table.add_row(at, Text(event.text, EVENT_STYLE[event.weight]))
