@@ -7,7 +7,8 @@ keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      all that the
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -24,6 +25,7 @@ from protocol.rights import ROLES, common_name
 from tandem.terminal import Refused
 
 AUTHORITY_FOLDER = "authority"
+PEM = serialization.Encoding.PEM
 AUTHORITY_DAYS = 3650
 """Longer than any certificate that it signs: renewing one of those is one folder to copy, a new authority is all."""
 LEAF_DAYS = 365
@@ -62,8 +64,7 @@ class Issued:
         except x509.ExtensionNotFound:
             return []
         return [
-            *names.get_values_for_type(x509.DNSName),
-            *map(str, names.get_values_for_type(x509.IPAddress)),
+            str(name) for kind in (x509.DNSName, x509.IPAddress) for name in names.get_values_for_type(kind)
         ]
 
 
@@ -79,23 +80,14 @@ def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Is
     names = _host_names([*ALWAYS, *hosts])
     key = ec.generate_private_key(ec.SECP256R1())
     authority = _authority(plant, key)
-    try:
-        _folder(folder)
-        _folder(folder / AUTHORITY_FOLDER)
-        _write(folder / AUTHORITY_FOLDER / KEY, _pem(key))
-        _write(folder / AUTHORITY_FOLDER / CERTIFICATE, authority.public_bytes(serialization.Encoding.PEM))
+    with _refused_where_it_cannot_write(folder):
+        for place in (folder, *(folder / name for name in (AUTHORITY_FOLDER, *ROLES))):
+            place.mkdir(mode=0o700, parents=True)
+            place.chmod(0o700)
+        _write(folder / AUTHORITY_FOLDER, key, authority)
         for role in ROLES:
-            _folder(folder / role)
-            issue(
-                folder / role,
-                common_name(role, plant),
-                key,
-                authority,
-                days,
-                names if role == "router" else [],
-            )
-    except OSError as error:
-        raise Refused(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
+            hosts_of = names if role == "router" else []
+            issue(folder / role, common_name(role, plant), key, authority, days, hosts_of)
     return found(folder)
 
 
@@ -120,20 +112,17 @@ def renew(
     old = _issued(folder / role)
     if old is None:
         raise Refused(f"{folder / role / CERTIFICATE}: not there; is {folder} a plant's folder of keys?")
-    if _plant_of(authority) != old.plant:
-        raise Refused(
-            f"{place}: is the authority of {_plant_of(authority)}, and {folder / role} is of {old.plant}"
-        )
+    _, plant = _role_and_plant(authority)
+    if plant != old.plant:
+        raise Refused(f"{place}: is the authority of {plant}, and {folder / role} is of {old.plant}")
     left = (authority.not_valid_after_utc - datetime.now(UTC)).days
     if not 1 <= days < left:
         raise Refused(f"--days {days}: at least 1, and less than the {left} that the authority has left")
     if hosts and role != "router":
         raise Refused(f"--host: only the router's certificate names hosts, not the {role}'s")
     names = _host_names([*old.hosts, *hosts]) if role == "router" else []
-    try:
+    with _refused_where_it_cannot_write(folder):
         issue(folder / role, common_name(role, old.plant), key, authority, days, names)
-    except OSError as error:
-        raise Refused(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
     new = _issued(folder / role)
     assert new is not None
     return old, new
@@ -143,16 +132,12 @@ def found(folder: Path) -> list[Issued]:
     """All certificates in a folder, in a plant's, or in one of several plants'."""
     if not folder.is_dir():
         raise Refused(f"{folder}: no such folder; `tandem keys create --plant NAME` makes one")
-    places = sorted(
-        {path.parent for depth in ("", "*/", "*/*/") for path in folder.glob(depth + CERTIFICATE)}
-    )
+    places = sorted(path.parent for depth in ("", "*/", "*/*/") for path in folder.glob(depth + CERTIFICATE))
     all_of_them = [issued for place in places if (issued := _issued(place)) is not None]
     if not all_of_them:
         raise Refused(f"{folder}: no {CERTIFICATE} in it, or in a folder of it")
-    order = (AUTHORITY_FOLDER, *ROLES)
-    return sorted(
-        all_of_them, key=lambda one: (one.plant, order.index(one.role) if one.role in order else 99)
-    )
+    order = {role: i for i, role in enumerate((AUTHORITY_FOLDER, *ROLES))}
+    return sorted(all_of_them, key=lambda one: (one.plant, order.get(one.role, len(order))))
 
 
 def _issued(folder: Path) -> Issued | None:
@@ -163,12 +148,20 @@ def _issued(folder: Path) -> Issued | None:
         certificate = load_certificate(path)
     except ConfigError as error:
         raise Refused(str(error)) from error
+    return Issued(folder, *_role_and_plant(certificate), certificate)
+
+
+def _role_and_plant(certificate: x509.Certificate) -> tuple[str, str]:
     role, _, plant = name_of(certificate).partition(".")
-    return Issued(folder, role, plant, certificate)
+    return role, plant
 
 
-def _plant_of(authority: x509.Certificate) -> str:
-    return name_of(authority).partition(".")[2]
+@contextmanager
+def _refused_where_it_cannot_write(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise Refused(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
 
 
 def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
@@ -188,15 +181,10 @@ def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
 def _authority(plant: str, key: ec.EllipticCurvePrivateKey) -> x509.Certificate:
     # Two authorities of one plant are two names, so that who refuses the other's certificates can say so.
     number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest.hex()
-    name = x509.Name(
-        [*_name(common_name(AUTHORITY_FOLDER, plant)), x509.NameAttribute(NameOID.SERIAL_NUMBER, number)]
-    )
-    return (
-        _dated(name, name, key.public_key(), AUTHORITY_DAYS)
-        # It signs these certificates and no further authority.
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs_certificates=True), critical=True)
-        .sign(key, hashes.SHA256())
+    own = _name(common_name(AUTHORITY_FOLDER, plant))
+    name = x509.Name([*own, x509.NameAttribute(NameOID.SERIAL_NUMBER, number)])
+    return _builder(name, name, key.public_key(), AUTHORITY_DAYS, signs_others=True).sign(
+        key, hashes.SHA256()
     )
 
 
@@ -211,27 +199,21 @@ def issue(
     """A new key and its certificate, named `name`, in `folder`. Who has hosts is a server too; all are clients."""
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    builder = _dated(_name(name), authority.subject, key.public_key(), days)
+    builder = _builder(_name(name), authority.subject, key.public_key(), days, signs_others=False)
     if hosts:
         uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
-    certificate = (
-        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
-        )
-        .sign(signer, hashes.SHA256())
-    )
-    _write(folder / KEY, _pem(key))
-    _write(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
-    _write(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
+    builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+    builder = builder.add_extension(issuer, critical=False)
+    _write(folder, key, builder.sign(signer, hashes.SHA256()))
+    _write_file(folder / AUTHORITY, authority.public_bytes(PEM))
 
 
-def _dated(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float, *, signs_others: bool
 ) -> x509.CertificateBuilder:
+    """What both kinds have; an authority signs these certificates and no further authority."""
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
@@ -242,6 +224,10 @@ def _dated(
         .not_valid_before(now - EARLY)
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(
+            x509.BasicConstraints(ca=signs_others, path_length=0 if signs_others else None), critical=True
+        )
+        .add_extension(_usage(signs_others), critical=True)
     )
 
 
@@ -249,31 +235,26 @@ def _name(text: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
-def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+def _usage(signs_others: bool) -> x509.KeyUsage:
     return x509.KeyUsage(
-        digital_signature=not signs_certificates,
+        digital_signature=not signs_others,
         content_commitment=False,
         key_encipherment=False,
         data_encipherment=False,
         key_agreement=False,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
+        key_cert_sign=signs_others,
+        crl_sign=signs_others,
         encipher_only=False,
         decipher_only=False,
     )
 
 
-def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
+def _write(folder: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+    pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    _write_file(folder / KEY, key.private_bytes(PEM, pkcs8, plain))
+    _write_file(folder / CERTIFICATE, certificate.public_bytes(PEM))
 
 
-def _folder(path: Path) -> None:
-    path.mkdir(mode=0o700, parents=True)
-    path.chmod(0o700)
-
-
-def _write(path: Path, content: bytes) -> None:
+def _write_file(path: Path, content: bytes) -> None:
     """Readable by the owner alone from the first byte."""
     write_whole(path, content, mode=0o600, durable=True)

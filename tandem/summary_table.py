@@ -5,31 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
-from rich.table import Table
+from rich.table import Column, Table
 
 from run_log.reporting.summary import Summary
 
-KEYS = (
-    "ticks",
-    "late_ticks",
-    "lost_ticks",
-    "weights_adopted",
-    "weights_refused",
-    "weights_rolled_back",
-    "fallback_ticks",
-    "soft_ticks",
-    "constraint_violations",
-    "cost",
-    "overshoot",
-    "settling_step",
-    "solve_ms",
-    "tick_ms",
-    "prediction_error",
-    "outside_ticks",
-    "smallest_set_margin",
-    "log",
-)
-"""What programs may count on, in `run` and `simulate` alike."""
+FOR_A_PERSON = ("skipped_slots", "final_deviation")
+"""Shown in the table alone; programs may count on everything else, in `run` and `simulate` alike."""
 
 MEANING = {
     "ticks": "control steps",
@@ -68,16 +49,13 @@ SHOULD_BE_ZERO = (
 
 def of(summary: Summary) -> dict[str, Any]:
     """The object that `--json` prints."""
-    tree = msgspec.to_builtins(summary)
-    return {key: tree[key] for key in KEYS}
+    return {key: value for key, value in msgspec.to_builtins(summary).items() if key not in FOR_A_PERSON}
 
 
 def table(summary: Summary) -> Table:
     """The same for a person, with what else there is to know."""
-    shown = Table(show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    shown.add_column(style="bold")
-    shown.add_column(justify="right")
-    shown.add_column(style="dim")
+    columns = Column(style="bold"), Column(justify="right"), Column(style="dim")
+    shown = Table(*columns, show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name, value in msgspec.to_builtins(summary).items():
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         text = _text(value)
