@@ -12,7 +12,7 @@ from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, from_tree
 from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
-from tandem.experiments.reporting.page import header, page
+from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Declaration, Resolved, resolve
 from tandem.experiments.study.plan import code_version, rows
@@ -84,16 +84,12 @@ def run(
     found = results.collect(plans, records, timings, plant)
     code = code_version()
     html = page(declared, found, plant, base, command, code, quick)
-    made = Finished(
-        out / "report.html",
-        out / "summary.json",
-        sum(want.log is not None for want in wants.values()),
-        [row for result in found for row in result.rows],
-    )
-    told = results.summary(found, header(declared, plant, command, code, processes, quick))
-    write_whole(made.report, html.encode())
-    write_whole(made.summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
-    return made
+    every = [row for result in found for row in result.rows]
+    told = results.summary(declared, every, plant, command, code, processes, quick)
+    report, summary = out / "report.html", out / "summary.json"
+    write_whole(report, html.encode())
+    write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
+    return Finished(report, summary, sum(want.log is not None for want in wants.values()), every)
 
 
 def _chosen(declared: Declaration, cases: list[Resolved], only: str | None, where: str) -> list[Resolved]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jinja2
 import numpy as np
@@ -16,12 +15,6 @@ from tandem.experiments.study.declaration import Declaration, Group
 from tandem.experiments.study.results import CaseResult, spread
 
 
-class Drawn(NamedTuple):
-    uri: str
-    caption: str
-    alt: str
-
-
 class Table(NamedTuple):
     head: list[str]
     body: list[list[str]]
@@ -29,29 +22,13 @@ class Table(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One group."""
+    """What is shown of one group."""
 
-    name: str
-    title: str
-    about: str
-    command: str
+    group: Group
     claims: list[findings.Claim]
-    pictures: list[Drawn]
+    pictures: list[style.Picture]
     table: Table
     words: list[str]
-
-
-class Page(NamedTuple):
-    """What the template is given besides the declaration."""
-
-    declared: Declaration
-    parts: list[Part]
-    config: str
-    machine: dict[str, str]
-    command: str
-    code: str
-    runs: int
-    quick: bool
 
 
 def page(
@@ -78,40 +55,29 @@ def page(
     for group in declared.group:
         own = [result for result in results if result.case.group == group.name]
         if own:
-            parts.append(_part(group, own, plant, command))
+            parts.append(_part(group, own, plant))
     loader = jinja2.PackageLoader("tandem.experiments.reporting", "")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    found = {
-        **provenance.describe(),
-        **provenance.versions(provenance.SCIENCE),
-        "load": f"{provenance.load():.1f} processes at the end",
-    }
-    whole = Page(
+    environment.filters["data_uri"] = style.data_uri
+    return environment.get_template("page.html.j2").render(
         declared=declared,
         parts=parts,
         config=to_toml(base),
-        machine=found,
+        machine=provenance.describe() | provenance.versions(provenance.SCIENCE),
+        load=provenance.load(),
         command=command,
         code=code,
         runs=sum(len(result.rows) for result in results),
         quick=quick,
     )
-    return environment.get_template("page.html.j2").render(page=whole)
 
 
-def _part(group: Group, results: list[CaseResult], plant: Plant, command: str) -> Part:
+def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
     survival = group.picture == "survival"
-    drawn = [
-        Drawn(style.data_uri(one.figure), one.caption, one.alt)
-        for one in pictures.draw(group.picture, results, plant, group.reference)
-    ]
     return Part(
-        name=group.name,
-        title=group.title,
-        about=" ".join(group.about.split()),
-        command=f"{command} --only {group.name}",
+        group=group,
         claims=findings.claims(results) if group.picture == "trajectories" else [],
-        pictures=drawn,
+        pictures=pictures.draw(group.picture, results, plant, group.reference),
         table=_survival_table(results) if survival else _table(results, plant),
         words=findings.survival(results) if survival else findings.compare(results, group.reference),
     )
@@ -135,7 +101,6 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
     ]
     body = []
     for result in results:
-        worst = "regret" if regret else "cost"
         times = "–"
         if result.timing is not None:
             spent = spread(result.timing)
@@ -147,9 +112,9 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
                 f"{result.kept:.0%}",
                 _number(result.median("cost")),
                 *([_number(result.median("regret"))] if regret else []),
-                _number(float(result.values(worst).max())),
+                _number(result.worst("regret" if regret else "cost")),
                 _number(result.median("overshoot"), 2),
-                _number(float(result.values("overshoot").max()), 2),
+                _number(result.worst("overshoot"), 2),
                 _settled(result),
                 _number(result.median("infeasible_ticks")),
                 times,
@@ -168,17 +133,12 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
 def _survival_table(results: list[CaseResult]) -> Table:
     families = pictures.by_family(results)
     places = pictures.margins(next(iter(families.values())))
-    body = [
-        [
-            pictures.family_label(members[0]),
-            str(len(members[0].rows)),
-            *(f"{member.kept:.0%}" for member in members),
-        ]
-        for members in families.values()
-    ]
-    return Table(
-        ["oracle", "runs", *(f"{place:g}" for place in places)], body, "Share of the runs kept, by margin."
-    )
+    head = ["oracle", "runs", *(f"{place:g}" for place in places)]
+    body = []
+    for members in families.values():
+        first, kept = members[0], [f"{member.kept:.0%}" for member in members]
+        body.append([pictures.family_label(first), str(len(first.rows)), *kept])
+    return Table(head, body, "Share of the runs kept, by margin.")
 
 
 def _settled(result: CaseResult) -> str:
@@ -193,20 +153,3 @@ def _number(value: float, digits: int = 3) -> str:
     if value == round(value) and abs(value) < 1e5:
         return f"{value:.0f}"
     return f"{value:.{digits}g}"
-
-
-def header(
-    declared: Declaration, plant: Plant, command: str, code: str, jobs: int, quick: bool
-) -> dict[str, Any]:
-    """What `summary.json` says besides its rows."""
-    return {
-        "experiment": declared.name,
-        "quick": quick,
-        "plant": plant.name,
-        "command": command,
-        "code": code,
-        "machine": provenance.describe(),
-        "versions": provenance.versions(provenance.SCIENCE),
-        "processes": jobs,
-        "cores": os.cpu_count(),
-    }

@@ -10,7 +10,7 @@ from matplotlib.ticker import NullLocator
 from lbmpc.plants import Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
 from tandem.experiments.reporting.pictures_over_time import lemma, recovery, trajectories
-from tandem.experiments.reporting.style import Picture, figure, legend_above, looks
+from tandem.experiments.reporting.style import Picture, figure, full_name, legend_above, looks
 from tandem.experiments.study.declaration import Picture as Kind
 from tandem.experiments.study.results import CaseResult
 
@@ -46,46 +46,31 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
         shown = np.minimum(values, right)
         middle = min(result.median(what), right)
         colour = BLUE if own else "black"
-        ax.plot(
-            [shown.min(), shown.max()], [i, i], color=colour, linewidth=3.5, alpha=0.25, solid_capstyle="butt"
-        )
+        reach = [shown.min(), shown.max()]
+        ax.plot(reach, [i, i], color=colour, linewidth=3.5, alpha=0.25, solid_capstyle="butt")
         ax.plot(shown, np.full(len(shown), i), "|", color=colour, markersize=6, alpha=0.7)
         ax.plot(middle, i, "D" if own else "o", color=colour, markersize=5)
         lost = int((~np.isfinite(values)).sum())
         broken = sum(not record.kept for record in result.records)
         if lost or broken:
-            said = f"{broken} of {len(values)} leave the bounds"
-            ax.annotate(
-                said,
-                (shown.max(), i),
-                xytext=(5, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-                color=VERMILION,
-            )
+            said, beside = f"{broken} of {len(values)} leave the bounds", (shown.max(), i)
+            place: Any = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
+            ax.annotate(said, beside, **place, fontsize=8, color=VERMILION)
         if own:
             ax.axvline(middle, color=BLUE, linewidth=0.9, linestyle=(0, (4, 2)), zorder=0)
     if finite.min() > 0 and finite.max() > 6 * finite.min():
         ax.set_xscale("log")
-        ax.xaxis.set_major_formatter(lambda value, _position: f"{value:g}")
+        ax.xaxis.set_major_formatter("{x:g}")
         if finite.max() < 60 * finite.min():
-            ax.xaxis.set_minor_formatter(
-                lambda value, _position: f"{value:g}" if f"{value:e}"[0] in "25" else ""
-            )
+            ax.xaxis.set_minor_formatter(lambda at, _position: f"{at:g}" if f"{at:e}"[0] in "25" else "")
         else:
             ax.xaxis.set_minor_locator(NullLocator())
     ax.set_yticks(range(len(results)), [_wrapped(result.label) for result in results])
     ax.set_ylim(len(results) - 0.5, -0.5)
     ax.set_xlabel(f"{what}: sum of Δz² + Δy²{', above the true h' if what == 'regret' else ''}")
     marked = "; diamond and dashed line: what the others are compared with" if reference else ""
-    return [
-        Picture(
-            made,
-            f"{what.capitalize()} of every run (strokes) and its median (dot){marked}.",
-            f"{what} by case",
-        )
-    ]
+    caption = f"{what.capitalize()} of every run (strokes) and its median (dot){marked}."
+    return [Picture(made, caption, f"{what} by case")]
 
 
 def _wrapped(label: str) -> str:
@@ -103,14 +88,13 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
     for ax in axes[len(results) :]:
         ax.set_visible(False)
     for ax, result in zip(axes, results, strict=False):
-        share: dict[tuple[float, float], list[bool]] = {}
+        kept_from: dict[tuple[float, float], list[bool]] = {}
         for row, record in zip(result.rows, result.records, strict=True):
-            share.setdefault((row.x0[first], row.x0[second]), []).append(record.kept)
-        for (z, y), kept in share.items():
-            part = float(np.mean(kept))
-            if part == 1.0:
+            kept_from.setdefault((row.x0[first], row.x0[second]), []).append(record.kept)
+        for (z, y), kept in kept_from.items():
+            if all(kept):
                 ax.plot(z, y, "o", color=BLUE, markersize=8)
-            elif part == 0.0:
+            elif not any(kept):
                 ax.plot(z, y, "x", color=VERMILION, markersize=8, markeredgewidth=2)
             else:
                 ax.plot(z, y, "o", markerfacecolor="white", markeredgecolor=VERMILION, markersize=11)
@@ -120,9 +104,9 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
         ax.set_ylim(plant.x_min[second], plant.x_max[second])
         ax.set_title(f"{result.label}: {result.kept:.0%} keep all", fontsize=9)
     for ax in axes[-columns:]:
-        ax.set_xlabel(plant.names.get(plant.states[first], plant.states[first]))
+        ax.set_xlabel(full_name(plant, first))
     for ax in axes[::columns]:
-        ax.set_ylabel(plant.names.get(plant.states[second], plant.states[second]))
+        ax.set_ylabel(full_name(plant, second))
     caption = (
         "Dot: every run from there keeps all true constraints; cross: none does; number: so many seeds do. "
         "The frame is the bounds, the plus in the middle the equilibrium."
@@ -140,31 +124,17 @@ def survival(results: list[CaseResult]) -> list[Picture]:
         places = margins(members)
         # Side by side, since many lie on each other.
         at = np.arange(len(places)) + 0.07 * (i - (len(heads) - 1) / 2)
-        ax.plot(
-            at,
-            [100 * member.kept for member in members],
-            color=look.colour,
-            linestyle=look.line,
-            marker=look.marker,
-            markersize=5,
-            linewidth=1.4,
-            label=f"{family_label(members[0])} ({_runs(len(members[0].rows))})",
-        )
+        runs = len(members[0].rows)
+        label = f"{family_label(members[0])} ({runs} {'run' if runs == 1 else 'runs'})"
+        ax.plot(at, [100 * one.kept for one in members], **look, markersize=5, linewidth=1.4, label=label)
     # Even steps: the margins crowd at the small end.
     ax.set_xticks(range(len(places)), [f"{place:g}" for place in places])
     ax.set_ylim(-4, 104)
     ax.set_ylabel("runs that keep all constraints (%)")
     ax.set_xlabel("margin for w_y (half-width of W; steps are not even)")
     legend_above(ax)
-    return [
-        Picture(
-            made, "Share of runs that keep all true constraints, by margin.", "survival by margin and oracle"
-        )
-    ]
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
+    caption = "Share of runs that keep all true constraints, by margin."
+    return [Picture(made, caption, "survival by margin and oracle")]
 
 
 def by_family(results: list[CaseResult]) -> dict[str, list[CaseResult]]:

@@ -7,9 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from lbmpc.plants import Plant
-from run_log.reporting.plots import GREY, VERMILION
-from tandem.experiments.reporting.style import Look, Picture, figure, legend_above, looks
+from run_log.reporting.plots import BLUE, GREY, VERMILION
+from tandem.experiments.reporting.style import Look, Picture, figure, full_name, legend_above, looks
 from tandem.experiments.study.results import CaseResult
+from tandem.experiments.study.work import Traces
 
 
 def trajectories(results: list[CaseResult], plant: Plant) -> list[Picture]:
@@ -22,13 +23,13 @@ def trajectories(results: list[CaseResult], plant: Plant) -> list[Picture]:
 def _state(results: list[CaseResult], plant: Plant, i: int) -> Picture:
     made, (ax,) = figure(height=3.0)
     index = plant.performance[i]
-    name, full = plant.states[index], _full_name(plant, index)
+    full = full_name(plant, index)
     for result, look in zip(results, looks(results), strict=True):
-        _band(ax, result, look, i)
+        _state_band(ax, result, look, i)
     ax.axhline(plant.x_e[index], color=GREY, linewidth=0.7, zorder=0)
     _bounds(ax, plant, index)
     ax.set_xlabel("time (s)")
-    ax.set_ylabel(f"{full} ({_unit(plant, name)})")
+    ax.set_ylabel(f"{full} ({_unit(plant, index)})")
     legend_above(ax)
     return Picture(
         made,
@@ -38,26 +39,28 @@ def _state(results: list[CaseResult], plant: Plant, i: int) -> Picture:
     )
 
 
-def _band(ax: Axes, result: CaseResult, look: Look, i: int) -> None:
-    """Median over the runs, and everything between the lowest and the highest."""
-    runs = [np.array(r.traces.x)[:, i] for r in result.records if r.traces is not None and r.lost is None]
-    if not runs:
-        return
-    t = np.arange(len(runs[0])) * result.case.config.period
-    values = np.array(runs)
-    label = result.label + (f" ({len(runs)} seeds)" if np.ptp(values, axis=0).max() > 0 else "")
-    ax.plot(
-        t,
-        np.median(values, axis=0),
-        color=look.colour,
-        linestyle=look.line,
-        linewidth=1.5,
-        marker=look.marker,
-        markevery=(len(t) // 20, max(1, len(t) // 8)),
-        markersize=4,
-        label=label,
-    )
-    ax.fill_between(t, values.min(axis=0), values.max(axis=0), color=look.colour, alpha=0.18, linewidth=0)
+def _whole(result: CaseResult) -> list[Traces]:
+    """Of the runs whose plant was not lost."""
+    return [r.traces for r in result.records if r.traces is not None and r.lost is None]
+
+
+def _state_band(ax: Axes, result: CaseResult, look: Look, i: int) -> None:
+    values = np.array([np.array(traces.x)[:, i] for traces in _whole(result)])
+    if len(values):
+        seeds = f" ({len(values)} seeds)" if np.ptp(values, axis=0).max() > 0 else ""
+        _band(ax, values, result, look, result.label + seeds, linewidth=1.5, alpha=0.18)
+
+
+def _band(
+    ax: Axes, values: np.ndarray, result: CaseResult, look: Look, label: str, linewidth: float, alpha: float
+) -> None:
+    """Median over the runs, and everything between the lowest and the highest. values: (runs, samples)."""
+    t = np.arange(values.shape[1]) * result.case.config.period
+    every = len(t) // 20, max(1, len(t) // 8)
+    middle = np.median(values, axis=0)
+    ax.plot(t, middle, **look, linewidth=linewidth, markevery=every, markersize=4, label=label)
+    low, high = values.min(axis=0), values.max(axis=0)
+    ax.fill_between(t, low, high, color=look["color"], alpha=alpha, linewidth=0)
 
 
 def _bounds(ax: Axes, plant: Plant, index: int) -> None:
@@ -77,25 +80,12 @@ def _solver(results: list[CaseResult]) -> Picture:
     made, (ax,) = figure(height=3.0)
     for result, look in zip(results, looks(results), strict=True):
         assert result.timing is not None
-        times = np.array(result.timing.runs)
-        t = np.arange(times.shape[1]) * result.case.config.period
-        ax.plot(
-            t,
-            np.median(times, axis=0),
-            color=look.colour,
-            linestyle=look.line,
-            linewidth=1.2,
-            marker=look.marker,
-            markevery=(len(t) // 20, max(1, len(t) // 8)),
-            markersize=4,
-            label=result.label,
-        )
-        ax.fill_between(t, times.min(axis=0), times.max(axis=0), color=look.colour, alpha=0.15, linewidth=0)
+        _band(ax, np.array(result.timing.runs), result, look, result.label, linewidth=1.2, alpha=0.15)
     period = results[0].case.config.period * 1e3
     ax.set_yscale("log")
     ax.axhline(period, color=VERMILION, linewidth=1.0, linestyle=(0, (6, 2)))
     ax.text(0.0, period * 0.93, f"sampling period, {period:g} ms", va="top", fontsize=8.5, color=VERMILION)
-    ax.yaxis.set_major_formatter(lambda value, _position: f"{value:g}")
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("time (s)")
     ax.set_ylabel("one solve (ms)")
     legend_above(ax)
@@ -117,39 +107,33 @@ def recovery(results: list[CaseResult], plant: Plant) -> list[Picture]:
     for same in by_fault.values():
         made, (above, below) = figure(rows=2, height=1.9)
         for result, look in zip(same, looks(same), strict=True):
-            _band(above, result, look, 0)
+            _state_band(above, result, look, 0)
             _errors(below, result, look)
         drift = same[0].case.faults.drift
         said = "no change"
         if drift is not None:
             values = ", ".join(f"{n} = {plant.parameters[n]:g} to {v:g}" for n, v in drift.to.items())
-            said = values + (
-                f" over {drift.over:g} s from {drift.at:g} s on" if drift.over else f" at {drift.at:g} s"
-            )
+            when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
+            said = f"{values} {when}"
             for ax in (above, below):
                 ax.axvspan(drift.at, drift.at + max(drift.over, 0.02), color=GREY, alpha=0.3, linewidth=0)
         above.axhline(plant.x_e[index], color=GREY, linewidth=0.7, zorder=0)
-        above.set_ylabel(f"{_full_name(plant, index)} ({_unit(plant, plant.states[index])})")
+        above.set_ylabel(f"{full_name(plant, index)} ({_unit(plant, index)})")
         below.set_yscale("log")
         below.set_ylabel("|ĥ − h|")
         below.set_xlabel("time (s)")
         legend_above(above)
-        drawn.append(
-            Picture(
-                made, f"{said[0].upper()}{said[1:]}: grey. Above the state, below the prediction error.", said
-            )
-        )
+        caption = f"{said[0].upper()}{said[1:]}: grey. Above the state, below the prediction error."
+        drawn.append(Picture(made, caption, said))
     return drawn
 
 
 def _errors(ax: Axes, result: CaseResult, look: Look) -> None:
-    runs = [r.traces.error for r in result.records if r.traces is not None and r.lost is None]
+    runs = [traces.error for traces in _whole(result)]
     if runs and result.oracle != "linear":
         values = np.median(np.array(runs, dtype=float), axis=0)
         t = np.arange(len(values)) * result.case.config.period
-        ax.plot(
-            t, np.where(values > 0, values, np.nan), color=look.colour, linestyle=look.line, linewidth=1.1
-        )
+        ax.plot(t, np.where(values > 0, values, np.nan), **{**look, "marker": ""}, linewidth=1.1)
 
 
 def lemma(results: list[CaseResult], plant: Plant) -> list[Picture]:
@@ -160,17 +144,12 @@ def lemma(results: list[CaseResult], plant: Plant) -> list[Picture]:
     for ax, (result, found) in zip(axes, shown, strict=True):
         assert found is not None
         t = np.arange(1, len(found.error) + 1) * result.case.config.period
-        ax.semilogy(t, found.accumulated, color=LOOK_ERROR.colour, linewidth=1.6, label="accumulated |x̃|²")
-        ax.semilogy(
-            t, found.bound, color=VERMILION, linestyle=(0, (5, 1.5)), label="bound (ii), this run's constants"
-        )
-        ax.semilogy(
-            t,
-            found.bound_beforehand,
-            color=GREY,
-            linestyle=(0, (1, 1.2)),
-            label="bound (iii), constants known before",
-        )
+        ax.semilogy(t, found.accumulated, color=BLUE, linewidth=1.6, label="accumulated |x̃|²")
+        for bound, colour, line, label in (
+            (found.bound, VERMILION, (5, 1.5), "bound (ii), this run's constants"),
+            (found.bound_beforehand, GREY, (1, 1.2), "bound (iii), constants known before"),
+        ):
+            ax.semilogy(t, bound, color=colour, linestyle=(0, line), label=label)
         ax.set_ylabel("sum (units of x²)")
         ax.set_title(result.label, loc="right", fontsize=8.5, pad=2)
         ratio = float((found.accumulated / found.bound).max())
@@ -180,19 +159,11 @@ def lemma(results: list[CaseResult], plant: Plant) -> list[Picture]:
             f"W̄ = {found.W_bar:.3g}; the sum reaches at most {ratio:.2g} of its bound (ii)."
         )
     axes[-1].set_xlabel("time (s)")
-    axes[0].legend(loc="lower left", bbox_to_anchor=(0, 1.08), frameon=False, fontsize=8.5, borderaxespad=0.0)
-    return [
-        Picture(made, " ".join(lines), "accumulated squared prediction error beside its bounds, logarithmic")
-    ]
+    legend_above(axes[0], height=1.08, columns=1, space=0.0)
+    alt = "accumulated squared prediction error beside its bounds, logarithmic"
+    return [Picture(made, " ".join(lines), alt)]
 
 
-LOOK_ERROR = Look("#0072B2", "-", "o")
-
-
-def _full_name(plant: Plant, index: int) -> str:
-    return plant.names.get(plant.states[index], plant.states[index])
-
-
-def _unit(plant: Plant, name: str) -> str:
-    unit = plant.units.get(name, "")
+def _unit(plant: Plant, index: int) -> str:
+    unit = plant.units.get(plant.states[index], "")
     return "dimensionless" if unit in ("", "1") else unit

@@ -10,7 +10,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from run_log.reporting.plots import BLACK, BLUE, GREEN, GREY, VERMILION
+from lbmpc.plants import Plant
+from run_log.reporting.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
 from tandem.experiments.study.results import CaseResult
 
 WIDTH = 5.4
@@ -18,23 +19,19 @@ WIDTH = 5.4
 FONT: Any = {"font.size": 9, "axes.titlesize": 9.5, "svg.hashsalt": "tandem", "svg.fonttype": "path"}
 
 
-class Look(NamedTuple):
-    colour: str
-    line: tuple[int, tuple[float, ...]] | str
-    marker: str
-
-
-LOOKS = {
-    "linear": Look(GREY, (0, (5, 1.5)), "s"),
-    "l2nw": Look(VERMILION, (0, (5, 1.5, 1, 1.5)), "^"),
-    "dnn": Look(BLUE, "-", "o"),
-    "perfect": Look(BLACK, (0, (1, 1.2)), "D"),
+Look = dict[str, Any]
+"""Colour, line and marker, as `Axes.plot` takes them."""
+LOOKS: dict[str, Look] = {
+    "linear": {"color": GREY, "linestyle": (0, (5, 1.5)), "marker": "s"},
+    "l2nw": {"color": VERMILION, "linestyle": (0, (5, 1.5, 1, 1.5)), "marker": "^"},
+    "dnn": {"color": BLUE, "linestyle": "-", "marker": "o"},
+    "perfect": {"color": BLACK, "linestyle": (0, (1, 1.2)), "marker": "D"},
 }
-MORE = (
-    Look("#E69F00", (0, (3, 1, 1, 1, 1, 1)), "v"),
-    Look(GREEN, (0, (8, 2)), "P"),
-    Look("#CC79A7", (0, (2, 2)), "X"),
-    Look("#56B4E9", "-", "*"),
+MORE: tuple[Look, ...] = (
+    {"color": "#E69F00", "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
+    {"color": GREEN, "linestyle": (0, (8, 2)), "marker": "P"},
+    {"color": "#CC79A7", "linestyle": (0, (2, 2)), "marker": "X"},
+    {"color": SKY, "linestyle": "-", "marker": "*"},
 )
 
 
@@ -57,13 +54,11 @@ class Picture(NamedTuple):
     alt: str
 
 
-def figure(
-    rows: int = 1, columns: int = 1, height: float = 2.7, share: bool = True
-) -> tuple[Figure, list[Axes]]:
+def figure(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list[Axes]]:
     """A figure of `rows` by `columns` axes, each `height` inches high; the axes row by row."""
     with rc_context(FONT):
         made = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
-        axes = made.subplots(rows, columns, squeeze=False, sharex=share, sharey=share and columns > 1)
+        axes = made.subplots(rows, columns, squeeze=False, sharex=True, sharey=columns > 1)
     for ax in axes.ravel():
         ax.grid(True, color="#DDDDDD", linewidth=0.6)
         ax.set_axisbelow(True)
@@ -71,16 +66,15 @@ def figure(
     return made, list(axes.ravel())
 
 
-def legend_above(ax: Axes, columns: int = 2) -> None:
+def legend_above(ax: Axes, height: float = 1.0, columns: int = 2, space: float = 0.2) -> None:
     """Above the axes, so that it hides nothing."""
-    ax.legend(
-        loc="lower left",
-        bbox_to_anchor=(0, 1.0),
-        ncols=columns,
-        frameon=False,
-        fontsize=8.5,
-        borderaxespad=0.2,
-    )
+    place: Any = {"loc": "lower left", "bbox_to_anchor": (0, height), "borderaxespad": space}
+    ax.legend(**place, ncols=columns, frameon=False, fontsize=8.5)
+
+
+def full_name(plant: Plant, index: int) -> str:
+    """Of a state, in words where the plant has them."""
+    return plant.names.get(plant.states[index], plant.states[index])
 
 
 def data_uri(made: Figure) -> str:

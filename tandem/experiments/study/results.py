@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import os
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from lbmpc.plants import Plant
+from node_runtime import provenance
 from run_log.reporting.summary import Spread
-from tandem.experiments.study.declaration import Resolved
+from tandem.experiments.study.declaration import Declaration, Resolved
 from tandem.experiments.study.plan import RowPlan
 from tandem.experiments.study.runner import Timing
 from tandem.experiments.study.work import Record
@@ -56,6 +58,9 @@ class CaseResult(NamedTuple):
     def median(self, name: str) -> float:
         return float(np.median(self.values(name)))
 
+    def worst(self, name: str) -> float:
+        return float(self.values(name).max())
+
     @property
     def kept(self) -> float:
         """Share of the runs that keep all constraints on the true plant."""
@@ -67,7 +72,7 @@ class CaseResult(NamedTuple):
 
     @property
     def label(self) -> str:
-        return self.case.label or self.case.name
+        return self.case.label
 
 
 def collect(
@@ -110,10 +115,23 @@ def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | N
 
 
 def spread(timing: Timing) -> Spread:
-    times = np.concatenate([np.asarray(run) for run in timing.runs])
+    times = np.concatenate(timing.runs)
     return Spread(float(np.percentile(times, 50)), float(np.percentile(times, 99)), float(times.max()))
 
 
-def summary(results: list[CaseResult], header: dict[str, Any]) -> dict[str, Any]:
+def summary(
+    declared: Declaration, rows: list[Row], plant: Plant, command: str, code: str, processes: int, quick: bool
+) -> dict[str, Any]:
     """What `summary.json` holds."""
-    return {**header, "rows": [msgspec.to_builtins(row) for result in results for row in result.rows]}
+    return {
+        "experiment": declared.name,
+        "quick": quick,
+        "plant": plant.name,
+        "command": command,
+        "code": code,
+        "machine": provenance.describe(),
+        "versions": provenance.versions(provenance.SCIENCE),
+        "processes": processes,
+        "cores": os.cpu_count(),
+        "rows": rows,
+    }
