@@ -14,7 +14,7 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
-from tandem.experiments.study.declaration import Declaration, Resolved, resolve
+from tandem.experiments.study.declaration import Declaration, resolve
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, time_all, wanted
 
@@ -65,7 +65,12 @@ def run(
         OSError: `out` cannot be written to.
         KeyboardInterrupt: what was finished is kept.
     """
-    cases = _chosen(declared, resolve(declared, plant, where, quick), only, where)
+    cases = resolve(declared, plant, where, quick)
+    if only is not None:
+        names = [group.name for group in declared.group]
+        if only not in names:
+            raise ConfigError(f"--only {only}: {where} has no such group; it has {', '.join(names)}")
+        cases = [case for case in cases if case.group == only]
     base = settings(declared, where)
     detailed = {group.name for group in declared.group if group.picture in DETAILED}
     logs = out / "logs"
@@ -90,15 +95,6 @@ def run(
     write_whole(report, html.encode())
     write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
     return Finished(report, summary, sum(want.log is not None for want in wants.values()), every)
-
-
-def _chosen(declared: Declaration, cases: list[Resolved], only: str | None, where: str) -> list[Resolved]:
-    if only is None:
-        return cases
-    names = [group.name for group in declared.group]
-    if only not in names:
-        raise ConfigError(f"--only {only}: {where} has no such group; it has {', '.join(names)}")
-    return [case for case in cases if case.group == only]
 
 
 def settings(declared: Declaration, where: str) -> Config:

@@ -15,8 +15,6 @@ REGRET = 0.1
 """and the medians of the regret differ by this share of the reference's,"""
 OVERSHOOT = 0.005
 """or those of the overshoot by this much."""
-
-
 ENOUGH = 3
 """Fewer pairs say nothing."""
 
@@ -52,14 +50,14 @@ def claims(results: list[CaseResult]) -> list[Claim]:
         Claim(
             "Less overshoot than L2NW, for every seed",
             bool((network < kernel).all()),
-            f"{dnn.median('overshoot'):.2g} in the median, {dnn.values('overshoot').max():.2g} at worst, against "
+            f"{dnn.median('overshoot'):.2g} in the median, {dnn.worst('overshoot'):.2g} at worst, against "
             f"{l2nw.values('overshoot').min():.2g}",
         ),
         Claim(
             "Faster than linear MPC, for every seed",
             bool((fast < slow).all()),
-            f"settles at step {dnn.median('settling_step'):.0f} in the median, {dnn.values('settling_step').max():.0f} "
-            f"at worst, against {linear.median('settling_step'):.0f}",
+            f"settles at step {dnn.median('settling_step'):.0f} in the median, {dnn.worst('settling_step'):.0f} at "
+            f"worst, against {linear.median('settling_step'):.0f}",
         ),
         Claim(
             "All true constraints kept by all three",
@@ -86,24 +84,15 @@ def compare(results: list[CaseResult], reference: str | None) -> list[str]:
     known = [result for result in results if result.case.name == reference]
     if not known:
         return []
-    base, matter, same, said = known[0], [], [], []
+    base = known[0]
     if min(len(result.rows) for result in results) < ENOUGH and len(base.rows) < ENOUGH:
         return [f"Fewer than {ENOUGH} runs of a case do not show what matters."]
-    for result in results:
-        if result is base:
-            continue
-        differences = _differences(result, base)
-        if differences:
-            matter.append(result.label)
-            said.append(f"{result.label}: {'; '.join(differences)}.")
-        else:
-            same.append(result.label)
-    closing = []
-    if matter:
-        closing.append(f"Matters, against {base.label}: {', '.join(matter)}.")
-    if same:
-        closing.append(f"No clear difference from {base.label}: {', '.join(same)}.")
-    return [*closing, *said]
+    found = [(result.label, _differences(result, base)) for result in results if result is not base]
+    matter = [label for label, differences in found if differences]
+    same = [label for label, differences in found if not differences]
+    said = [f"Matters, against {base.label}: {', '.join(matter)}."] if matter else []
+    said += [f"No clear difference from {base.label}: {', '.join(same)}."] if same else []
+    return said + [f"{label}: {'; '.join(differences)}." for label, differences in found if differences]
 
 
 def _differences(result: CaseResult, base: CaseResult) -> list[str]:
@@ -111,29 +100,23 @@ def _differences(result: CaseResult, base: CaseResult) -> list[str]:
     if abs(result.kept - base.kept) * min(len(result.rows), len(base.rows)) >= 1.5:
         said.append(f"keeps all constraints in {_kept(result)}, against {_kept(base)}")
     regret = "regret" if all(row.regret is not None for row in (*base.rows, *result.rows)) else "cost"
-    for name, word, enough in (
-        (regret, regret, REGRET * abs(base.median(regret))),
-        ("overshoot", "overshoot", OVERSHOOT),
-    ):
+    for name, enough in ((regret, REGRET * abs(base.median(regret))), ("overshoot", OVERSHOOT)):
         own, other = paired(result, base, name)
         if not len(own):
             continue
         if name == "overshoot":
             # Below zero there is none, however far below.
             own, other = np.maximum(own, 0.0), np.maximum(other, 0.0)
-        change = float(np.median(own)) - float(np.median(other))
-        if not abs(change) > enough:
+        middle, others = float(np.median(own)), float(np.median(other))
+        if not abs(middle - others) > enough:
             continue
-        agree = int((own > other).sum() if change > 0 else (own < other).sum())
+        more = middle > others
+        agree = int((own > other if more else own < other).sum())
         if agree >= CLEAR * len(own):
-            more = "more" if change > 0 else "less"
+            pairs = f"all {agree}" if agree == len(own) else f"{agree} of {len(own)}"
             said.append(
-                f"{more} {word}, {_figure(np.median(own))} against {_figure(np.median(other))} in the median "
-                + (
-                    f"in all {agree} pairs of runs"
-                    if agree == len(own)
-                    else f"in {agree} of {len(own)} pairs of runs"
-                )
+                f"{'more' if more else 'less'} {name}, {_figure(middle)} against {_figure(others)} in the median "
+                f"in {pairs} pairs of runs"
             )
     return said
 
@@ -148,16 +131,16 @@ def _kept(result: CaseResult) -> str:
 
 def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The figure of both for every seed and x0 that both have; rows that draw nothing stand for all seeds."""
-    keys = [(row.seed, tuple(row.x0)) for row in base.rows]
-    own = [(row.seed, tuple(row.x0)) for row in result.rows]
-    one, other = result.values(name), base.values(name)
-    if result.oracle != "dnn" and base.oracle == "dnn":
-        by_x0 = {key[1]: value for key, value in zip(own, one, strict=True)}
-        both = [(by_x0[key[1]], value) for key, value in zip(keys, other, strict=True) if key[1] in by_x0]
-    else:
-        table = dict(zip(own, one, strict=True))
-        both = [(table[key], value) for key, value in zip(keys, other, strict=True) if key in table]
-    return np.array([a for a, _ in both]), np.array([b for _, b in both])
+    for_all_seeds = result.oracle != "dnn" and base.oracle == "dnn"
+
+    def by_start(one: CaseResult) -> list[tuple[tuple[float, ...], float]]:
+        starts = [tuple(row.x0) if for_all_seeds else (row.seed, *row.x0) for row in one.rows]
+        return list(zip(starts, one.values(name), strict=True))
+
+    own = dict(by_start(result))
+    both = [(own[start], value) for start, value in by_start(base) if start in own]
+    one, other = np.reshape(both, (-1, 2)).T
+    return one, other
 
 
 def survival(results: list[CaseResult]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 
 from lbmpc.plants import Plant
@@ -45,4 +44,4 @@ class Faults(Section, frozen=True):
     """Seconds; what it had not sent by then is lost."""
     noise: list[NonNegative] | None = None
     """Standard deviation of what is measured of each state, in its unit."""
-    drift: Drift | None = msgspec.field(default=None)
+    drift: Drift | None = None

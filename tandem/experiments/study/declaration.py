@@ -151,15 +151,14 @@ def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick:
         varied = dict(zip(vary, values, strict=True))
         tree = _merged(_merged({}, declared.base), case.set)
         for key, value in varied.items():
-            apply_override(tree, f"{key}={_toml(value)}")
+            apply_override(tree, f"{key}={msgspec.json.encode(value).decode()}")
         suffix = ", ".join(f"{key.rpartition('.')[2]} = {_shown(value)}" for key, value in varied.items())
+        label = case.label or ("" if suffix else case.name)
         made.append(
             Resolved(
                 name=f"{case.name}: {suffix}" if suffix else case.name,
                 group=case.group,
-                label=": ".join(
-                    text for text in (case.label or ("" if suffix else case.name), suffix) if text
-                ),
+                label=": ".join(text for text in (label, suffix) if text),
                 config=from_tree(tree, f"{where}: case {case.name!r}"),
                 varied=varied,
                 seeds=seeds,
@@ -221,10 +220,6 @@ def _spread(values: list[Any], count: int) -> list[Any]:
     if len(values) <= count:
         return values
     return [values[round(i * (len(values) - 1) / max(1, count - 1))] for i in range(count)]
-
-
-def _toml(value: Any) -> str:
-    return msgspec.json.encode(value).decode()
 
 
 def _shown(value: Any) -> str:

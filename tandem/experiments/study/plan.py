@@ -11,16 +11,7 @@ from typing import NamedTuple
 import msgspec
 
 from node_runtime import provenance
-from node_runtime.config.sections import (
-    AdaptationConfig,
-    BusConfig,
-    Config,
-    L2nwConfig,
-    LogConfig,
-    NetworkConfig,
-    RealtimeConfig,
-    TrainerConfig,
-)
+from node_runtime.config.sections import Config
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.study.declaration import Resolved
 
@@ -68,9 +59,10 @@ def rows(cases: list[Resolved]) -> Iterator[RowPlan]:
 
 
 def _job(config: Config, case: Resolved) -> Job:
-    return Job(
-        config=_what_counts(config, case.faults), steps=case.steps, faults=_faults_that_count(config, case)
-    )
+    faults = case.faults
+    if config.controller.oracle != "dnn":
+        faults = msgspec.structs.replace(faults, training_seconds=0.0, trainer_dies_at=None)
+    return Job(config=_what_counts(config, faults), steps=case.steps, faults=faults)
 
 
 def _floor(config: Config, case: Resolved) -> Job | None:
@@ -83,21 +75,15 @@ def _floor(config: Config, case: Resolved) -> Job | None:
 
 def _what_counts(config: Config, faults: Faults) -> Config:
     """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
-    same = {"name": Config().name, "bus": BusConfig(), "log": LogConfig(), "realtime": RealtimeConfig()}
-    oracle = config.controller.oracle
+    unread, oracle = ["name", "bus", "log", "realtime"], config.controller.oracle
     if oracle != "l2nw":
-        same["l2nw"] = L2nwConfig()
+        unread.append("l2nw")
     if oracle != "dnn":
-        same |= {"network": NetworkConfig(), "adaptation": AdaptationConfig(), "trainer": TrainerConfig()}
+        unread += ["network", "adaptation", "trainer"]
         if faults.noise is None:
-            same["seed"] = 0
-    return msgspec.structs.replace(config, **same)
-
-
-def _faults_that_count(config: Config, case: Resolved) -> Faults:
-    if config.controller.oracle == "dnn":
-        return case.faults
-    return msgspec.structs.replace(case.faults, training_seconds=0.0, trainer_dies_at=None)
+            unread.append("seed")
+    default = Config()
+    return msgspec.structs.replace(config, **{name: getattr(default, name) for name in unread})
 
 
 @cache

@@ -44,13 +44,8 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
     wants: dict[str, Want] = {}
 
     def want(job: Job, detail: bool, log: Path | None) -> None:
-        key = job.key
-        before = wants.get(key)
-        wants[key] = Want(
-            job,
-            detail or (before is not None and before.detail),
-            log or (before.log if before else None),
-        )
+        before = wants.get(job.key, Want(job, False, None))
+        wants[job.key] = Want(job, detail or before.detail, log or before.log)
 
     for plan in plans:
         case = plan.case
@@ -139,14 +134,12 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
-    config = msgspec.structs.replace(
-        config, seed=seed, plant=PlantConfig(model=config.plant.model), controller=controller
-    )
+    plant = PlantConfig(model=config.plant.model)
+    config = msgspec.structs.replace(config, seed=seed, plant=plant, controller=controller)
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
-    steps = round(seconds * config.rate)
-    return Job(config=config, steps=steps, faults=Faults())
+    return Job(config=config, steps=round(seconds * config.rate), faults=Faults())
 
 
 def time_all(
@@ -162,10 +155,10 @@ def time_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     keys = {case.name: timing_job(case, 0, seconds).key for case in cases}
-    most = {keys[case.name]: 0 for case in cases}
+    by_key = {keys[case.name]: case for case in cases}
+    most = dict.fromkeys(by_key, 0)
     for case in cases:
         most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
-    by_key = {keys[case.name]: case for case in cases}
     timings: dict[str, Timing] = {}
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent) as pool:
         for done, (key, case) in enumerate(by_key.items()):
