@@ -21,6 +21,7 @@ from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import Problem, build_problem
 from network_model.description import NetworkDescription
 from network_model.operations import get_architecture
+from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
@@ -30,20 +31,8 @@ SHORTEST_WATCH = 8
 
 
 def build_plant(config: Config) -> Plant:
-    """The plant named by the configuration. Raises `ConfigError`."""
-    try:
-        return get_plant(config.plant.model)
-    except KeyError as error:
-        raise ConfigError(f"plant.model: {error.args[0]}") from error
-
-
-def initial_state(config: Config, plant: Plant) -> np.ndarray:
-    """x0 in the plant's own units, (d,). Raises `ConfigError`."""
-    if config.plant.x0 is None:
-        return plant.x0.copy()
-    if len(config.plant.x0) != plant.d:
-        raise ConfigError(f"plant.x0 has {len(config.plant.x0)} entries, {plant.name} has {plant.d} states")
-    return np.array(config.plant.x0, dtype=float)
+    """The plant named by the configuration, whose lengths fit it. Raises `ConfigError`."""
+    return plant_of(config, get_plant)
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
@@ -79,9 +68,8 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
         chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)
-        unknown = [name for name in chosen if name not in names]
-        if unknown or not chosen:
-            raise ConfigError(f"l2nw.variables: {unknown or 'empty'}; choose from {', '.join(names)}")
+        if not chosen:
+            raise ConfigError(f"l2nw.variables: empty; choose from {', '.join(names)}")
         indices = tuple(names.index(name) for name in chosen)
         settings = config.l2nw
         return L2nwOracle(

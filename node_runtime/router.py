@@ -114,7 +114,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     if open_to_all(config.bus.endpoint) and not config.bus.insecure:
         log.warning(
             "%s is neither encrypted nor authenticated: whoever reaches it may command the plant. Let it listen on "
-            "127.0.0.1, and on bus.remote for other machines (docs/remote.md); bus.insecure=true says that it is meant",
+            "127.0.0.1, and on bus.remote for other machines (`tandem keys`); bus.insecure=true says that it is meant",
             config.bus.endpoint,
         )
     # Every state and every command passes through here, so the router must be as punctual as the loops.

@@ -24,7 +24,7 @@ def solver(quick: bool, document: Path | None, as_json: bool) -> int:
         if error.name not in ("matplotlib", "mcap", "zstandard"):
             raise
         raise Refused(f"benchmarks need {error.name}: pip install 'tandem-control[log]'") from error
-    from tandem.commands.various import progress_bar
+    from tandem.terminal import progress_bar
 
     console = terminal.console(as_json)
     try:

@@ -1,28 +1,41 @@
-"""What every command of `tandem` has, and what every command with a configuration has."""
+"""What every command of `tandem` has, and what every command with a configuration has.
+
+A command's file holds its arguments and what it does. Its imports stand in the functions that need them: all commands
+are loaded for `tandem --help`, and each process loads only what it needs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import UseAppendAction, arg
 
 if TYPE_CHECKING:
+    from lbmpc.plants import Plant
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
+OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
+"""Those of the extras. Where one is missing, the command ends with a message."""
+NO_SETS, INTERRUPTED = 3, 130
+"""Exit codes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """What every command has."""
 
+    EXTRAS: ClassVar[str] = ""
+    """What must be installed for it, as in pip install 'tandem-control[EXTRAS]'."""
+
     json: bool = False
     """Print the result as one JSON object on standard output, and nothing else there."""
 
     def run(self) -> int:
-        """Do it; returns the exit code. Raises `ConfigError` or `Refused` for what cannot be done."""
+        """Do it; returns the exit code. Raises `ConfigError`, `LogError` or `Refused` for what cannot be done."""
         raise NotImplementedError
 
 
@@ -33,7 +46,7 @@ class Configured(Command):
     config: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped values)")
     ] = None
-    """Configuration in TOML; see configs/compressor.toml."""
+    """Configuration in TOML; `tandem config show` prints one with all keys."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Change one value of the configuration."""
 
@@ -61,3 +74,18 @@ class Configured(Command):
                 table[last] = value
                 origins[key] = option
         return from_tree(tree, str(self.config or "configuration"), origins), tree
+
+    def resolve_with_plant(self) -> tuple[Config, Plant]:
+        """The configuration, and the plant that it names and fits."""
+        from lbmpc.plants import get_plant
+        from node_runtime.config.plant import plant_of
+
+        config, _ = self.resolve()
+        return config, plant_of(config, get_plant)
+
+
+def require(*packages: str) -> None:
+    """Raises `ModuleNotFoundError` for a package that would be missed late, or in another process only."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -41,6 +41,12 @@ STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
 BY_NAME = {process.name: process for process in TABLE}
 
 
+def command_line(command: str, config: Path) -> list[str]:
+    """Starts a tandem command that ends when this process does, and imports nothing from the current folder."""
+    child = (sys.executable, "-P", "-m", "tandem.child", str(os.getpid()))
+    return [*child, command, "--config", str(config)]
+
+
 class Child:
     """A process of the table, running in a process group of its own, its output in a file."""
 
@@ -49,10 +55,7 @@ class Child:
         self.process = process
         self.output = folder / f"{process.name}.txt"
         self.starts = 0
-        self._command = [
-            *(sys.executable, "-m", "tandem.live.child", str(os.getpid())),
-            *(process.command, "--config", str(config)),
-        ]
+        self._command = command_line(process.command, config)
         self._running: subprocess.Popen[bytes] | None = None
 
     @property

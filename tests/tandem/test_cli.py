@@ -17,7 +17,6 @@ COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
     "health",
     "config show",
-    "bench solver",
     *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {

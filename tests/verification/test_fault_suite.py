@@ -417,7 +417,7 @@ MAY_READ_IT = {
     "run_log/writing/recorder.py _record": "once, the offset of all times in the log",
     "node_runtime/tls/credentials.py *": "certificates end at a date",
     "tandem/certificate_authority.py *": "the same",
-    "tandem/commands/keys*.py *": "the same",
+    "tandem/commands/keys.py *": "the same",
 }
 
 

@@ -6,39 +6,87 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-from rich.console import Console
-from rich.progress import TaskID
-from rich.table import Table
+from tyro.conf import arg
 
-from controller_node.build import model_for
-from controller_node.certified_sets import (
-    CertifiedSets,
-    Found,
-    Kind,
-    SavedArrays,
-    Work,
-    default_cache,
-    read_sets,
-    start_of,
-    write_sets,
-)
-from lbmpc.model import Model
-from lbmpc.sets.certificate import Certificate, CertificateError
-from lbmpc.sets.check import check
-from lbmpc.sets.construct import construct, volume_fraction
-from lbmpc.sets.enclosures.search import DisturbanceError
-from lbmpc.sets.geometry.polytope import SetError
-from lbmpc.sets.guard import Guard
-from node_runtime.config.sections import Config
 from tandem import terminal
-from tandem.checks import plant_of
-from tandem.commands.sets.check import HAIR, REFUSED, sample, share_bar
+from tandem.commands.base import NO_SETS, Configured
 from tandem.terminal import Refused
 
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import TaskID
+    from rich.table import Table
+
+    from controller_node.certified_sets import CertifiedSets, Kind, SavedArrays
+    from lbmpc.model import Model
+    from lbmpc.sets.certificate import Certificate
+
 WARNING_SAMPLES = 20_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetsCompute(Configured):
+    """Compute sets in which the true plant can be kept for ever, have them checked, and write them to a file."""
+
+    kind: Annotated[
+        Literal["regions", "hull", "box", "given", "all"], arg(metavar="regions|hull|box|given|all")
+    ] = "regions"
+    """What is known of the model error h: its bound as a box, as a hull, by regions around a way from x0 as well, or
+    given as controller.W. `all`: box, hull and regions in one table, and the last one written."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("sets.json")
+    """Where the sets go; gzipped where the name ends in .gz."""
+    slack: Annotated[float, arg(metavar="SHARE")] = 3e-4
+    """Room beyond W, as a share of X's half-widths: more ends sooner, with smaller sets."""
+    fresh: bool = False
+    """Take nothing from the cache."""
+
+    def run(self) -> int:
+        """0: written; 3: there are no such sets, and why."""
+        config, _ = self.resolve()
+        import numpy as np
+
+        from controller_node.build import model_for
+        from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
+        from lbmpc.sets.enclosures.search import DisturbanceError
+        from lbmpc.sets.geometry.polytope import SetError
+
+        if not 0.0 < self.slack < 1.0:
+            raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
+        if self.out.is_dir():
+            raise Refused(f"{self.out}: is a folder; name a file")
+        model, console = model_for(config), terminal.console(self.json)
+        W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
+        asked = _Asked(model, start_of(config, model), W, self.slack, self.fresh, default_cache())
+        kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)
+        made: list[tuple[Kind, CertifiedSets | str, bool]] = []
+        for kind in kinds:
+            try:
+                made.append((kind, *_one(asked, kind, console)))
+            except (SetError, DisturbanceError) as error:
+                made.append((kind, str(error), False))
+            except OSError as error:
+                raise Refused(
+                    f"{error.filename or asked.cache}: cannot be written: {error.strerror}"
+                ) from error
+        results = [_result(kind, sets, cached) for kind, sets, cached in made]
+        good = [sets for _, sets, _ in made if isinstance(sets, CertifiedSets)]
+        if good:
+            try:
+                write_sets(good[-1], self.out)
+            except OSError as error:
+                raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
+            results[[s for _, s, _ in made].index(good[-1])]["file"] = str(self.out)
+            console.print(_table(results))
+            terminal.say(console, _meaning(good[-1], asked), f"wrote {self.out}")
+        for kind, reason, _ in made:
+            if isinstance(reason, str):
+                terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
+        if self.json:
+            terminal.emit(results[0] if len(results) == 1 else {"sets": results})
+        return 0 if len(good) == len(made) else NO_SETS
 
 
 @dataclass(frozen=True)
@@ -53,68 +101,33 @@ class _Asked:
     cache: Path
 
 
-def run(config: Config, kinds: Sequence[Kind], out: Path, slack: float, fresh: bool, as_json: bool) -> int:
-    """0: written; 3: there are no such sets, and why. Raises `Refused`, `ConfigError`."""
-    if not 0.0 < slack < 1.0:
-        raise Refused(f"--slack {slack:g}: a share between 0 and 1")
-    if out.is_dir():
-        raise Refused(f"{out}: is a folder; name a file")
-    plant_of(config)
-    model = model_for(config)
-    W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
-    asked = _Asked(model, start_of(config, model), W, slack, fresh, default_cache())
-    console = terminal.console(as_json)
-    made: list[tuple[Kind, CertifiedSets | str, bool]] = []
-    for kind in kinds:
-        try:
-            sets, cached = _one(asked, kind, as_json, console)
-            made.append((kind, sets, cached))
-        except (SetError, DisturbanceError) as error:
-            made.append((kind, str(error), False))
-        except OSError as error:
-            raise Refused(f"{error.filename or asked.cache}: cannot be written: {error.strerror}") from error
-    results = [_result(kind, sets, cached) for kind, sets, cached in made]
-    good = [sets for _, sets, _ in made if isinstance(sets, CertifiedSets)]
-    if good:
-        try:
-            write_sets(good[-1], out)
-        except OSError as error:
-            raise Refused(f"{out}: cannot be written: {error.strerror}") from error
-        results[[s for _, s, _ in made].index(good[-1])]["file"] = str(out)
-        console.print(_table(results))
-        console.print(_meaning(good[-1], asked), markup=False, soft_wrap=True)
-        console.print(f"wrote {out}", markup=False, soft_wrap=True)
-    for kind, reason, _ in made:
-        if isinstance(reason, str):
-            terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
-    if as_json:
-        terminal.emit(results[0] if len(results) == 1 else {"sets": results})
-    return 0 if len(good) == len(made) else REFUSED
-
-
-def _one(asked: _Asked, kind: Kind, as_json: bool, console: Console) -> tuple[CertifiedSets, bool]:
+def _one(asked: _Asked, kind: Kind, console: Console) -> tuple[CertifiedSets, bool]:
     """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
+    from controller_node.certified_sets import CertifiedSets, Found, SavedArrays, Work, read_sets, write_sets
+    from lbmpc.sets.certificate import CertificateError
+    from lbmpc.sets.check import check
+    from lbmpc.sets.construct import volume_fraction
+    from lbmpc.sets.geometry.polytope import SetError
+    from lbmpc.sets.guard import Guard
+
     work = Work.of(asked.model, kind, asked.start, asked.W, asked.slack, asked.cache)
     if not asked.fresh and work.sets.exists():
         try:
             return read_sets(work.sets), True
         except CertificateError as error:
-            console.print(f"{error}; computed again", style="yellow", markup=False, soft_wrap=True)
+            terminal.say(console, f"{error}; computed again", style="yellow")
     saved = SavedArrays(work.folder)
     if asked.fresh:
         saved.clear()
     began = time.monotonic()
     try:
-        certificate = _constructed(asked, kind, saved, as_json)
+        certificate = _constructed(asked, kind, saved, console)
     except KeyboardInterrupt:
-        console.print(
-            f"interrupted; what was done is kept in {work.folder}: the same command goes on from there",
-            markup=False,
-            soft_wrap=True,
-        )
+        text = f"interrupted; what was done is kept in {work.folder}: the same command goes on from there"
+        terminal.say(console, text)
         raise
     seconds = time.monotonic() - began
-    with share_bar(as_json) as bar:
+    with terminal.share_bar(console) as bar:
         task = bar.add_task(f"{kind}: proving the claim", total=1.0)
         verdict = check(certificate, progress=lambda done: bar.update(task, completed=done))
     if not verdict.ok:
@@ -126,9 +139,11 @@ def _one(asked: _Asked, kind: Kind, as_json: bool, console: Console) -> tuple[Ce
     return sets, False
 
 
-def _constructed(asked: _Asked, kind: Kind, saved: SavedArrays, as_json: bool) -> Certificate:
+def _constructed(asked: _Asked, kind: Kind, saved: SavedArrays, console: Console) -> Certificate:
+    from lbmpc.sets.construct import construct
+
     tasks: dict[str, TaskID] = {}
-    with share_bar(as_json) as bar:
+    with terminal.share_bar(console) as bar:
 
         def report(what: str, share: float) -> None:
             # "the invariant set: step 12, 340 facets" is one bar, whose text changes.
@@ -162,6 +177,8 @@ def _result(kind: Kind, sets: CertifiedSets | str, cached: bool) -> dict[str, An
 
 
 def _table(results: Sequence[dict[str, Any]]) -> Table:
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("W", style="bold")
     for name in ("sets", "facets", "share of X", "x0", "margin", "seconds", "certificate"):
@@ -185,6 +202,8 @@ def _table(results: Sequence[dict[str, Any]]) -> Table:
 
 
 def _meaning(sets: CertifiedSets, asked: _Asked) -> str:
+    from tandem.commands.sets.sampling import HAIR, sample
+
     certificate = sets.certificate
     count = len(certificate.pieces)
     given = certificate.source_of_W == "given"

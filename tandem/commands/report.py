@@ -1,0 +1,45 @@
+"""`tandem report`: pictures and a table of a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from tandem import terminal
+from tandem.commands.base import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a run and tabulate it, from its log alone."""
+
+    EXTRAS = "log"
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The log."""
+    output: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the log's)")] = None
+    """Where the pictures go."""
+
+    def run(self) -> int:
+        import msgspec
+
+        from run_log.reading.reader import read_run
+        from run_log.reporting.report import report
+        from run_log.reporting.summary import summarise
+        from tandem import summary_table
+
+        console = terminal.console(self.json)
+        ran = read_run(self.file)
+        summary = summarise(ran)
+        with console.status("drawing"):
+            drawn = report(self.file, self.output or self.file.parent)
+        console.print(summary_table.table(summary))
+        terminal.say(console, *(f"picture {picture}" for picture in drawn))
+        if ran.note:
+            terminal.say(console, ran.note, style="yellow")
+        if self.json:
+            terminal.emit({**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]})
+        return 0
