@@ -35,10 +35,25 @@ class Experiment(Command):
 
     def run(self) -> int:
         if self.what == "list":
-            return _show_list(self.json)
+            return self._list()
         if self.out is None:
             raise Refused("--out DIR is missing: where should the report go?")
         return self._run(self.out)
+
+    def _list(self) -> int:
+        from tandem.experiments.experiment import overview
+        from tandem.experiments.study.declaration import load
+
+        told = []
+        for name, path in _shipped_files().items():
+            about = overview(load(path))
+            told.append(about)
+            self.say(f"{name}: {about['title']}")
+            self.say(f"  groups: {', '.join(about['groups'])}", style="dim")
+        if not told:
+            raise Refused("no experiment is shipped with this installation; name a file of your own")
+        self.emit({"experiments": told})
+        return 0
 
     def _run(self, out: Path) -> int:
         """Run it, and leave report.html, summary.json and logs in `out`."""
@@ -57,8 +72,8 @@ class Experiment(Command):
         name = self.what if self.what in _shipped_files() else path.name
         command = f"tandem experiment {name} --out DIR" + (" --quick" if self.quick else "")
         processes = self.jobs or len(os.sched_getaffinity(0))
-        console, began = terminal.console(self.json), time.monotonic()
-        with terminal.progress_bar(console) as bar:
+        began = time.monotonic()
+        with terminal.progress_bar(self.console) as bar:
             tasks = {}
 
             def progress(stage: str, done: int, total: int) -> None:
@@ -79,21 +94,20 @@ class Experiment(Command):
                 raise Refused(f"{error.filename or out}: cannot be written: {error.strerror}") from error
             except KeyboardInterrupt:
                 text = f"interrupted; finished runs are kept in {out}: the same command goes on from there"
-                terminal.say(console, text)
+                self.say(text)
                 raise
         seconds = time.monotonic() - began
-        terminal.say(console, f"{len(made.rows)} runs in {seconds:.0f} s")
-        terminal.say(console, *(f"wrote {file}" for file in (made.report, made.summary)))
-        if self.json:
-            terminal.emit(
-                {
-                    "report": str(made.report),
-                    "summary": str(made.summary),
-                    "logs": made.logs,
-                    "seconds": seconds,
-                    "rows": msgspec.to_builtins(made.rows),
-                }
-            )
+        self.say(f"{len(made.rows)} runs in {seconds:.0f} s")
+        self.say(*(f"wrote {file}" for file in (made.report, made.summary)))
+        self.emit(
+            {
+                "report": str(made.report),
+                "summary": str(made.summary),
+                "logs": made.logs,
+                "seconds": seconds,
+                "rows": msgspec.to_builtins(made.rows),
+            }
+        )
         return 0
 
 
@@ -102,24 +116,6 @@ def _shipped_files() -> dict[str, Path]:
     from node_runtime.config.shipped import shipped
 
     return {path.stem: path for path in sorted(shipped("experiments").glob("*.toml"))}
-
-
-def _show_list(as_json: bool) -> int:
-    from tandem.experiments.experiment import overview
-    from tandem.experiments.study.declaration import load
-
-    console = terminal.console(as_json)
-    told = []
-    for name, path in _shipped_files().items():
-        about = overview(load(path))
-        told.append(about)
-        terminal.say(console, f"{name}: {about['title']}")
-        terminal.say(console, f"  groups: {', '.join(about['groups'])}", style="dim")
-    if not told:
-        raise Refused("no experiment is shipped with this installation; name a file of your own")
-    if as_json:
-        terminal.emit({"experiments": told})
-    return 0
 
 
 def _find(what: str) -> Path:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
-from tandem import terminal
 from tandem.commands.base import Command
 from tandem.terminal import Refused
 
@@ -21,8 +20,39 @@ if TYPE_CHECKING:
 ROLE = "router|plant|controller|trainer|recorder|operator"
 
 
+class Shows(Command):
+    """A command that shows certificates."""
+
+    def _show(self, there: list[Issued]) -> None:
+        from rich.table import Table
+
+        from node_runtime.tls.credentials import WARN_DAYS
+        from protocol.rights import ROLES
+
+        for plant in dict.fromkeys(one.plant for one in there):
+            table = Table(title=f"keys of {plant}", title_justify="left", show_lines=True)
+            table.add_column("role", no_wrap=True)
+            table.add_column("may", ratio=1)
+            for head in ("valid until", "SHA-256"):
+                table.add_column(head, no_wrap=True)
+            for one in there:
+                if one.plant == plant:
+                    table.add_row(*_row(one))
+            self.console.print(table)
+        for one in there:
+            if one.days_left < WARN_DAYS:
+                end = "has expired" if one.days_left < 0 else f"expires in {one.days_left:.0f} days"
+                how = (
+                    f"`tandem keys renew --role {one.role}`"
+                    if one.role in ROLES
+                    else "`tandem keys create` again"
+                )
+                self.say(f"{one.folder}: {end}; {how}", style="yellow")
+        self.emit({"certificates": [_plain(one) for one in there]})
+
+
 @dataclass(frozen=True, kw_only=True)
-class KeysCreate(Command):
+class KeysCreate(Shows):
     """Make a private authority for one plant, and with it one certificate a role."""
 
     plant: Annotated[str, arg(metavar="NAME")]
@@ -44,11 +74,10 @@ class KeysCreate(Command):
             )
         folder = self.out or Path("keys") / self.plant
         made = certificate_authority.create(self.plant, self.host, folder, self.days)
-        _show(made, self.json)
+        self._show(made)
         router = next(one for one in made if one.role == "router")
         authority_key = folder / certificate_authority.AUTHORITY_FOLDER / "key.pem"
-        terminal.say(
-            terminal.console(self.json),
+        self.say(
             f"The router answers to {', '.join(router.hosts)}; --host adds others.",
             f"Each machine gets its own roles' folders and nothing else. {authority_key} can make any of these: it is "
             "needed to renew one and never to run, so keep it elsewhere.",
@@ -82,24 +111,21 @@ class KeysRenew(Command):
                 raise Refused(f"--role {role}: one of {', '.join(ROLES)}")
         if not self.role:
             raise Refused(f"--role is missing: one of {', '.join(ROLES)}")
-        console = terminal.console(self.json)
         renewed = []
         for role in self.role:
             hosts = self.host if role == "router" or len(self.role) == 1 else []
             old, new = certificate_authority.renew(role, self.folder, hosts, self.days, self.authority)
             renewed.append(new)
-            terminal.say(
-                console,
+            self.say(
                 f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}, was {old.valid_until:%Y-%m-%d}. Copy the "
                 f"folder to the {role}'s machine and start the {role} again. The old certificate works until its end.",
             )
-        if self.json:
-            terminal.emit({"certificates": [_plain(one) for one in renewed]})
+        self.emit({"certificates": [_plain(one) for one in renewed]})
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeysShow(Command):
+class KeysShow(Shows):
     """Say what each certificate's holder may do, and until when. Exit code 1 when one has expired."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("keys")
@@ -110,7 +136,7 @@ class KeysShow(Command):
         from tandem import certificate_authority
 
         there = certificate_authority.found(self.folder)
-        _show(there, self.json)
+        self._show(there)
         return 1 if any(one.days_left < 0 for one in there) else 0
 
 
@@ -123,36 +149,6 @@ class KeysCommand:
         | Annotated[KeysRenew, subcommand("renew")]
         | Annotated[KeysShow, subcommand("show")]
     )
-
-
-def _show(there: list[Issued], as_json: bool) -> None:
-    from rich.table import Table
-
-    from node_runtime.tls.credentials import WARN_DAYS
-    from protocol.rights import ROLES
-
-    console = terminal.console(as_json)
-    for plant in dict.fromkeys(one.plant for one in there):
-        table = Table(title=f"keys of {plant}", title_justify="left", show_lines=True)
-        table.add_column("role", no_wrap=True)
-        table.add_column("may", ratio=1)
-        for head in ("valid until", "SHA-256"):
-            table.add_column(head, no_wrap=True)
-        for one in there:
-            if one.plant == plant:
-                table.add_row(*_row(one))
-        console.print(table)
-    for one in there:
-        if one.days_left < WARN_DAYS:
-            end = "has expired" if one.days_left < 0 else f"expires in {one.days_left:.0f} days"
-            how = (
-                f"`tandem keys renew --role {one.role}`"
-                if one.role in ROLES
-                else "`tandem keys create` again"
-            )
-            terminal.say(console, f"{one.folder}: {end}; {how}", style="yellow")
-    if as_json:
-        terminal.emit({"certificates": [_plain(one) for one in there]})
 
 
 def _row(one: Issued) -> list[Text]:

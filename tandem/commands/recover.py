@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from tandem import terminal
 from tandem.commands.base import Command
 
 
@@ -40,7 +39,6 @@ class Recover(Command):
                 text += (
                     f", which was cut at byte {saved.cut_at} ({saved.lost_bytes} bytes of a torn record lost)"
                 )
-        terminal.say(terminal.console(self.json), text, *saved.damage)
-        if self.json:
-            terminal.emit(msgspec.to_builtins(saved))
+        self.say(text, *saved.damage)
+        self.emit(msgspec.to_builtins(saved))
         return 0

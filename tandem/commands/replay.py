@@ -32,9 +32,8 @@ class Replay(Command):
         from run_log.reading.reader import read_run
         from run_log.replaying.replay import replay
 
-        console = terminal.console(self.json)
         ran = read_run(self.file)
-        with terminal.progress_bar(console) as bar:
+        with terminal.progress_bar(self.console) as bar:
             task = bar.add_task("replaying", total=None)
             found = replay(
                 ran,
@@ -46,19 +45,20 @@ class Replay(Command):
             text = (
                 f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
             )
-            terminal.say(console, text, style="yellow" if found.lost_ticks else "green")
+            self.say(text, style="yellow" if found.lost_ticks else "green")
         else:
-            console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+            self.console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
         if found.lost_ticks:
             text = f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps"
-            console.print(text, style="bold red")
+            self.console.print(text, style="bold red")
         first = found.first_difference
         if first is not None:
             values = f"recorded {first.recorded}, replayed {first.replayed}"
-            terminal.say(console, f"first at tick {first.tick}: {first.field} {values}")
+            self.say(f"first at tick {first.tick}: {first.field} {values}")
         if not found.equal and found.largest_difference is not None:
-            console.print(f"largest difference of an input: {found.largest_difference:.3g}", markup=False)
-        terminal.say(console, *(f"note: {note}" for note in found.notes), style="yellow")
-        if self.json:
-            terminal.emit(msgspec.to_builtins(found))
+            self.console.print(
+                f"largest difference of an input: {found.largest_difference:.3g}", markup=False
+            )
+        self.say(*(f"note: {note}" for note in found.notes), style="yellow")
+        self.emit(msgspec.to_builtins(found))
         return 0 if found.equal and not found.lost_ticks else 1

@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from tandem import terminal
 from tandem.commands.base import Command
 
 
@@ -31,15 +30,13 @@ class Report(Command):
         from run_log.reporting.summary import summarise
         from tandem import summary_table
 
-        console = terminal.console(self.json)
         ran = read_run(self.file)
         summary = summarise(ran)
-        with console.status("drawing"):
+        with self.console.status("drawing"):
             drawn = report(self.file, self.output or self.file.parent)
-        console.print(summary_table.table(summary))
-        terminal.say(console, *(f"picture {picture}" for picture in drawn))
+        self.console.print(summary_table.table(summary))
+        self.say(*(f"picture {picture}" for picture in drawn))
         if ran.note:
-            terminal.say(console, ran.note, style="yellow")
-        if self.json:
-            terminal.emit({**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]})
+            self.say(ran.note, style="yellow")
+        self.emit({**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]})
         return 0

@@ -14,8 +14,6 @@ from tandem import terminal
 from tandem.commands.base import FROM_CONFIG, INTERRUPTED, Configured, require
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from node_runtime.config.sections import Config
     from tandem.live.files import RunFiles
     from tandem.live.monitor import Monitor, Snapshot
@@ -27,6 +25,7 @@ class Run(Configured):
     """Run router, recorder, trainer, plant and controller here, watch them, and leave a log and a picture."""
 
     EXTRAS = "trainer,log"
+    KEYS = (("oracle", "controller.oracle"), ("rate", "rate"), ("seed", "seed"), ("log", "log.path"))
 
     seconds: Annotated[float, arg(metavar="S")] = 20.0
     """How long, counted from the first command."""
@@ -44,14 +43,6 @@ class Run(Configured):
     """Start no trainer here: it comes from another machine ("Put the trainer on another machine" in the
     documentation), or not at all."""
 
-    def flags(self) -> dict[str, tuple[str, Any]]:
-        return {
-            "--oracle": ("controller.oracle", self.oracle),
-            "--rate": ("rate", self.rate),
-            "--seed": ("seed", self.seed),
-            "--log": ("log.path", None if self.log is None else str(self.log)),
-        }
-
     def run(self) -> int:
         """Run everything for `seconds` from the first command."""
         config, given = self.resolve()
@@ -68,11 +59,10 @@ class Run(Configured):
 
         require("matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
         plant = build_plant(config)
-        console = terminal.console(self.json)
         said = guarantee(config)
         with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
-            terminal.say(console, *moved, style="dim")
-            terminal.say(console, said)
+            self.say(*moved, style="dim")
+            self.say(said)
             endpoint = config.bus.endpoint if "endpoint" in given.get("bus", {}) else _free_endpoint()
             bus = msgspec.structs.replace(config.bus, endpoint=endpoint)
             log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
@@ -82,7 +72,7 @@ class Run(Configured):
             files.config.write_text(to_toml(resolved), encoding="utf-8")
             monitor = Monitor(resolved, plant, self.seconds)
             try:
-                trouble, logged = _supervise(resolved, files, monitor, wish, console, not self.no_trainer)
+                trouble, logged = self._supervise(resolved, files, monitor, wish)
             except StartError as error:
                 terminal.complain(f"{error}\nAll output is in {files.folder}.", self.json)
                 return 2 if error.exit_code == 2 else 1
@@ -90,71 +80,72 @@ class Run(Configured):
                 text = f"ended at once, everything was killed; {files.log} may be cut short"
                 terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", self.json)
                 return INTERRUPTED
-            return _conclude(files, console, trouble, logged, monitor.first_command is not None, self.json)
+            return self._conclude(files, trouble, logged, monitor.first_command is not None)
 
+    def _supervise(
+        self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
+    ) -> tuple[str | None, bool]:
+        """Why the run ended badly, or None; and whether its log is whole."""
+        from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
+        from tandem.live.screen import Screen
+        from tandem.live.supervisor import Supervisor
 
-def _supervise(
-    config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console, trainer: bool
-) -> tuple[str | None, bool]:
-    """Why the run ended badly, or None; and whether its log is whole."""
-    from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
-    from tandem.live.screen import Screen
-    from tandem.live.supervisor import Supervisor
+        priority = min(READER_PRIORITY, config.realtime.priority)
+        with Screen(self.console, monitor.new_events) as screen, punctual(priority, silent=True):
+            garbage = GarbageCollection()
+            garbage.begin()
 
-    priority = min(READER_PRIORITY, config.realtime.priority)
-    with Screen(console, monitor.new_events) as screen, punctual(priority, silent=True):
-        garbage = GarbageCollection()
-        garbage.begin()
+            def show(now: Snapshot) -> None:
+                screen.show(now)
+                garbage.idle()
 
-        def show(now: Snapshot) -> None:
-            screen.show(now)
-            garbage.idle()
+            supervisor = Supervisor(
+                config, files.config, files.folder, monitor, wish, show, not self.no_trainer
+            )
+            trouble = supervisor.run()
+            return trouble, not supervisor.recorder_died
 
-        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, show, trainer)
-        trouble = supervisor.run()
-        return trouble, not supervisor.recorder_died
+    def _conclude(self, files: RunFiles, trouble: str | None, logged: bool, began: bool) -> int:
+        """Figures and picture from the log alone."""
+        from run_log.errors import LogError
+        from run_log.reading.reader import read_run
+        from run_log.reporting import report
+        from run_log.reporting.summary import summarise
+        from run_log.writing.parts import existing_parts
+        from tandem import summary_table
 
-
-def _conclude(
-    files: RunFiles, console: Console, trouble: str | None, logged: bool, began: bool, as_json: bool
-) -> int:
-    """Figures and picture from the log alone."""
-    from run_log.errors import LogError
-    from run_log.reading.reader import read_run
-    from run_log.reporting import report
-    from run_log.reporting.summary import summarise
-    from run_log.writing.parts import existing_parts
-    from tandem import summary_table
-
-    if trouble is None and not logged:
-        trouble = f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
-    if trouble is None and not began:
-        trouble = "stopped before the first command"
-    result: dict[str, Any] = {}
-    try:
-        with console.status("reading the log and drawing"):
-            parts = existing_parts(files.log)
-            ran = read_run(parts[0] if parts else files.log)
-            summary = summarise(ran)
-            picture = report.picture(ran, files.picture)
-    except LogError as error:
-        trouble = f"{trouble}\n{error}" if trouble else str(error)
-    else:
-        result = summary_table.of(summary)
-        console.print(summary_table.table(summary))
-        terminal.say(console, f"picture {_near(picture)}")
-        terminal.say(console, *(f"replay  tandem replay {_near(part)}" for part in parts))
-        if len(parts) > 1:
-            text = f"the log has {len(parts)} parts; table and picture are of the first, {_near(parts[0])}"
-            terminal.say(console, text, style="yellow")
-        elif ran.note:
-            terminal.say(console, ran.note, style="yellow")
-    if trouble is not None:
-        terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
-        result = {"error": trouble, **result}
-    if as_json:
-        terminal.emit(result)
-    return 0 if trouble is None else 1
+        if trouble is None and not logged:
+            trouble = (
+                f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
+            )
+        if trouble is None and not began:
+            trouble = "stopped before the first command"
+        result: dict[str, Any] = {}
+        try:
+            with self.console.status("reading the log and drawing"):
+                parts = existing_parts(files.log)
+                ran = read_run(parts[0] if parts else files.log)
+                summary = summarise(ran)
+                picture = report.picture(ran, files.picture)
+        except LogError as error:
+            trouble = f"{trouble}\n{error}" if trouble else str(error)
+        else:
+            result = summary_table.of(summary)
+            self.console.print(summary_table.table(summary))
+            self.say(f"picture {_near(picture)}")
+            self.say(*(f"replay  tandem replay {_near(part)}" for part in parts))
+            if len(parts) > 1:
+                text = (
+                    f"the log has {len(parts)} parts; table and picture are of the first, {_near(parts[0])}"
+                )
+                self.say(text, style="yellow")
+            elif ran.note:
+                self.say(ran.note, style="yellow")
+        if trouble is not None:
+            terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
+            result = {"error": trouble, **result}
+        self.emit(result)
+        return 0 if trouble is None else 1
 
 
 def _free_endpoint() -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -19,6 +19,10 @@ class Simulate(Configured):
     """Controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
 
     EXTRAS = "trainer,log"
+    KEYS = (
+        *(("oracle", "controller.oracle"), ("tightening", "controller.tightening")),
+        *(("seed", "seed"), ("x0", "plant.x0")),
+    )
 
     oracle: Annotated[
         OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
@@ -42,15 +46,6 @@ class Simulate(Configured):
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
     """Write the run's log too, in the format of a live run."""
 
-    def flags(self) -> dict[str, tuple[str, Any]]:
-        return {
-            "--oracle": ("controller.oracle", self.oracle),
-            "--seed": ("seed", self.seed),
-            "--tightening": ("controller.tightening", self.tightening),
-            "--adapt-only": ("trainer.enabled", False if self.adapt_only else None),
-            "--x0": ("plant.x0", self.x0),
-        }
-
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
         if self.steps < 1:
@@ -61,14 +56,16 @@ class Simulate(Configured):
             )
         from controller_node.guarantee import guarantee
         from lbmpc.plants import PlantError
+        from node_runtime.config.sections import override
         from run_log.reporting.summary import summarise
         from run_log.writing.save import save
         from tandem import summary_table
         from tandem.experiments.simulation.lockstep import simulate
 
-        console = terminal.console(self.json)
-        terminal.say(console, guarantee(config))
-        with terminal.progress_bar(console) as bar:
+        if self.adapt_only:
+            config = override(config, ["trainer.enabled=false"])
+        self.say(guarantee(config))
+        with terminal.progress_bar(self.console) as bar:
             task = bar.add_task(f"simulating, {config.controller.oracle}", total=self.steps)
             try:
                 ran = simulate(config, self.steps, progress=lambda step: bar.update(task, completed=step))
@@ -79,7 +76,6 @@ class Simulate(Configured):
             save(ran, self.log)
             ran.path = self.log
         summary = summarise(ran)
-        console.print(summary_table.table(summary))
-        if self.json:
-            terminal.emit(summary_table.of(summary))
+        self.console.print(summary_table.table(summary))
+        self.emit(summary_table.of(summary))
         return 0

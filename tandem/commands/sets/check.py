@@ -32,7 +32,7 @@ class SetsCheck(Configured):
 
         if self.samples < 1:
             raise terminal.Refused(f"--samples {self.samples}: at least 1")
-        model, console = model_for(config), terminal.console(self.json)
+        model = model_for(config)
         result: dict[str, Any] = {"file": str(self.file), "certificate": "ok"}
         reason = ""
         try:
@@ -42,7 +42,7 @@ class SetsCheck(Configured):
         except CertificateError as error:
             reason = str(error)
         else:
-            with terminal.share_bar(console) as bar:
+            with terminal.share_bar(self.console) as bar:
                 task = bar.add_task("proving the claim", total=1.0)
                 verdict = check(sets.certificate, progress=lambda done: bar.update(task, completed=done))
             found = sample(sets.certificate, model, self.samples)
@@ -56,7 +56,7 @@ class SetsCheck(Configured):
             result["certificate"] = reason
             terminal.complain(f"{self.file}: refused: {reason}", as_json=False)
         else:
-            terminal.say(console, f"{self.file}: ok", style="green")
+            self.say(f"{self.file}: ok", style="green")
             near = (
                 f"at least {-found.excess:.2g} inside" if found.excess < 0 else f"never outside by {HAIR:g}"
             )
@@ -66,7 +66,6 @@ class SetsCheck(Configured):
                 f"the true plant at {found.samples} states and inputs: h stays in W ({near})\n"
                 f"sha256 {sets.sha256}"
             )
-            terminal.say(console, text)
-        if self.json:
-            terminal.emit(result)
+            self.say(text)
+        self.emit(result)
         return NO_SETS if reason else 0

@@ -57,14 +57,14 @@ class SetsCompute(Configured):
             raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
         if self.out.is_dir():
             raise Refused(f"{self.out}: is a folder; name a file")
-        model, console = model_for(config), terminal.console(self.json)
+        model = model_for(config)
         W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
         asked = _Asked(model, start_of(config, model), W, self.slack, self.fresh, default_cache())
         kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)
         made: list[tuple[Kind, CertifiedSets | str, bool]] = []
         for kind in kinds:
             try:
-                made.append((kind, *_one(asked, kind, console)))
+                made.append((kind, *_one(asked, kind, self.console)))
             except (SetError, DisturbanceError) as error:
                 made.append((kind, str(error), False))
             except OSError as error:
@@ -79,13 +79,12 @@ class SetsCompute(Configured):
             except OSError as error:
                 raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
             results[[s for _, s, _ in made].index(good[-1])]["file"] = str(self.out)
-            console.print(_table(results))
-            terminal.say(console, _meaning(good[-1], asked), f"wrote {self.out}")
+            self.console.print(_table(results))
+            self.say(_meaning(good[-1], asked), f"wrote {self.out}")
         for kind, reason, _ in made:
             if isinstance(reason, str):
                 terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
-        if self.json:
-            terminal.emit(results[0] if len(results) == 1 else {"sets": results})
+        self.emit(results[0] if len(results) == 1 else {"sets": results})
         return 0 if len(good) == len(made) else NO_SETS
 
 

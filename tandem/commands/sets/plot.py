@@ -68,9 +68,8 @@ class SetsPlot(Command):
             raise Refused(f"{file}: {error}") from error
         except OSError as error:
             raise Refused(f"{out}: cannot be written: {error.strerror}") from error
-        terminal.say(terminal.console(self.json), f"picture {out}")
-        if self.json:
-            terminal.emit({"picture": str(out), "sha256": sets.sha256})
+        self.say(f"picture {out}")
+        self.emit({"picture": str(out), "sha256": sets.sha256})
         return 0
 
 

@@ -79,7 +79,7 @@ def page(
         own = [result for result in results if result.case.group == group.name]
         if own:
             parts.append(_part(group, own, plant, command))
-    loader = jinja2.PackageLoader("experiments", "")
+    loader = jinja2.PackageLoader("tandem.experiments.reporting", "")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     found = {
         **provenance.describe(),

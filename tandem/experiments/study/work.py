@@ -6,10 +6,8 @@ import os
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
-from controller_node.build import build_oracle, build_plant
-from lbmpc.model import build_model
+from controller_node.build import build_oracle, model_for
 from lbmpc.oracles import DnnOracle
 from node_runtime.config.sections import Config
 from run_log.reading.reader import Run
@@ -106,9 +104,7 @@ def _traces(run: Run) -> Traces:
 
 
 def _lemma(run: Run, config: Config) -> Lemma | None:
-    settings = config.controller
-    weights = (None if w is None else np.array(w, dtype=float) for w in (settings.Q, settings.R))
-    oracle = build_oracle(config, build_model(build_plant(config), config.period, *weights))
+    oracle = build_oracle(config, model_for(config))
     return measure(run, oracle) if isinstance(oracle, DnnOracle) else None
 
 
