@@ -80,10 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         terminal.complain(str(error), command.json)
         return 2
     except ModuleNotFoundError as error:
-        if error.name not in OPTIONAL_PACKAGES:
+        package = (error.name or "").partition(".")[0]
+        if package not in OPTIONAL_PACKAGES:
             raise
         how = f"pip install 'tandem-control[{command.EXTRAS}]'"
-        terminal.complain(f"this command needs {error.name}: {how}", command.json)
+        terminal.complain(f"this command needs {package}: {how}", command.json)
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from tandem.commands.base import FROM_CONFIG, Configured
+from tandem.commands.base import FROM_CONFIG, Configured, require
 
 if TYPE_CHECKING:
     from node_runtime.config.sections import Config
@@ -96,5 +96,7 @@ class Record(Process):
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
         from run_log.writing.recorder import main
+
+        require("zstandard")
 
         return self._process("recorder", main, config)

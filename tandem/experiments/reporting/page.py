@@ -96,7 +96,7 @@ def page(
         runs=sum(len(result.rows) for result in results),
         quick=quick,
     )
-    return environment.get_template("report.html.j2").render(page=whole)
+    return environment.get_template("page.html.j2").render(page=whole)
 
 
 def _part(group: Group, results: list[CaseResult], plant: Plant, command: str) -> Part:
