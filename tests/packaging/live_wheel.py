@@ -24,7 +24,7 @@ class Environment:
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
         self._bin = folder / "bin"
         what = f"{wheel}[{extras}]" if extras else str(wheel)
-        subprocess.run([str(self._bin / "pip"), "install", "--quiet", what], check=True)
+        subprocess.run([str(self._bin / "python"), "-I", "-m", "pip", "install", "--quiet", what], check=True)
 
     def tandem(self, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
