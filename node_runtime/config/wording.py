@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -16,6 +17,13 @@ from msgspec import inspect
 _PLACE = re.compile(r"^(?P<text>.*) - at `\$\.?(?P<key>.*)`$", re.DOTALL)
 _ABSENT = re.compile(r"missing required field `(\w+)`")
 _STEP = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """A hint for who misspelt one of these names: the one that was meant, or all that there are."""
+    names = list(names)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names) or 'none'}"
 
 
 def explain(text: str, tree: Any, kind: type) -> tuple[str, str]:

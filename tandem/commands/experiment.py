@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import time
 from dataclasses import dataclass
@@ -120,12 +119,12 @@ def _shipped_files() -> dict[str, Path]:
 
 def _find(what: str) -> Path:
     """A shipped name, or a file. Raises `Refused`."""
+    from node_runtime.config.wording import nearest
+
     files = _shipped_files()
     if what in files:
         return files[what]
     path = Path(what)
     if path.suffix == ".toml" or path.exists():
         return path
-    near = difflib.get_close_matches(what, files, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(files) or 'none'}"
-    raise Refused(f"no experiment is called {what!r}; {hint} Or name a file, FILE.toml")
+    raise Refused(f"no experiment is called {what!r}; {nearest(what, files)} Or name a file, FILE.toml")

@@ -16,13 +16,11 @@ from tandem.terminal import Refused
 
 if TYPE_CHECKING:
     import numpy as np
-    from rich.console import Console
     from rich.progress import TaskID
     from rich.table import Table
 
-    from controller_node.certified_sets import CertifiedSets, Kind, SavedArrays
+    from controller_node.certified_sets import CertifiedSets, Kind
     from lbmpc.model import Model
-    from lbmpc.sets.certificate import Certificate
 
 WARNING_SAMPLES = 20_000
 
@@ -59,18 +57,17 @@ class SetsCompute(Configured):
             raise Refused(f"{self.out}: is a folder; name a file")
         model = model_for(config)
         W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
-        asked = _Asked(model, start_of(config, model), W, self.slack, self.fresh, default_cache())
+        start = start_of(config, model)
         kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)
         made: list[tuple[Kind, CertifiedSets | str, bool]] = []
         for kind in kinds:
             try:
-                made.append((kind, *_one(asked, kind, self.console)))
+                made.append((kind, *self._one(kind, model, start, W)))
             except (SetError, DisturbanceError) as error:
                 made.append((kind, str(error), False))
             except OSError as error:
-                raise Refused(
-                    f"{error.filename or asked.cache}: cannot be written: {error.strerror}"
-                ) from error
+                where = error.filename or default_cache()
+                raise Refused(f"{where}: cannot be written: {error.strerror}") from error
         results = [_result(kind, sets, cached) for kind, sets, cached in made]
         good = [sets for _, sets, _ in made if isinstance(sets, CertifiedSets)]
         if good:
@@ -80,78 +77,69 @@ class SetsCompute(Configured):
                 raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
             results[[s for _, s, _ in made].index(good[-1])]["file"] = str(self.out)
             self.console.print(_table(results))
-            self.say(_meaning(good[-1], asked), f"wrote {self.out}")
+            self.say(_meaning(good[-1], model), f"wrote {self.out}")
         for kind, reason, _ in made:
             if isinstance(reason, str):
                 terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
         self.emit(results[0] if len(results) == 1 else {"sets": results})
         return 0 if len(good) == len(made) else NO_SETS
 
+    def _one(
+        self, kind: Kind, model: Model, start: np.ndarray, W: np.ndarray | None
+    ) -> tuple[CertifiedSets, bool]:
+        """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
+        from controller_node.certified_sets import (
+            CertifiedSets,
+            Found,
+            SavedArrays,
+            Work,
+            default_cache,
+            read_sets,
+            write_sets,
+        )
+        from lbmpc.sets.certificate import CertificateError
+        from lbmpc.sets.check import check
+        from lbmpc.sets.construct import construct, volume_fraction
+        from lbmpc.sets.geometry.polytope import SetError
+        from lbmpc.sets.guard import Guard
 
-@dataclass(frozen=True)
-class _Asked:
-    """What the sets are for."""
+        work = Work.of(model, kind, start, W, self.slack, default_cache())
+        saved = SavedArrays(work.folder)
+        if self.fresh:
+            saved.clear()
+        elif work.sets.exists():
+            try:
+                return read_sets(work.sets), True
+            except CertificateError as error:
+                self.say(f"{error}; computed again", style="yellow")
+        began = time.monotonic()
+        tasks: dict[str, TaskID] = {}
+        with terminal.share_bar(self.console) as bar:
 
-    model: Model
-    start: np.ndarray
-    W: np.ndarray | None
-    slack: float
-    fresh: bool
-    cache: Path
+            def report(what: str, share: float) -> None:
+                # "the invariant set: step 12, 340 facets" is one bar, whose text changes.
+                stage = what.split(":")[0]
+                if stage not in tasks:
+                    tasks[stage] = bar.add_task(what, total=1.0)
+                bar.update(tasks[stage], completed=share, description=f"{kind}: {what}")
 
-
-def _one(asked: _Asked, kind: Kind, console: Console) -> tuple[CertifiedSets, bool]:
-    """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
-    from controller_node.certified_sets import CertifiedSets, Found, SavedArrays, Work, read_sets, write_sets
-    from lbmpc.sets.certificate import CertificateError
-    from lbmpc.sets.check import check
-    from lbmpc.sets.construct import volume_fraction
-    from lbmpc.sets.geometry.polytope import SetError
-    from lbmpc.sets.guard import Guard
-
-    work = Work.of(asked.model, kind, asked.start, asked.W, asked.slack, asked.cache)
-    if not asked.fresh and work.sets.exists():
-        try:
-            return read_sets(work.sets), True
-        except CertificateError as error:
-            terminal.say(console, f"{error}; computed again", style="yellow")
-    saved = SavedArrays(work.folder)
-    if asked.fresh:
-        saved.clear()
-    began = time.monotonic()
-    try:
-        certificate = _constructed(asked, kind, saved, console)
-    except KeyboardInterrupt:
-        text = f"interrupted; what was done is kept in {work.folder}: the same command goes on from there"
-        terminal.say(console, text)
-        raise
-    seconds = time.monotonic() - began
-    with terminal.share_bar(console) as bar:
-        task = bar.add_task(f"{kind}: proving the claim", total=1.0)
-        verdict = check(certificate, progress=lambda done: bar.update(task, completed=done))
-    if not verdict.ok:
-        raise SetError(f"constructed, but the checker refuses it: {verdict.reason}")
-    contains = Guard(certificate).first_inputs(asked.start).piece >= 0
-    found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
-    sets = CertifiedSets.of(certificate, found)
-    write_sets(sets, work.sets)
-    return sets, False
-
-
-def _constructed(asked: _Asked, kind: Kind, saved: SavedArrays, console: Console) -> Certificate:
-    from lbmpc.sets.construct import construct
-
-    tasks: dict[str, TaskID] = {}
-    with terminal.share_bar(console) as bar:
-
-        def report(what: str, share: float) -> None:
-            # "the invariant set: step 12, 340 facets" is one bar, whose text changes.
-            stage = what.split(":")[0]
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(what, total=1.0)
-            bar.update(tasks[stage], completed=share, description=f"{kind}: {what}")
-
-        return construct(asked.model, kind, asked.start, asked.W, asked.slack, saved=saved, report=report)
+            try:
+                certificate = construct(model, kind, start, W, self.slack, saved=saved, report=report)
+            except KeyboardInterrupt:
+                self.say(
+                    f"interrupted; what was done is kept in {work.folder}: the same command goes on from there"
+                )
+                raise
+            seconds = time.monotonic() - began
+            proving = bar.add_task(f"{kind}: proving the claim", total=1.0)
+            verdict = check(certificate, progress=lambda done: bar.update(proving, completed=done))
+        if not verdict.ok:
+            raise SetError(f"constructed, but the checker refuses it: {verdict.reason}")
+        contains = Guard(certificate).first_inputs(start).piece >= 0
+        found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
+        sets = CertifiedSets.of(certificate, found)
+        write_sets(sets, work.sets)
+        return sets, False
 
 
 def _result(kind: Kind, sets: CertifiedSets | str, cached: bool) -> dict[str, Any]:
@@ -200,7 +188,7 @@ def _table(results: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def _meaning(sets: CertifiedSets, asked: _Asked) -> str:
+def _meaning(sets: CertifiedSets, model: Model) -> str:
     from tandem.commands.sets.sampling import HAIR, sample
 
     certificate = sets.certificate
@@ -214,7 +202,7 @@ def _meaning(sets: CertifiedSets, asked: _Asked) -> str:
     if not given:
         return text + "whatever the true h does within its proved bound."
     text += "as long as h stays in the W that was given."
-    found = sample(certificate, asked.model, WARNING_SAMPLES)
+    found = sample(certificate, model, WARNING_SAMPLES)
     if found.excess > HAIR:
         text += f"\nWarning: the plant's own equations leave that W: {found.where}."
     return text
