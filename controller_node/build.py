@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
-from lbmpc.model import Model, ModelError, build_model
+from lbmpc.model import Model, ModelError
+from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
-from lbmpc.oracles.dnn.oracle import Refit
+from lbmpc.oracles.base import Realise
+from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.trial import Trial
 from lbmpc.plants import Plant, get_plant
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import Problem, build_problem
+from lbmpc.solver.rows import Box
+from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
-from network_model.operations import get_architecture
+from network_model.registry import get_architecture
 from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
-Realise = Callable[[ca.Function], ca.Function]
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
@@ -75,6 +78,11 @@ def build_oracle(config: Config, model: Model) -> Oracle:
         return L2nwOracle(
             plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation
         )
+    return build_network_oracle(config, plant)
+
+
+def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
+    """The network oracle of the configuration, whichever oracle it names. Raises `ConfigError`."""
     try:
         description = describe_network(config, plant)
     except ValueError as error:
@@ -107,29 +115,62 @@ def describe_trial(config: Config) -> Trial | None:
     )
 
 
-def model_for(config: Config) -> Model:
+def build_model(config: Config) -> Model:
     """The nominal model of the configuration's plant at its rate. Raises `ConfigError`."""
+    settings = config.controller
+    Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
+    R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        return _model(config, build_plant(config))
+        return nominal_model(build_plant(config), config.period, Q, R)
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
 
 
+class TimedSolver:
+    """A solver, and how long its last solve took: for the log, never for a decision."""
+
+    def __init__(self, solver: Solver):
+        self._solver = solver
+        self.seconds = 0.0
+
+    def solve(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        *,
+        first: Box | None = None,
+    ) -> Solution:
+        before = time.perf_counter()
+        solution = self._solver.solve(x, oracle_parameters, warm_start, first=first)
+        self.seconds = time.perf_counter() - before
+        return solution
+
+    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
+        self._solver.prepare(x, oracle_parameters, warm_start)
+
+    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+        before = time.perf_counter()
+        solution = self._solver.feedback(x, first)
+        self.seconds = time.perf_counter() - before
+        return solution
+
+
 def build_controller(
-    config: Config, realise: Realise | None = None, certificate: Certificate | None = None
-) -> Controller:
-    """Everything a controller is, built once.
+    config: Config, model: Model, realise: Realise | None = None, certificate: Certificate | None = None
+) -> tuple[Controller, TimedSolver]:
+    """A controller and the solver that it uses.
 
     Args:
         config: the resolved configuration.
+        model: the nominal model of that configuration.
         realise: may compile the solver's functions.
         certificate: the sets of the tightening `invariant`.
 
     Raises:
         ConfigError: the configuration admits no controller, or the sets are of another model.
     """
-    model = model_for(config)
-    settings = config.controller
+    settings, realise = config.controller, realise or _as_it_is
     try:
         problem = build_problem(
             model,
@@ -143,12 +184,11 @@ def build_controller(
     except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
-    solver = Solver(problem, chosen.max_iterations, chosen.tolerance, realise or _as_it_is)
-    if isinstance(problem.oracle, DnnOracle):
-        problem.oracle.compile(realise or _as_it_is)
+    solver = TimedSolver(Solver(problem, chosen.max_iterations, chosen.tolerance, realise))
+    problem.oracle.compile(realise)
     controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
-    _warm_up(controller, config.seed)
-    return controller
+    _warm_up(controller, solver, config.seed)
+    return controller, solver
 
 
 def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:
@@ -156,9 +196,9 @@ def build_backup(config: Config, problem: Problem, realise: Realise | None = Non
     return BackupPlanner(problem, config.controller.backup.margin, realise or _as_it_is)
 
 
-def _warm_up(controller: Controller, seed: int) -> None:
+def _warm_up(controller: Controller, solver: TimedSolver, seed: int) -> None:
     """Whatever is slow the first time is slow here and not in the first tick; leaves no trace in any result."""
-    solver, state = controller.solver, controller.initial_state(seed)
+    state = controller.initial_state(seed)
     d, m = controller.model.d, controller.model.m
     controller.oracle.learn(state.oracle, np.zeros(d), np.zeros(m), np.zeros(d))
     controller.oracle.estimate(state.oracle, np.zeros(d), np.zeros(m))
@@ -176,10 +216,3 @@ def _warm_up(controller: Controller, seed: int) -> None:
 
 def _as_it_is(function: ca.Function) -> ca.Function:
     return function
-
-
-def _model(config: Config, plant: Plant) -> Model:
-    settings = config.controller
-    Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
-    R = None if settings.R is None else np.array(settings.R, dtype=float)
-    return build_model(plant, config.period, Q, R)

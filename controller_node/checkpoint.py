@@ -69,7 +69,7 @@ class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Resumes(Protocol):
-    """What can go on with a checkpoint: `controller_node.core.ControllerCore`."""
+    """What can go on with a checkpoint: `controller_node.memory.Memory`."""
 
     def belongs(self) -> dict[str, str]: ...
 
@@ -77,7 +77,7 @@ class Resumes(Protocol):
 
 
 @dataclass(frozen=True)
-class Memory:
+class Snapshot:
     """What the loop hands over: references to what it never changes again."""
 
     seq: int
@@ -88,7 +88,7 @@ class Memory:
 # -- reading -------------------------------------------------------------------------------------------------
 
 
-def resume(core: Resumes, path: Path) -> Checkpoint | None:
+def resume(memory: Resumes, path: Path) -> Checkpoint | None:
     """Let a controller go on with the memory in a file, before its first tick.
 
     Returns:
@@ -96,9 +96,9 @@ def resume(core: Resumes, path: Path) -> Checkpoint | None:
         is kept beside, under another name, because the next checkpoint takes this one.
     """
     try:
-        found = read(path, core.belongs())
+        found = read(path, memory.belongs())
         try:
-            core.go_on(found.arrays, found.run_id)
+            memory.go_on(found.arrays, found.run_id)
         except ValueError as error:
             raise OtherController(f"the checkpoint of a controller with other settings: {error}") from error
         log.info("%s: goes on from %s, tick %d", path, found.run_id, found.seq)
@@ -192,12 +192,12 @@ class CheckpointWriter:
             (len(batch.samples), codec.encode(batch)) for batch in outbox.earlier
         )
         self._last = -1
-        self._memory: Memory | None = None
+        self._memory: Snapshot | None = None
         self._offered, self._end = threading.Event(), threading.Event()
         self._said = ""
         self._thread = threading.Thread(target=self._run, name="checkpoint", daemon=True)
 
-    def offer(self, memory: Memory) -> None:
+    def offer(self, memory: Snapshot) -> None:
         """The newest memory, from the loop; returns at once."""
         self._memory, self.wanted = memory, False
         self._offered.set()

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller_node.build import model_for
 from controller_node.certified_sets import CertifiedSets, find_sets, start_of
+from lbmpc.model import Model
 from lbmpc.sets.guard import Guard
 from node_runtime.config.sections import Config
 
 
-def guarantee(config: Config, sets: CertifiedSets | None = None) -> str:
+def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -> str:
     """One sentence or two for the tightening of the configuration.
 
     Args:
         config: the resolved configuration.
+        model: the nominal model of that configuration.
         sets: those in force; None: found by the configuration, for `invariant`.
 
     Raises:
@@ -33,7 +34,6 @@ def guarantee(config: Config, sets: CertifiedSets | None = None) -> str:
                 "guaranteed: X and U for ever, for every disturbance in W, from every state where the problem has a "
                 "solution once; W is taken as given"
             )
-    model = model_for(config)
     return _of_sets(find_sets(config, model) if sets is None else sets, start_of(config, model))
 
 

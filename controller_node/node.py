@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller_node.checkpoint import CheckpointWriter, Memory, resume
+from controller_node.checkpoint import CheckpointWriter, Snapshot, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
@@ -25,10 +25,10 @@ from node_runtime.realtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime.scheduling import (
     GarbageCollection,
     core_for,
+    core_note,
     on_core,
     one_blas_thread,
     punctual,
-    said_of,
 )
 from protocol import codec, topics
 from protocol import messages as m
@@ -131,7 +131,7 @@ class ControllerNode:
         garbage.begin()
         if (sets := self._core.certified_sets()) is not None:
             self._bus.publish(topics.SETS, sets)
-        self._bus.publish(topics.KEYFRAME, self._core.keyframe(-1))
+        self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(-1))
         while self._find_plant(stop):
             while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:
                 slot, lateness = turn
@@ -146,7 +146,7 @@ class ControllerNode:
         if self._checkpoint is not None and self._seq >= 0:
             self._save(self._checkpoint)
         if self._keyframe_seq < self._seq:
-            self._bus.publish(topics.KEYFRAME, self._core.keyframe(self._seq))
+            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
 
     # -- before the step ---------------------------------------------------------------------------------
 
@@ -274,15 +274,14 @@ class ControllerNode:
             self._unsent.append(outputs.sample)
             if len(self._unsent) >= self._samples_batch:
                 self._send_samples()
-        adopted = outputs.result.weights_verdict == "adopted"
-        changed = adopted or bool(outputs.result.weights_rolled_back)
-        if outputs.output_weights is not None and (changed or self._seq % self._weights_every == 0):
+        due = outputs.new_network or self._seq % self._weights_every == 0
+        if due and outputs.output_weights is not None:
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if changed:
+        if outputs.new_network:
             self._remember_hidden()
         if (self._seq + 1) % self._settings.keyframe_every == 0:
             self._keyframe_seq = self._seq
-            self._bus.publish(topics.KEYFRAME, self._core.keyframe(self._seq))
+            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
 
     def _count(self, tick: m.Tick, outputs: Outputs, overrun: bool) -> None:
         self._missing = 0 if tick.state_verdict == "fresh" else self._missing + 1
@@ -292,12 +291,12 @@ class ControllerNode:
         counts["skipped slots"] += tick.skipped
         counts["states missing"] += tick.state_verdict == "missing"
         counts["states stale"] += tick.state_verdict == "stale"
-        verdict = outputs.result.weights_verdict
-        counts["weights adopted"] += verdict == "adopted"
-        if verdict.startswith("refused"):
+        result = outputs.result
+        counts["weights adopted"] += result.weights_outcome == "adopted"
+        if result.weights_outcome == "refused":
             counts["weights refused"] += 1
-            self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", verdict)
-        if rolled_back := outputs.result.weights_rolled_back:
+            self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", result.weights_verdict)
+        if rolled_back := result.weights_rolled_back:
             counts["weights rolled back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
 
@@ -307,10 +306,10 @@ class ControllerNode:
         self._unsent = []
 
     def _save(self, checkpoint: CheckpointWriter) -> None:
-        checkpoint.offer(Memory(self._seq, self._core.lasting(), dict(self._counts)))
+        checkpoint.offer(Snapshot(self._seq, self._core.memory.lasting(), dict(self._counts)))
 
     def _remember_hidden(self) -> None:
-        snapshot = self._core.hidden_snapshot(self._seq)
+        snapshot = self._core.memory.hidden_snapshot(self._seq)
         self._hidden = [] if snapshot is None else [codec.encode(snapshot)]
 
 
@@ -323,9 +322,9 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
             _check_phase(config)
             place = core_for(config, "controller", os.sched_getaffinity(0))
             core = ControllerCore(config, run_id)
-            log.info("%s", guarantee(config, core.sets))
+            log.info("%s", guarantee(config, core.controller.model, core.sets))
             path = Path(config.controller.checkpoint) if config.controller.checkpoint else None
-            before = None if path is None else resume(core, path)
+            before = None if path is None else resume(core.memory, path)
             if before is not None:
                 counts |= {name: before.counters.get(name, 0) for name in counts}
             outbox = Outbox(run_id, earlier=() if before is None else before.batches())
@@ -336,12 +335,14 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
                     bus,
                     core.run_info(time.time()),
                     lambda: counts,
-                    "; ".join(filter(None, (note, said_of(place)))),
+                    "; ".join(filter(None, (note, core_note(place)))),
                 ) as health,
             ):
                 saving = None
                 if path is not None:
-                    saving = CheckpointWriter(path, core.belongs(), outbox, config.trainer.capacity, counts)
+                    saving = CheckpointWriter(
+                        path, core.memory.belongs(), outbox, config.trainer.capacity, counts
+                    )
                 node = ControllerNode(core, bus, health, counts, outbox, saving)
                 with saving or nullcontext(), on_core(place):
                     node.run(stopping)

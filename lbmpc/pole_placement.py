@@ -3,8 +3,8 @@
     A + BK = X diag(p) X^-1,    X's column i spans the kernel of U1'(A - p_i I),    B = (U0 U1) (z; 0)
 
 With one input there is nothing to choose, and these lines are all of it. `scipy.signal.place_poles` does the same, to
-the last bit, and chooses where there are several inputs. But importing it takes a second, for which a controller that
-died would be away longer.
+the last bit, and chooses where there are several inputs. But importing it takes 0.9 s, as long as everything else until
+the first tick of a controller that is started again (median of 15 processes each).
 """
 
 from __future__ import annotations

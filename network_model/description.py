@@ -16,7 +16,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from network_model.operations import BOUNDED, Activation, Sizes, get_architecture
+from network_model.operations import BOUNDED, Activation, Sizes
+from network_model.registry import get_architecture
 
 __all__ = [
     "BOUNDED",

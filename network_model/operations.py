@@ -1,4 +1,4 @@
-"""What an architecture of the hidden layers is: one file in `architectures/`, written once for all backends.
+"""What an architecture of the hidden layers is, in operations that every backend has.
 
 An architecture sees the last k pairs (x, u), oldest first, and returns the activations of its last hidden layer. It
 is written in a few operations that numpy, CasADi and torch each provide, so that the controller's network and the
@@ -7,15 +7,9 @@ trainer's cannot differ. Derivatives follow from the operations. docs/architectu
 
 from __future__ import annotations
 
-import difflib
-import functools
-import importlib
 import itertools
-import pkgutil
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol
-
-from network_model import architectures
 
 Activation = Literal["tanh", "sigmoid", "softsign", "softplus", "relu"]
 BOUNDED: tuple[Activation, ...] = ("tanh", "sigmoid", "softsign")
@@ -103,29 +97,3 @@ def dense(net: Operations, layers: Sequence[Layer], activations: Sequence[Activa
     for layer, activation in zip(layers, activations, strict=True):
         a = net.activate(activation, net.affine(layer, a))
     return a
-
-
-def architecture_names() -> list[str]:
-    """Every architecture there is: the files of `network_model/architectures`."""
-    return sorted(module.name for module in pkgutil.iter_modules(architectures.__path__))
-
-
-@functools.cache
-def get_architecture(name: str) -> Architecture:
-    """The architecture of that name.
-
-    Raises:
-        ValueError: there is no such file; the text names the nearest one.
-    """
-    names = architecture_names()
-    if name not in names:
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-        raise ValueError(
-            f"no architecture is called {name!r}; did you mean {near[0]!r}? Known: {', '.join(names)}"
-        )
-    found = importlib.import_module(f"{architectures.__name__}.{name}").ARCHITECTURE
-    if not isinstance(found, Architecture):
-        raise ValueError(
-            f"network_model/architectures/{name}.py: ARCHITECTURE is no network_model.operations.Architecture"
-        )
-    return found

@@ -20,9 +20,9 @@ from protocol.messages import Health, ProcessStatus, RunInfo
 
 HEALTH_PERIOD = 0.5
 RUN_INFO_EVERY = 10
-BEATS = 600.0
-"""A second, at most, of all the publishers of one `Heart` together: a thousand then speak within the two seconds after
-which a view calls one silent."""
+MAX_RATE = 600.0
+"""Publishers a second, at most, of one `HealthThread`: a thousand then speak within the two seconds after which a view
+calls one silent."""
 PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh", "torch", "mcap")
 
 
@@ -57,10 +57,10 @@ def run_info(config: Config, process: str, run_id: str, units: dict[str, str] | 
     )
 
 
-class Heart:
-    """One thread that lets many publishers speak, one after the other; a context manager.
+class HealthThread:
+    """One thread that lets publishers speak, one after the other; a context manager.
 
-    Each comes twice a second, or, where there are more than three hundred, as often as `BEATS` allows.
+    Each comes twice a second, or, where there are more than three hundred, as often as `MAX_RATE` allows.
     """
 
     def __init__(self) -> None:
@@ -79,13 +79,11 @@ class Heart:
         with self._lock:
             self._publishers.remove(publisher)
 
-    def __enter__(self) -> Heart:
+    def __enter__(self) -> HealthThread:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join()
 
@@ -94,17 +92,19 @@ class Heart:
         while True:
             with self._lock:
                 among = len(self._publishers)
-                publisher = self._publishers[turn % among] if among else None
-                turn += 1
-                if publisher is not None:
+                if among:
                     # With the lock held, so that none speaks after it was removed.
-                    publisher.beat()
-            if self._end.wait(max(HEALTH_PERIOD / max(1, among), 1.0 / BEATS)):
+                    self._publishers[turn % among].publish_turn()
+                turn += 1
+            if self._end.wait(max(HEALTH_PERIOD / max(1, among), 1.0 / MAX_RATE)):
                 return
 
 
 class HealthPublisher:
-    """A context manager with a small thread of its own, or a place at a `Heart`. Any thread may call `set`."""
+    """Publishes how one process is, from a thread of its own or one that others use too. A context manager.
+
+    Any thread may call `set`.
+    """
 
     def __init__(
         self,
@@ -112,13 +112,14 @@ class HealthPublisher:
         info: RunInfo,
         counters: Callable[[], dict[str, int]] | None = None,
         note: str = "",
-        heart: Heart | None = None,
+        thread: HealthThread | None = None,
     ):
         """`counters`: the process's own figures, added to the bus's. `note`: stands before all others.
 
-        heart: whose thread speaks; None: one of its own.
+        thread: that lets it speak; None: one of its own.
         """
-        self._heart = heart
+        self._thread = thread or HealthThread()
+        self._shared = thread is not None
         self._bus = bus
         self._info = info
         self._counters = counters
@@ -128,8 +129,6 @@ class HealthPublisher:
         self._seq = 0
         self._turns = 0
         self._lock = threading.Lock()
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
     def set(self, status: ProcessStatus, note: str = "") -> None:
         """Change the status or the note, and publish it if it is a change."""
@@ -156,7 +155,7 @@ class HealthPublisher:
             # Inside the lock, so that the order on the wire is the order of seq.
             self._bus.publish(topics.HEALTH[self._bus.process], health)
 
-    def beat(self) -> None:
+    def publish_turn(self) -> None:
         """Say how this process is, and now and then what it is."""
         if self._turns % RUN_INFO_EVERY == 0:
             info = msgspec.structs.replace(self._info, seq=self._turns // RUN_INFO_EVERY)
@@ -164,27 +163,18 @@ class HealthPublisher:
         self._turns += 1
         self.publish()
 
-    def _run(self) -> None:
-        while True:
-            self.beat()
-            if self._end.wait(HEALTH_PERIOD):
-                return
-
     def __enter__(self) -> HealthPublisher:
-        if self._heart is None:
-            self._thread.start()
-        else:
-            self._heart.add(self)
+        self._thread.add(self)
+        if not self._shared:
+            self._thread.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._heart is None:
-            self._end.set()
-            self._thread.join()
-        else:
-            self._heart.remove(self)
+        self._thread.remove(self)
+        if not self._shared:
+            self._thread.__exit__()
         if error is not None and kind is not KeyboardInterrupt:
             self.set("failed", f"{type(error).__name__}: {error}")
         elif self._status != "failed":

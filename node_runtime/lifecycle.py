@@ -1,26 +1,48 @@
-"""Begin and end of a process: run ids, signals."""
+"""Begin and end of a process: run ids, signals, exit codes."""
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from node_runtime.bus.session import OpenInterrupted
+from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 
+log = logging.getLogger(__name__)
+
+EXIT_MISCONFIGURED = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # Ctrl-C reaches a whole process group, and a supervisor may repeat it at once: still one wish to stop.
-SAME_WISH = 1.0
+REPEATED_SIGNAL_S = 1.0
 
 
 def new_run_id(process: str) -> str:
     """A fresh name for this incarnation of `process`."""
     return f"{process}-{uuid.uuid4().hex[:12]}"
+
+
+def run_process(body: Callable[[threading.Event], int], stop: threading.Event | None = None) -> int:
+    """Run `body` until it ends, with an event that signals set; its exit code.
+
+    `stop`: as for `stopped_by_signals`. 2 for a `ConfigError`, 0 when told to stop before there was a router.
+    """
+    with stopped_by_signals(stop) as stopping:
+        try:
+            return body(stopping)
+        except ConfigError as error:
+            log.error("%s", error)
+            return EXIT_MISCONFIGURED
+        except OpenInterrupted as interrupted:
+            log.info("%s", interrupted)
+            return 0
 
 
 @contextmanager
@@ -40,7 +62,7 @@ def stopped_by_signals(stop: threading.Event | None = None) -> Iterator[threadin
             first.append(clock.now())
             # Event.set from a handler could wait for a lock that the interrupted code holds.
             threading.Thread(target=event.set, name="stop", daemon=True).start()
-        elif clock.now() - first[0] > SAME_WISH:
+        elif clock.now() - first[0] > REPEATED_SIGNAL_S:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 

@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 MAX_KINDS = 200
 
 
-class BadMessages:
+class RejectedMessages:
     """Counts per (topic, reason); the first of each is logged with its detail, the rest are only counted."""
 
     def __init__(self) -> None:

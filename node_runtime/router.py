@@ -15,13 +15,13 @@ import threading
 import zenoh
 
 from node_runtime.bus.session import lease_ms, secure, session_config
-from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
-from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.lifecycle import new_run_id, run_process
 from node_runtime.realtime.scheduling import punctual
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from node_runtime.tls import zenoh_log
 from protocol import topics
 
@@ -110,44 +110,42 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it cannot be used."""
     # Read when the first session opens, and nowhere else to be said.
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
-    bad = BadMessages()
     if open_to_all(config.bus.endpoint) and not config.bus.insecure:
         log.warning(
             "%s is neither encrypted nor authenticated: whoever reaches it may command the plant. Let it listen on "
-            "127.0.0.1, and on bus.remote for other machines (`tandem keys`); bus.insecure=true says that it is meant",
+            "127.0.0.1, and on bus.remote for other machines, with certificates that `tandem keys create` makes; "
+            "bus.insecure=true says that it is meant",
             config.bus.endpoint,
         )
+    return run_process(lambda stopping: _route(config, stopping), stop)
+
+
+def _route(config: Config, stopping: threading.Event) -> int:
+    bad = RejectedMessages()
     # Every state and every command passes through here, so the router must be as punctual as the loops.
     with (
-        stopped_by_signals(stop) as stopping,
         punctual(config.realtime.priority, keep_awake=config.awake) as note,
         contextlib.ExitStack() as while_listening,
     ):
         if remote(config):
             # At a thousand ticks a second a line of log for each message would cost more than the messages.
-            fast = config.rate > topics.GATHER_ABOVE
+            fast = config.rate > topics.BATCH_ABOVE_HZ
             filters = zenoh_log.REFUSED if fast else zenoh_log.DENIED
-            while_listening.enter_context(zenoh_log.listening(bad, filters))
+            while_listening.enter_context(zenoh_log.counting_refusals(bad, filters))
         try:
-            with Router(config) as router:
-                log.info("router listening on %s", config.bus.endpoint)
-                if config.bus.remote:
-                    log.info("and for other machines, with certificates, on %s", config.bus.remote)
-                # Its health travels like everybody else's, through a client of itself.
-                with (
-                    Bus(config, "router", router.run_id, stopping) as bus,
-                    HealthPublisher(
-                        bus, run_info(config, "router", router.run_id), bad.counters, note=note
-                    ) as health,
-                ):
-                    health.set("running")
-                    stopping.wait()
+            router = while_listening.enter_context(Router(config))
         except RouterError as error:
             log.error("%s", error)
             return 1
-        except ConfigError as error:
-            log.error("%s", error)
-            return 2
-        except OpenInterrupted:
-            pass
+        log.info("router listening on %s", config.bus.endpoint)
+        if config.bus.remote:
+            log.info("and for other machines, with certificates, on %s", config.bus.remote)
+        # Its health travels like everybody else's, through a client of itself.
+        info = run_info(config, "router", router.run_id)
+        with (
+            Bus(config, "router", router.run_id, stopping) as bus,
+            HealthPublisher(bus, info, bad.counters, note=note) as health,
+        ):
+            health.set("running")
+            stopping.wait()
     return 0

@@ -8,15 +8,14 @@ import threading
 
 from lbmpc.plants import PlantError, get_plant
 from node_runtime.bus.inbox import Inbox
-from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.plant import initial_state, plant_of
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
-from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.lifecycle import new_run_id, run_process
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer
-from node_runtime.realtime.scheduling import GarbageCollection, core_for, on_core, punctual, said_of
+from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual
 from plant_sim.simulator import PlantSim
 from protocol import topics
 from protocol.messages import Backup, Command, InputSource
@@ -95,39 +94,28 @@ class PlantNode:
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem plant`. 0 when told to stop, 2 for a wrong configuration, 3 when the plant's motion ended."""
+    return run_process(lambda stopping: _live(config, stopping), stop)
+
+
+def _live(config: Config, stopping: threading.Event) -> int:
     run_id = new_run_id("plant")
-    try:
-        sim = build(config, run_id)
-        return _live(config, sim, run_id, stop)
-    except ConfigError as error:
-        log.error("%s", error)
-        return 2
-
-
-def _live(config: Config, sim: PlantSim, run_id: str, stop: threading.Event | None) -> int:
+    sim = build(config, run_id)
     names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
     counts = dict.fromkeys(names, 0)
     place = core_for(config, "plant", os.sched_getaffinity(0))
-    with (
-        stopped_by_signals(stop) as stopping,
-        punctual(config.realtime.priority, keep_awake=config.awake) as note,
-    ):
+    with punctual(config.realtime.priority, keep_awake=config.awake) as note:
         info = run_info(config, "plant", run_id, sim.plant.units)
-        try:
-            with (
-                Bus(config, "plant", run_id, stopping) as bus,
-                HealthPublisher(
-                    bus, info, lambda: counts, "; ".join(filter(None, (note, said_of(place))))
-                ) as health,
-            ):
-                try:
-                    node = PlantNode(sim, bus, health, counts)
-                    with on_core(place):
-                        node.run(stopping)
-                except PlantError as error:
-                    log.error("%s", error)
-                    health.set("failed", str(error))
-                    return 3
-        except OpenInterrupted:
-            log.info("stopped before there was a router")
+        standing = "; ".join(filter(None, (note, core_note(place))))
+        with (
+            Bus(config, "plant", run_id, stopping) as bus,
+            HealthPublisher(bus, info, lambda: counts, standing) as health,
+        ):
+            try:
+                node = PlantNode(sim, bus, health, counts)
+                with on_core(place):
+                    node.run(stopping)
+            except PlantError as error:
+                log.error("%s", error)
+                health.set("failed", str(error))
+                return 3
     return 0

@@ -1,1 +1,1 @@
-"""What travels between Tandem's processes: messages, topics, their bytes, and the network's description."""
+"""What travels between Tandem's processes: messages, topics, their bytes, and who may do what."""

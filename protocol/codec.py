@@ -17,6 +17,8 @@ from protocol.topics import Topic
 
 Reason = Literal["oversized", "malformed", "not finite", "wrong size"]
 M = TypeVar("M", bound=m.Message)
+UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError)
+"""All that msgspec raises for bytes that are none of ours."""
 
 
 class BadMessage(ValueError):
@@ -52,7 +54,7 @@ def head_of(payload: bytes) -> Head | None:
     """Who wrote a message, and its number, without a look at the rest of it; None where that cannot be read."""
     try:
         return _head.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError):
+    except UNREADABLE:
         return None
 
 
@@ -74,7 +76,7 @@ def decode(topic: Topic, payload: bytes) -> m.Message:
         raise BadMessage(topic.name, "oversized", f"{len(payload)} bytes, at most {topic.max_bytes}")
     try:
         message = decode_as(topic.type, payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
+    except UNREADABLE as error:
         raise BadMessage(topic.name, "malformed", str(error)) from error
     field = None if _surely_finite(message) else first_non_finite(message)
     if field is not None:
@@ -91,13 +93,13 @@ def _fields_with_floats(kind: type[msgspec.Struct]) -> tuple[str, ...]:
 
 def _may_hold_float(kind: inspect.Type) -> bool:
     match kind:
-        case inspect.Metadata(type=inner):
-            return _may_hold_float(inner)
         case inspect.UnionType(types=types):
             return any(map(_may_hold_float, types))
-        case inspect.ListType(item_type=inner):
-            return _may_hold_float(inner)
-        case inspect.DictType(value_type=inner):
+        case (
+            inspect.Metadata(type=inner)
+            | inspect.ListType(item_type=inner)
+            | inspect.DictType(value_type=inner)
+        ):
             return _may_hold_float(inner)
         case inspect.StructType(cls=struct):
             return struct is m.Array or bool(_fields_with_floats(struct))
@@ -173,11 +175,12 @@ def first_non_finite(value: object, path: str = "") -> str | None:
 def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) -> None:
     """Raise `BadMessage` when a vector's length is not the plant's: d states, m_inputs inputs."""
 
+    def wrong(detail: str) -> BadMessage:
+        return BadMessage(topic.name, "wrong size", detail)
+
     def expect(name: str, values: list[float] | None, length: int) -> None:
         if values is not None and len(values) != length:
-            raise BadMessage(
-                topic.name, "wrong size", f"{name} has {len(values)} entries, the plant has {length}"
-            )
+            raise wrong(f"{name} has {len(values)} entries, the plant has {length}")
 
     match message:
         case m.PlantState():
@@ -191,17 +194,13 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                 for i, entry in enumerate(message.plan):
                     expect(f"plan[{i}]", entry, m_inputs)
             if not message.plan:
-                raise BadMessage(topic.name, "wrong size", "the plan is empty")
-            if not 0.0 < message.period < 3600.0:
-                raise BadMessage(topic.name, "wrong size", f"period {message.period} s")
+                raise wrong("the plan is empty")
         case m.Backup():
             if len(message.gain) != m_inputs or not message.inputs:
-                raise BadMessage(topic.name, "wrong size", "no entry in inputs, or in gain not one an input")
+                raise wrong("no entry in inputs, or in gain not one an input")
             for name, rows, length in (("gain", message.gain, d), ("inputs", message.inputs, m_inputs)):
                 for i, row in enumerate(rows):
                     expect(f"{name}[{i}]", row, length)
-            if not 0.0 < message.period < 3600.0:
-                raise BadMessage(topic.name, "wrong size", f"period {message.period} s")
         case m.Samples():
             for sample in message.samples:
                 expect("x", sample.x, d)
@@ -211,6 +210,6 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                     expect(f"past[{i}]", pair, d + m_inputs)
         case m.OutputWeights():
             if len(message.K.shape) != 2 or message.K.shape[1] != d:
-                raise BadMessage(
-                    topic.name, "wrong size", f"K is {message.K.shape}, the plant has {d} states"
-                )
+                raise wrong(f"K is {message.K.shape}, the plant has {d} states")
+    if isinstance(message, m.Command | m.Backup) and not 0.0 < message.period < 3600.0:
+        raise wrong(f"period {message.period} s")

@@ -29,6 +29,7 @@ InputSource = Literal["hold", "command", "plan", "safe"]
 """What drove the plant: held at x0, a fresh command, the backup policy or else the last plan, the local safe input."""
 CommandMode = Literal["solver", "shifted_plan", "feedback"]
 StateVerdict = Literal["fresh", "stale", "missing"]
+WeightsOutcome = Literal["none", "adopted", "refused"]
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
 
 
@@ -192,6 +193,17 @@ class TickResult(Message, frozen=True):
     """Which of the certified sets the state is in; -1: none."""
     weights_rolled_back: str = ""
     """Why the hidden weights and K from before came back in this tick; empty where they did not."""
+
+    @property
+    def weights_outcome(self) -> WeightsOutcome:
+        """What became of the hidden weights on offer."""
+        outcome = self.weights_verdict.partition(": ")[0]
+        return "adopted" if outcome == "adopted" else "refused" if outcome == "refused" else "none"
+
+
+def weights_verdict(outcome: WeightsOutcome, reason: str = "") -> str:
+    """The text of `TickResult.weights_verdict`."""
+    return f"{outcome}: {reason}" if reason else outcome
 
 
 class TickTiming(Message, frozen=True):

@@ -47,10 +47,10 @@ class Rights:
         return [topics.everything(plant)] if self.reads_all else _keys(self.reads, plant)
 
     def ask_keys(self, plant: str) -> list[str]:
-        return [f"{topics.PREFIX}/{plant}/{name}" for name in self.asks]
+        return [topics.below(plant, name) for name in self.asks]
 
     def answer_keys(self, plant: str) -> list[str]:
-        return [f"{topics.PREFIX}/{plant}/{name}" for name in self.answers]
+        return [topics.below(plant, name) for name in self.answers]
 
 
 def rights_of(role: str) -> Rights:
@@ -78,6 +78,4 @@ def common_name(role: str, plant: str) -> str:
 
 
 def _keys(of: tuple[Topic, ...], plant: str) -> list[str]:
-    # A fast loop's control messages travel at their direct key as well.
-    direct = [topic.direct_key(plant) for topic in of if topic.gathered and topic.lane == "control"]
-    return [topic.key(plant) for topic in of] + direct
+    return [key for topic in of for key in topic.keys(plant)]

@@ -32,40 +32,49 @@ class Topic:
     """A loop that ticks faster publishes it at every n-th tick only, and where what it says has changed."""
     view_hz: float = math.inf
     """Messages a second that get a view in the log; their bytes are all in it, whatever the rate."""
-    gathered: bool = False
-    """In a fast loop those who log and show it get many of its messages in one `Batch`; see `gathers`."""
+    batched: bool = False
+    """In a fast loop those who log and show it get many of its messages in one `Batch`; see `batched_at`."""
 
     def every(self, period: float) -> int:
         """Ticks from one message to the next in a loop of this period, in seconds."""
         return max(1, math.ceil(1.0 / (period * self.max_hz) - 1e-9))
 
+    def batched_at(self, rate: float) -> bool:
+        """Whether its messages are logged from a `Batch` at this sampling rate, in Hz."""
+        return self.batched and rate > BATCH_ABOVE_HZ
+
     def key(self, plant: str) -> str:
-        return f"{PREFIX}/{plant}/{self.name}"
+        return below(plant, self.name)
 
     def direct_key(self, plant: str) -> str:
         """Where a fast loop's control messages travel: no wildcard covers it, so only who needs them is woken."""
-        return f"{PREFIX}/{plant}/{DIRECT}/{self.name}"
+        return below(plant, f"{DIRECT}/{self.name}")
+
+    def keys(self, plant: str) -> list[str]:
+        """Every key that its messages may travel at, whatever the rate."""
+        direct = [self.direct_key(plant)] if self.batched and self.lane == "control" else []
+        return [self.key(plant), *direct]
 
 
 WEIGHTS_LIMIT = 16 * 1024 * 1024
 
 # Above this rate, in Hz, what is logged and shown travels together; up to it every message travels alone.
-GATHER_ABOVE = 100.0
+BATCH_ABOVE_HZ = 100.0
 # Seconds for which messages wait for each other, and bytes beyond which they do not.
-GATHER_S = 0.02
+BATCH_S = 0.02
 BATCH_BYTES = 1024 * 1024
 
 # More points than that in a second no plot shows, and each costs as much as the logging itself.
 VIEW_HZ = 100.0
 
-PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ, gathered=True)
+PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ, batched=True)
 COMMAND = Topic(
-    "controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ, gathered=True
+    "controller/command", m.Command, "control", "controller", 256 * 1024, view_hz=VIEW_HZ, batched=True
 )
 BACKUP = Topic("controller/backup", m.Backup, "control", "controller", 256 * 1024)
-TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ, gathered=True)
-RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
-TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ, gathered=True)
+TICK = Topic("controller/tick", m.Tick, "bulk", "controller", WEIGHTS_LIMIT, view_hz=VIEW_HZ, batched=True)
+RESULT = Topic("controller/result", m.TickResult, "bulk", "controller", view_hz=VIEW_HZ, batched=True)
+TIMING = Topic("controller/timing", m.TickTiming, "bulk", "controller", view_hz=VIEW_HZ, batched=True)
 SAMPLES = Topic("controller/samples", m.Samples, "bulk", "controller", 1024 * 1024)
 OUTPUT_WEIGHTS = Topic(
     "controller/output_weights", m.OutputWeights, "bulk", "controller", WEIGHTS_LIMIT, max_hz=50.0
@@ -96,22 +105,25 @@ ALL: tuple[Topic, ...] = (
     *HEALTH.values(),
 )
 BY_NAME = {topic.name: topic for topic in ALL}
-
-
-def gathers(topic: Topic, rate: float) -> bool:
-    """Whether messages of `topic` are logged from a `Batch` at this sampling rate, in Hz."""
-    return topic.gathered and topic.writer in BATCH and rate > GATHER_ABOVE
+LARGEST_MESSAGE = max(topic.max_bytes for topic in ALL)
 
 
 OUTBOX_QUERY = "controller/outbox"
 """Queryable: `?run=RUN;since=SEQ;last=K` answers with `Samples` batches."""
 HIDDEN_QUERY = "controller/hidden"
 """Queryable: answers with the controller's current `HiddenSnapshot`."""
+LARGEST_QUESTION = 4096
+"""Characters of the parameters of a query."""
+
+
+def below(plant: str, name: str) -> str:
+    """The full key of a topic, or of a queryable, of one plant."""
+    return f"{PREFIX}/{plant}/{name}"
 
 
 def everything(plant: str) -> str:
     """The key expression that covers all of a plant's topics."""
-    return f"{PREFIX}/{plant}/**"
+    return below(plant, "**")
 
 
 def topic_of(key: str) -> Topic | None:

@@ -6,13 +6,13 @@ import fnmatch
 import logging
 import threading
 
+from node_runtime.bus.lanes import Lanes
 from node_runtime.bus.session import OpenInterrupted
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import stopped_by_signals
 from node_runtime.realtime.scheduling import quick_handover
 from trainer_node.fleet.discovery import OneRouter, OwnRouters
 from trainer_node.fleet.fleet import Fleet
-from trainer_node.fleet.plant_bus import Sessions
 from trainer_node.training import TrainerError, pick_device, use_one_thread
 
 log = logging.getLogger(__name__)
@@ -48,8 +48,8 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
                     return 2
                 Fleet(OwnRouters(config, places, stopping)).run(stopping)
             else:
-                with Sessions(config, "trainer", stopping) as sessions:
-                    Fleet(OneRouter(config, plants or config.name, sessions)).run(stopping)
+                with Lanes(config, "trainer", stopping) as lanes:
+                    Fleet(OneRouter(config, plants or config.name, lanes)).run(stopping)
         except OpenInterrupted:
             log.info("stopped before there was a router")
     return 0

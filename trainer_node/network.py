@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from network_model.description import NetworkDescription
-from network_model.operations import Activation, get_architecture
+from network_model.operations import Activation
+from network_model.registry import get_architecture
 
 # torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
 ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from node_runtime.config.sections import Strategy
+from node_runtime.config.literals import Strategy
 
 STRETCHES = 10_000
 """Stretches of sequence numbers remembered for one run."""

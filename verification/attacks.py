@@ -67,7 +67,7 @@ class _Attacked(_LockStep):
             return None if real is None else self._forged(seq, _numbers(real.layers), real.seq)
         if real is not None or seq % self.every:
             return real
-        snapshot = self.core.hidden_snapshot(seq)
+        snapshot = self.core.memory.hidden_snapshot(seq)
         assert snapshot is not None
         return self._forged(seq, _numbers(snapshot.layers), snapshot.hidden_version + 1)
 
@@ -85,13 +85,13 @@ class _Attacked(_LockStep):
             return
         self.strange += 1
         if self.strange * self.config.period > PATIENCE:
-            snapshot = self.core.hidden_snapshot(output.seq)
+            snapshot = self.core.memory.hidden_snapshot(output.seq)
             assert snapshot is not None
             self.trainer.resume(_numbers(snapshot.layers), snapshot.hidden_version)
 
     def _forged(self, seq: int, good: Layers, version: int) -> m.HiddenWeights:
-        assert self.core.description is not None
-        scale = np.array(self.core.description.input_scale)
+        assert self.core.controller.oracle.description is not None
+        scale = np.array(self.core.controller.oracle.description.input_scale)
         known = Known(seq, good, np.array(self.points).reshape(-1, len(scale)) / scale)
         layers = [layer.astype(np.float32) for layer in self.forge(known, self.rng)]
         return m.HiddenWeights(
@@ -103,7 +103,7 @@ class _Attacked(_LockStep):
             samples=1,
             loss_before=1.0,
             loss_after=0.0,
-            network_sha256=self.core.description.sha256(),
+            network_sha256=self.core.controller.oracle.description.sha256(),
             sha256=hash_layers(layers),
             layers=[m.Array.of(layer, "<f4") for layer in layers],
         )

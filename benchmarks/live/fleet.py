@@ -182,17 +182,8 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
     with tempfile.TemporaryDirectory() as folder, Router(config):
         file = Path(folder) / "fleet.toml"
         file.write_text(to_toml(config))
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "tandem",
-            "trainer",
-            "--plants",
-            "plant*",
-            "--config",
-            str(file),
-        ]
+        words = ("trainer", "--plants", "plant*", "--config", str(file))
+        command = [sys.executable, "-P", "-m", "tandem", *words]
         with zenoh.open(session_config("client", endpoint, 10_000)) as session:
             arrived: list[tuple[str, bytes, float]] = []
             declared = _serve(session, controllers, arrived)
@@ -305,9 +296,9 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
 _DESCENT = """
 import json, sys, time
 import numpy as np
-from benchmarks.fleet import NETWORK
-from node_runtime.config import TrainerConfig
-from protocol.network import initial_hidden
+from benchmarks.live.fleet import NETWORK
+from node_runtime.config.sections import TrainerConfig
+from network_model.description import initial_hidden
 from trainer_node.descent import Problem, descend, descend_together
 from trainer_node.network import Network
 from trainer_node.training import use_one_thread

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -128,18 +127,18 @@ class WholeTick:
         self._core = ControllerCore(config, "benchmark")
         self._mode = "tick" if mode == "converged" else "real_time_tick"
         self._recording = recording
-        self._before = self._after = self._core.state
+        self._before = self._after = self._core.memory.state
 
     def run(self, tick: int) -> list[Part]:
         core = self._core
-        core.state = self._before
+        core.memory.state = self._before
         core.prepare()
         message = self._message(tick)
         before = time.perf_counter()
         outputs = core.step(message)
         codec.encode(outputs.command)
         seconds = time.perf_counter() - before
-        self._after = core.state
+        self._after = core.memory.state
         v0, result = np.array(outputs.command.u) - core.plant.u_e, outputs.result
         return [Part(self._mode, seconds, v0, result.iterations, result.mode == "solver")]
 
@@ -175,6 +174,3 @@ class WholeTick:
 
 def _part(mode: str, seconds: float, solution: Solution, expected: Status) -> Part:
     return Part(mode, seconds, solution.v[0], solution.iterations, solution.status is expected)
-
-
-Build = Callable[[], Candidate]

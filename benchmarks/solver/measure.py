@@ -1,20 +1,20 @@
-"""`tandem bench solver`: every candidate on every recorded state, in turn, in one process."""
+"""`python -m benchmarks.solver`: every candidate on every recorded state, in turn, in one process."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import casadi as ca
 import msgspec
 import numpy as np
 
-from benchmarks.solver import memory, rivals
-from benchmarks.solver.candidates import Build, Candidate, Converged, Other, Part, RealTime, WholeTick
+from benchmarks.solver import memory
+from benchmarks.solver.candidates import Candidate, Converged, Other, Part, RealTime, WholeTick
 from benchmarks.solver.recording import SEED, Case, Recording, build_case, record
+from benchmarks.solver.rivals import QP_SOLVERS, Rival, ipopt, sqpmethod
 from controller_node.build import Realise
 from controller_node.codegen.compiler import Compiler
 from lbmpc.solver.gauss_newton import Solver
@@ -30,7 +30,7 @@ CENTRE, WIDTH = 60, 32
 
 
 @dataclass(frozen=True)
-class Plan:
+class Scope:
     """What is measured."""
 
     ticks: int = 60
@@ -49,7 +49,7 @@ class Plan:
     centre: int = CENTRE
 
 
-QUICK = Plan(
+QUICK = Scope(
     ticks=20, rounds=2, horizons=(20, 60), widths=(32,), rival_horizons=(60,), rival_every=5, memory=False
 )
 
@@ -117,7 +117,7 @@ class _Taken:
 
 
 def measure(
-    plan: Plan, progress: Progress = lambda _what, _done, _of: None, cache: Path | None = None
+    scope: Scope, progress: Progress = lambda _what, _done, _of: None, cache: Path | None = None
 ) -> Report:
     """Build everything, warm it up, then go through the ticks.
 
@@ -127,16 +127,16 @@ def measure(
     ticks.
 
     Args:
-        plan: what to measure.
+        scope: what to measure.
         progress: told how far it is.
         cache: where compiled functions are kept; None: the usual place.
     """
-    used = memory.measure() if plan.memory else {}
+    used = memory.measure() if scope.memory else {}
     with punctual(0):
-        compiler = Compiler(cache) if plan.compile else None
-        recording = record(plan.ticks, compiler)
-        candidates, notes = _build(plan, recording, compiler, progress)
-        taken = _run(plan, candidates, progress)
+        compiler = Compiler(cache) if scope.compile else None
+        recording = record(scope.ticks, compiler)
+        candidates, notes = _build(scope, recording, compiler, progress)
+        taken = _run(scope, candidates, progress)
     rows = [
         _row(candidate, mode, figures)
         for candidate, modes in zip(candidates, taken, strict=True)
@@ -148,9 +148,9 @@ def measure(
 
 
 def _build(
-    plan: Plan, recording: Recording, compiler: Compiler | None, progress: Progress
+    scope: Scope, recording: Recording, compiler: Compiler | None, progress: Progress
 ) -> tuple[list[Candidate], list[str]]:
-    shapes = _shapes(plan)
+    shapes = _shapes(scope)
     candidates: list[Candidate] = []
     notes: list[str] = []
     for done, (oracle, horizon, width) in enumerate(shapes):
@@ -160,8 +160,7 @@ def _build(
             notes.append(
                 f"{oracle}, N = {horizon}: the tight reference stopped above its tolerance at {case.unsure} ticks"
             )
-        for build in _builders(plan, case, recording, compiler):
-            candidate = build()
+        for candidate in _candidates(scope, case, recording, compiler):
             if candidate.compiled and compiler is not None and compiler.note.startswith("not compiled"):
                 # It would be the virtual machine under another name.
                 continue
@@ -169,78 +168,61 @@ def _build(
     return candidates, notes
 
 
-def _shapes(plan: Plan) -> list[tuple[OracleName, int, int | None]]:
+def _shapes(scope: Scope) -> list[tuple[OracleName, int, int | None]]:
     """Every problem, once."""
     shapes: list[tuple[OracleName, int, int | None]] = [
         (oracle, horizon, WIDTH if oracle == "dnn" else None)
-        for horizon in plan.horizons
-        for oracle in plan.oracles
+        for horizon in scope.horizons
+        for oracle in scope.oracles
     ]
-    if "dnn" in plan.oracles:
-        shapes += [("dnn", plan.centre, width) for width in plan.widths]
+    if "dnn" in scope.oracles:
+        shapes += [("dnn", scope.centre, width) for width in scope.widths]
     return list(dict.fromkeys(shapes))
 
 
-def _builders(plan: Plan, case: Case, recording: Recording, compiler: Compiler | None) -> Iterator[Build]:
+def _candidates(
+    scope: Scope, case: Case, recording: Recording, compiler: Compiler | None
+) -> Iterator[Candidate]:
     ways: list[tuple[bool, Realise]] = [(False, _as_it_is)]
     if compiler is not None:
         ways.insert(0, (True, compiler))
     for compiled, realise in ways:
-        yield partial(_converged, case, compiled, realise)
-        yield partial(_real_time, case, compiled, realise)
-    central = case.horizon == plan.centre and case.width in (None, WIDTH)
-    if central:
+        for way in (Converged, RealTime):
+            yield Candidate("tandem", case, compiled, way(case, Solver(case.problem, realise=realise)))
+    if case.width not in (None, WIDTH):
+        return
+    if case.horizon == scope.centre:
         for mode in ("converged", "real_time"):
-            yield partial(_tick, case, recording, mode, compiler is not None)
-    if case.horizon in plan.rival_horizons and case.width in (None, WIDTH):
-        every = plan.rival_every
-        for soft, gauss_newton, name in (
-            (True, False, "ipopt"),
-            (False, False, "ipopt-hard"),
-            (False, True, "ipopt-hard-gauss-newton"),
-        ):
-            if case.oracle == "l2nw" or (case.oracle == "linear" and gauss_newton):
-                continue
-            yield partial(_ipopt, case, name, soft, gauss_newton, every)
-        if case.oracle == "dnn":
-            for qp in rivals.QP_SOLVERS:
-                yield partial(_sqpmethod, case, qp, every)
+            compiled = compiler is not None
+            yield Candidate("tandem", case, compiled, WholeTick(case, recording, mode, compiled))
+    if case.horizon in scope.rival_horizons:
+        for name, rival in _rivals(case):
+            yield Candidate(name, case, False, Other(case, rival), scope.rival_every, once=True)
 
 
-def _converged(case: Case, compiled: bool, realise: Realise) -> Candidate:
-    return Candidate("tandem", case, compiled, Converged(case, Solver(case.problem, realise=realise)))
-
-
-def _real_time(case: Case, compiled: bool, realise: Realise) -> Candidate:
-    return Candidate("tandem", case, compiled, RealTime(case, Solver(case.problem, realise=realise)))
-
-
-def _tick(case: Case, recording: Recording, mode: str, compiled: bool) -> Candidate:
-    return Candidate("tandem", case, compiled, WholeTick(case, recording, mode, compiled))
-
-
-def _ipopt(case: Case, name: str, soft: bool, gauss_newton: bool, every: int) -> Candidate:
-    rival = rivals.ipopt(case.problem, soft, gauss_newton)
-    return Candidate(name, case, False, Other(case, rival), every, once=True)
-
-
-def _sqpmethod(case: Case, qp: str, every: int) -> Candidate:
-    runs = Other(case, rivals.sqpmethod(case.problem, qp))
-    return Candidate(f"sqpmethod-{qp}", case, False, runs, every, once=True)
+def _rivals(case: Case) -> Iterator[tuple[str, Rival]]:
+    problem = case.problem
+    if case.oracle != "l2nw":
+        yield "ipopt", ipopt(problem, soft=True, gauss_newton=False)
+        yield "ipopt-hard", ipopt(problem, soft=False, gauss_newton=False)
+    if case.oracle == "dnn":
+        yield "ipopt-hard-gauss-newton", ipopt(problem, soft=False, gauss_newton=True)
+        for qp in QP_SOLVERS:
+            yield f"sqpmethod-{qp}", sqpmethod(problem, qp)
 
 
 def _as_it_is(function: ca.Function) -> ca.Function:
     return function
 
 
-def _run(plan: Plan, candidates: list[Candidate], progress: Progress) -> list[dict[str, _Taken]]:
+def _run(scope: Scope, candidates: list[Candidate], progress: Progress) -> list[dict[str, _Taken]]:
     taken: list[dict[str, _Taken]] = [defaultdict(_Taken) for _ in candidates]
     order = np.random.default_rng(SEED)
     garbage = GarbageCollection(every=1)
     garbage.begin()
-    for tick in range(plan.ticks):
-        progress("measuring", tick, plan.ticks)
-        for round_ in range(plan.rounds):
+    for tick in range(scope.ticks):
+        progress("measuring", tick, scope.ticks)
+        for round_ in range(scope.rounds):
             for index in order.permutation(len(candidates)):
                 candidate = candidates[index]
                 if tick % candidate.every or (candidate.once and round_):
@@ -252,7 +234,7 @@ def _run(plan: Plan, candidates: list[Candidate], progress: Progress) -> list[di
         for candidate in candidates:
             candidate.runs.keep()
         garbage.idle()
-    progress("measuring", plan.ticks, plan.ticks)
+    progress("measuring", scope.ticks, scope.ticks)
     return taken
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller_node.build import Realise, build_controller, build_oracle
+from controller_node.build import Realise, build_controller, build_model, build_oracle
 from lbmpc.controller.step import Observation
 from lbmpc.model import Model
 from lbmpc.plants import Truth
@@ -74,8 +74,9 @@ def configure(oracle: OracleName, horizon: int, width: int | None) -> Config:
 
 def record(ticks: int, realise: Realise | None = None) -> Recording:
     """Run the controller with an adapting network for so many ticks from the plant's x0."""
-    controller = build_controller(configure("dnn", RECORDED_HORIZON, RECORDED_WIDTH), realise)
-    model = controller.model
+    config = configure("dnn", RECORDED_HORIZON, RECORDED_WIDTH)
+    model = build_model(config)
+    controller, _ = build_controller(config, model, realise)
     plant, truth = model.plant, Truth(model.plant)
     state, x, applied = controller.initial_state(SEED), plant.x0 - plant.x_e, None
     made = Recording(model, [], [], [])

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from controller_node.codegen.fast_loops import quicken
+from controller_node.codegen.fast_loops import with_fast_loops
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ class CannotCompile(Exception):
 def _source(function: ca.Function) -> str:
     generator = ca.CodeGenerator("kernel.c", {"with_header": False})
     generator.add(function)
-    return quicken(generator.dump())
+    return with_fast_loops(generator.dump())
 
 
 def _version(command: str) -> str:

@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -34,10 +35,11 @@ from lbmpc.casadi_buffers import Bound
 from lbmpc.model import Model
 from lbmpc.oracles.base import remembered
 from lbmpc.sets.constraint_sets import state_set
-from lbmpc.solver.least_distance import NO_ROWS, least_distance, violation
+from lbmpc.solver.least_distance import NO_ROWS
 from lbmpc.solver.problem import Problem
 from lbmpc.solver.riccati import build_rows, build_sweep
 from lbmpc.solver.rows import Rows
+from lbmpc.solver.subproblem import Subproblem
 
 STEPS = 2
 """Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
@@ -51,8 +53,11 @@ STIFFNESS = 25.0
 """Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
 
 
-Plan = tuple[np.ndarray, np.ndarray]
-"""Inputs v, (N, m), and the states z_1 .. z_N that they lead to, (N, d)."""
+class Rollout(NamedTuple):
+    """Inputs v, (N, m), and the learned states z_1 .. z_N that they lead to, (N, d)."""
+
+    v: np.ndarray
+    z: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +91,9 @@ class BackupPlanner:
         model, oracle, n = problem.model, problem.oracle, problem.horizon
         self._margin = margin
         self._kept, self._plain = _rows(problem, margin), _rows(problem, 0.0)
-        self._sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
-        self._move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
+        sweep = Bound(realise(build_sweep(model, oracle, n, "learned")))
+        move = Bound(realise(build_rows(model, n, remembered(oracle), "learned")))
+        self._subproblem = Subproblem(sweep, move)
         self._gain = tracking_gain(model)
 
     def policy(self, s: np.ndarray, theta: np.ndarray, plan: np.ndarray) -> Policy | None:
@@ -108,26 +114,26 @@ class BackupPlanner:
             share, found = self._less(s, theta, kept) if self._is_in_the_way(s, kept) else (1.0, kept)
         return self._with_feedback(s, *found, share * self._margin)
 
-    def _is_in_the_way(self, s: np.ndarray, kept: Plan) -> bool:
+    def _is_in_the_way(self, s: np.ndarray, kept: Rollout) -> bool:
         return self._end(s, kept) >= NEARER and _touches(self._kept, *kept)
 
-    def _less(self, s: np.ndarray, theta: np.ndarray, kept: Plan) -> tuple[float, Plan]:
+    def _less(self, s: np.ndarray, theta: np.ndarray, kept: Rollout) -> tuple[float, Rollout]:
         """The share of the margin, and the plan, that leads back, or else what ends nearer, if anything does.
 
         Where a plan ends is taken for linear in the margin.
         """
-        free = self._best(self._plain, s, theta, kept[0], 1)
+        free = self._best(self._plain, s, theta, kept.v, 1)
         if free is None or (end := self._end(s, free)) >= NEARER * self._end(s, kept):
             return 1.0, kept
         if end >= NEARER:
             return 0.0, free
         share = (NEARER - end) / (self._end(s, kept) - end)
-        between = self._best(_between(self._plain, self._kept, share), s, theta, free[0], 1)
+        between = self._best(_between(self._plain, self._kept, share), s, theta, free.v, 1)
         return (0.0, free) if between is None else (share, between)
 
-    def _end(self, s: np.ndarray, plan: Plan) -> float:
+    def _end(self, s: np.ndarray, rollout: Rollout) -> float:
         """|z_N|_P of |z_0|_P."""
-        return self._distance(plan[1][-1]) / max(self._distance(s), np.finfo(float).tiny)
+        return self._distance(rollout.z[-1]) / max(self._distance(s), np.finfo(float).tiny)
 
     def _distance(self, s: np.ndarray) -> float:
         """|x|_P of a state, with its past or without."""
@@ -135,48 +141,28 @@ class BackupPlanner:
         x = s[: model.d]
         return float(np.sqrt(x @ model.P @ x))
 
-    def _best(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray, steps: int) -> Plan | None:
+    def _best(
+        self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray, steps: int
+    ) -> Rollout | None:
         """The best of what the steps from v, (N, m), pass; None when its numbers are unusable."""
         best, least = None, np.inf
-        v = rows.clip(v)
+        subproblem, v = self._subproblem, rows.clip(v)
+        subproblem.load(s, theta)
         for step in range(steps + 1):
-            merit = self._linearise(rows, s, theta, v)
+            cost, z = subproblem.linearise(v), subproblem.sweep.outputs["z"]
+            merit = cost + rows.price(rows.values(v.T, z))
             if not np.isfinite(merit):
                 break
             if merit < least:
-                best, least = (v, self._sweep.outputs["z"].T.copy()), merit
-            if step == steps or (target := self._subproblem(rows, v.shape)) is None:
+                best, least = Rollout(v, z.T.copy()), merit
+            values = subproblem.values(rows)
+            if step == steps or not np.isfinite(values).all():
                 break
-            v = target
+            target = subproblem.constrained(rows, values, NO_ROWS)
+            if target is None:
+                break
+            v = target.v
         return best
-
-    def _linearise(self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray) -> float:
-        """Linearise at v, (N, m); its cost, with the penalty of what leaves the rows."""
-        sweep = self._sweep
-        sweep.inputs["x"][:, 0] = s
-        sweep.inputs["theta"][:, 0] = theta
-        sweep.inputs["v"][:] = v.T
-        sweep()
-        values = rows.values(v.T, sweep.outputs["z"])
-        return float(sweep.outputs["cost"][0, 0]) + rows.penalty.cost(
-            violation(values, rows.lower, rows.upper)
-        )
-
-    def _subproblem(self, rows: Rows, shape: tuple[int, ...]) -> np.ndarray | None:
-        """The minimiser of the linearised problem, (N, m)."""
-        outputs = self._sweep.outputs
-        values = rows.values(outputs["vs"], outputs["zs"])
-        if not np.isfinite(values).all():
-            return None
-        for name in "ABKL":
-            self._move.inputs[name][:] = outputs[name]
-        self._move()
-        slopes = self._move.outputs["M"].T
-        nearest = least_distance(values, rows.apply(slopes), rows.lower, rows.upper, rows.penalty, NO_ROWS)
-        if nearest is None:
-            return None
-        free = outputs["vs"].T
-        return rows.clip(free + (slopes[: free.size] @ nearest.w).reshape(shape))
 
     def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray, margin: float) -> Policy:
         gain, d = self._gain, self.problem.model.d

@@ -30,16 +30,10 @@ def shift(plan: Plan, last: np.ndarray) -> Plan:
     return Plan(np.concatenate([plan.v[1:], last[None]]), max(plan.left - 1, 0))
 
 
-def feedback(model: Model, x: np.ndarray) -> np.ndarray:
-    """K x clipped to U, (m,)."""
-    plant = model.plant
-    return np.clip(model.K @ x, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
-
-
 def feedback_plan(model: Model, x: np.ndarray, horizon: int) -> np.ndarray:
-    """The clipped feedback along the nominal prediction from x, (N, m)."""
-    inputs = np.zeros((horizon, model.m))
+    """K x clipped to U, along the nominal prediction from x, (N, m)."""
+    plant, inputs = model.plant, np.zeros((horizon, model.m))
     for i in range(horizon):
-        inputs[i] = feedback(model, x)
+        inputs[i] = np.clip(model.K @ x, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
         x = model.A @ x + model.B @ inputs[i]
     return inputs

@@ -7,129 +7,24 @@ in, then the problem is solved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
 from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
-from lbmpc.model import Model, Pieces
-from lbmpc.oracles.base import OracleState, follow
-from lbmpc.oracles.dnn.oracle import DnnOracle
+from lbmpc.controller.signals import Label, Mode, Observation, StepResult
+from lbmpc.controller.state import ControllerState
+from lbmpc.model import Model
+from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.sets.guard import FirstInputs
 from lbmpc.solver.problem import Problem
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution
 
-Mode = Literal["solver", "shifted_plan", "feedback"]
 DELAY_GAIN = 0.2
 """Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
-
-
-@dataclass(frozen=True, eq=False)
-class HiddenSet:
-    """A trained set of hidden layers on offer."""
-
-    version: int
-    layers: list[np.ndarray]
-    sha256: str
-    """Of the layers."""
-    network_sha256: str
-    """Of the description that they were trained for."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """What a step may depend on. x (d,) and applied (m,) are deviations; None where there was none."""
-
-    x: np.ndarray | None
-    applied: np.ndarray | None
-    """Mean input over the period that ended with x."""
-    source: int
-    """Which incarnation of the plant sent x; labels never span two."""
-    sequence: int
-    """Its sample number; a label needs two consecutive ones."""
-    hidden: HiddenSet | None
-    pieces: Pieces = ()
-    """The inputs of that period where there were several, deviations."""
-
-
-@dataclass(frozen=True, eq=False)
-class ControllerState:
-    """All of the controller's memory. Flat, so that it can be frozen into a keyframe and thawed."""
-
-    plan: Plan
-    """Shifted solution: warm start of the next solve and fallback."""
-    pending_x: np.ndarray
-    """x_t whose label is still to come, (d,)."""
-    pending: tuple[int, int]
-    """Its (source, sequence); sequence -1 when none is pending."""
-    predicted: np.ndarray
-    """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
-    delay: float
-    """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
-    oracle: OracleState
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        return {
-            "plan.v": self.plan.v,
-            "plan.left": np.array([self.plan.left], dtype=np.int64),
-            "pending.x": self.pending_x,
-            "pending": np.array(self.pending, dtype=np.int64),
-            "predicted": self.predicted,
-            "delay": np.array([self.delay]),
-            **{f"oracle.{name}": array for name, array in self.oracle.items()},
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
-        """Raises KeyError when an array is missing."""
-        source, sequence = (int(value) for value in arrays["pending"])
-        prefix = "oracle."
-        oracle = {
-            name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
-        }
-        plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
-        return cls(
-            plan,
-            arrays["pending.x"],
-            (source, sequence),
-            arrays["predicted"],
-            float(arrays["delay"][0]),
-            oracle,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Label:
-    """One labelled sample: x_t, the input applied until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
-
-    x: np.ndarray
-    u: np.ndarray
-    h: np.ndarray
-    h_hat: np.ndarray
-    """The oracle's estimate before it learned this sample."""
-    past: np.ndarray
-    """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
-
-
-@dataclass(frozen=True, eq=False)
-class StepResult:
-    """What a step decided and found, in deviation coordinates. plan is (N, m) with plan[0] the input for now."""
-
-    plan: np.ndarray
-    mode: Mode
-    solution: Solution | None
-    label: Label | None
-    verdict: str
-    """About the hidden weights on offer: "none", "adopted", "refused: <reason>"."""
-    rolled_back: str
-    """Why the hidden weights and K from before came back; empty where they did not."""
-    delay: float
-    """Seconds for which the sample was predicted ahead, to when the command acts."""
-    first: FirstInputs | None
-    """What is certified of v_0; None where there are no certified sets, or no state."""
 
 
 class Solves(Protocol):
@@ -164,7 +59,7 @@ class Controller:
     """
 
     def __init__(self, problem: Problem, solver: Solves, real_time: bool = False):
-        self.problem, self.solver, self.real_time = problem, solver, real_time
+        self.problem, self._solver, self.real_time = problem, solver, real_time
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self.oracle = problem.oracle
@@ -186,7 +81,7 @@ class Controller:
         by itself, with the same numbers.
         """
         if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
-            self.solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+            self._solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
@@ -201,9 +96,11 @@ class Controller:
             seen = replace(seen, x=None)
         label, oracle = self._learn(state, seen)
         rolled_back = ""
-        if label is not None and isinstance(self.oracle, DnnOracle):
+        if label is not None:
             oracle, rolled_back = self.oracle.confirm(oracle)
-        oracle, verdict = self._adopt(oracle, seen.hidden)
+        verdict = Verdict("none")
+        if seen.hidden is not None:
+            oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
@@ -253,13 +150,6 @@ class Controller:
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
         return self.model.ahead(seen.x, acting, delay) + drift
 
-    def _adopt(self, oracle: OracleState, hidden: HiddenSet | None) -> tuple[OracleState, str]:
-        if hidden is None:
-            return oracle, "none"
-        if not isinstance(self.oracle, DnnOracle):
-            return oracle, f"refused: the oracle {self.oracle.name} has no hidden layers"
-        return self.oracle.adopt(oracle, hidden.version, hidden.layers, hidden.sha256, hidden.network_sha256)
-
     def _plan(
         self,
         state: ControllerState,
@@ -288,10 +178,10 @@ class Controller:
         s = self._with_past(oracle, x)
         if not self.real_time or state.plan.left == 0:
             # Without a plan to start from, one step is not enough.
-            return self.solver.solve(s, self.oracle.theta(oracle), state.plan.v, first=first)
+            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.v, first=first)
         self.prepare(state)
         self._prepared_for = None
-        return self.solver.feedback(s, first)
+        return self._solver.feedback(s, first)
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
@@ -318,12 +208,3 @@ def _begun_within(plan: Plan, first: Box | None) -> Plan:
     if first is None:
         return plan
     return Plan(np.vstack([np.clip(plan.v[:1], *first), plan.v[1:]]), plan.left)
-
-
-def same_memory(a: ControllerState, b: ControllerState) -> str | None:
-    """Name of the first array that differs between two states, bit for bit, or None."""
-    left, right = a.to_arrays(), b.to_arrays()
-    for name in sorted(left.keys() | right.keys()):
-        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
-            return name
-    return None

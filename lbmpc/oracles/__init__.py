@@ -1,8 +1,18 @@
 """Estimates of the unknown h behind one contract; their parameters are data."""
 
-from lbmpc.oracles.base import LinearOracle, Oracle, OracleState
+from lbmpc.oracles.base import HiddenSet, Oracle, OracleState, Verdict
 from lbmpc.oracles.dnn.oracle import DnnOracle
 from lbmpc.oracles.l2nw import L2nwOracle
+from lbmpc.oracles.linear import LinearOracle
 from lbmpc.oracles.perfect import PerfectOracle
 
-__all__ = ["DnnOracle", "L2nwOracle", "LinearOracle", "Oracle", "OracleState", "PerfectOracle"]
+__all__ = [
+    "DnnOracle",
+    "HiddenSet",
+    "L2nwOracle",
+    "LinearOracle",
+    "Oracle",
+    "OracleState",
+    "PerfectOracle",
+    "Verdict",
+]

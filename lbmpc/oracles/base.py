@@ -1,4 +1,4 @@
-"""The contract of an oracle, and the oracle that knows nothing.
+"""The contract of an oracle.
 
 An oracle is three things that the controller keeps apart:
 
@@ -17,50 +17,131 @@ a shift register, so that the prediction is Markov again. Without a look back s 
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from network_model.description import NetworkDescription
+
 OracleState = dict[str, np.ndarray]
+Realise = Callable[[ca.Function], ca.Function]
+"""Turns a CasADi function into the one that is called, a compiler for instance."""
 
 
-class Oracle(Protocol):
-    """h_hat(s, u; theta) for d states and m inputs, in deviation coordinates."""
+@dataclass(frozen=True, eq=False)
+class HiddenSet:
+    """A trained set of hidden layers on offer."""
+
+    version: int
+    layers: list[np.ndarray]
+    sha256: str
+    """Of the layers."""
+    network_sha256: str
+    """Of the description that they were trained for."""
+
+
+class Verdict(NamedTuple):
+    """What became of the hidden layers on offer."""
+
+    outcome: Literal["none", "adopted", "refused"]
+    """none: there were none."""
+    reason: str = ""
+    """Why they were refused."""
+
+
+class LearnedNetwork(NamedTuple):
+    """The network that an oracle's state stands for."""
+
+    hidden: list[np.ndarray]
+    """W_1..W_{L-1}, the bias of each as its first row."""
+    K: np.ndarray
+    """Output weights, (1 + n_L, d), scaled."""
+    version: int
+    """Of the hidden layers in use."""
+    newest: int
+    """The highest version that was ever adopted."""
+
+
+class Oracle(ABC):
+    """h_hat(s, u; theta) for d states and m inputs, in deviation coordinates.
+
+    The defaults below are those of an oracle that sees the present pair alone and has no hidden layers.
+    """
 
     name: str
     d: int
     m: int
     parameters: int
     """Length of theta."""
-    pairs: int
+    pairs: int = 1
     """k, the pairs (x, u) that it sees, 1 when only the present one; s has d + (k - 1) (d + m) entries, here D."""
+    description: NetworkDescription | None = None
+    """The network whose hidden layers a trainer may send; None: it has none."""
 
+    # -- expressions ---------------------------------------------------------------------------------------------
+
+    @abstractmethod
     def split(self, theta: ca.MX) -> list[ca.MX]:
         """theta as the matrices that the expressions use, so that a rollout unpacks it once and not at every stage."""
 
+    @abstractmethod
     def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
         """h_hat for n points (s, u) at once: (D + m, n) -> (d, n)."""
 
+    @abstractmethod
     def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
         """d h_hat / d(s, u) for n points (s, u) at once, (D + m, n): one matrix (d, D + m) for each point."""
 
-    def initial_state(self, rng: np.random.Generator) -> OracleState: ...
+    # -- state and learning --------------------------------------------------------------------------------------
+
+    def initial_state(self, rng: np.random.Generator) -> OracleState:
+        """The memory before the first sample."""
+        return {}
 
     def begin(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
         """The state when what came before x is not known: as if the plant had stood at x under the input u."""
+        return state
 
     def past(self, state: OracleState) -> np.ndarray:
         """The k - 1 pairs before the present one, (k - 1, d + m), oldest first."""
+        return np.zeros((0, self.d + self.m))
 
     def theta(self, state: OracleState) -> np.ndarray:
         """The parameters that this state stands for, (parameters,)."""
+        return np.zeros(0)
 
+    @abstractmethod
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """h_hat(x, u) of this state, with the past that it remembers, (d,)."""
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
         """The state after one labelled sample, (x, u) now in its past; the state given is left as it was."""
+        return state
+
+    # -- hidden layers of a trainer ------------------------------------------------------------------------------
+
+    def compile(self, realise: Realise) -> None:  # noqa: B027  (a default that does nothing)
+        """Let `realise` turn what every tick calls into something faster."""
+
+    def adopt(self, state: OracleState, offered: HiddenSet) -> tuple[OracleState, Verdict]:
+        """Swap in a set of hidden layers, or refuse it; a refusal leaves the network as it was."""
+        return state, Verdict("refused", f"the oracle {self.name} has no hidden layers")
+
+    def confirm(self, state: OracleState) -> tuple[OracleState, str]:
+        """After a sample was learned: whether the set that was adopted last holds what it promised.
+
+        Returns:
+            The state and "", or the state with the network from before, and a text that says why.
+        """
+        return state, ""
+
+    def network(self, state: OracleState) -> LearnedNetwork | None:
+        """The network of this state; None without one."""
+        return None
 
 
 def remembered(oracle: Oracle) -> int:
@@ -99,48 +180,3 @@ def function(oracle: Oracle) -> ca.Function:
     return ca.Function(
         "oracle", [s, u, theta], [oracle.value(su, parts), jacobian], ["s", "u", "theta"], ["h", "J"]
     )
-
-
-class Memoryless:
-    """What the contract asks for where h_hat depends on the present pair alone."""
-
-    d: int
-    m: int
-    pairs: int = 1
-
-    def begin(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
-        return state
-
-    def past(self, state: OracleState) -> np.ndarray:
-        return np.zeros((0, self.d + self.m))
-
-
-class LinearOracle(Memoryless):
-    """h_hat = 0: plain linear MPC. `pairs` > 1 stands in for an oracle with a past, which it disregards."""
-
-    name = "linear"
-    parameters = 0
-
-    def __init__(self, d: int, m: int, pairs: int = 1):
-        self.d, self.m, self.pairs = d, m, pairs
-
-    def split(self, theta: ca.MX) -> list[ca.MX]:
-        return []
-
-    def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        return ca.MX.zeros(self.d, su.shape[1])
-
-    def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        return by_point([ca.MX.zeros(self.d, su.shape[1]) for _ in range(su.shape[0])])
-
-    def initial_state(self, rng: np.random.Generator) -> OracleState:
-        return {}
-
-    def theta(self, state: OracleState) -> np.ndarray:
-        return np.zeros(0)
-
-    def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.zeros(self.d)
-
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
-        return state

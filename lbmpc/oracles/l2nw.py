@@ -11,10 +11,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from lbmpc.oracles.base import Memoryless, OracleState, by_point
+from lbmpc.oracles.base import Oracle, OracleState, by_point
 
 
-class L2nwOracle(Memoryless):
+class L2nwOracle(Oracle):
     """Kernel regression on some of the states and inputs.
 
     Args:

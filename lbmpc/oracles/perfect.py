@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.model import Model
-from lbmpc.oracles.base import Memoryless, OracleState
+from lbmpc.oracles.base import Oracle, OracleState
 from lbmpc.plants.base import dop853
 
 STEP_NORM = 0.4
@@ -23,7 +23,7 @@ LEAST = 1e-3
 """States that must stay positive are not let below this in the expression, or a wild plan would make it NaN."""
 
 
-class PerfectOracle(Memoryless):
+class PerfectOracle(Oracle):
     """h_hat = h, with nothing to learn."""
 
     name = "perfect"
@@ -42,17 +42,8 @@ class PerfectOracle(Memoryless):
     def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
         return ca.horzsplit(self._slopes.map(su.shape[1])(su), self.d + self.m)
 
-    def initial_state(self, rng: np.random.Generator) -> OracleState:
-        return {}
-
-    def theta(self, state: OracleState) -> np.ndarray:
-        return np.zeros(0)
-
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.array(self._value(np.concatenate([x, u])))[:, 0]
-
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
-        return state
 
 
 def _functions(model: Model) -> tuple[ca.Function, ca.Function]:

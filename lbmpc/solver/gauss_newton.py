@@ -15,13 +15,15 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.oracles.base import LinearOracle, Oracle, remembered
-from lbmpc.solver.least_distance import NO_ROWS, Nearest, Shown, least_distance, violation
+from lbmpc.oracles.base import Oracle, remembered
+from lbmpc.oracles.linear import LinearOracle
+from lbmpc.solver.least_distance import NO_ROWS, Shown
 from lbmpc.solver.nominal_rollout import build_nominal
 from lbmpc.solver.problem import Problem
 from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
 from lbmpc.solver.rows import Box, Rows
 from lbmpc.solver.solution import Solution, Status
+from lbmpc.solver.subproblem import Subproblem, Target, finite
 
 # Above the QP's own tolerance; what a hard row may be off by before a solution is refused.
 HARD_TOLERANCE = 1e-7
@@ -54,20 +56,6 @@ class Prepared:
     """The QP as it was solved at x; None where no row was violated there."""
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """Where one Gauss-Newton step leads."""
-
-    v: np.ndarray
-    """Inputs, (N, m)."""
-    values: np.ndarray
-    """Row values there, (rows,)."""
-    feasible: bool
-    """Whether the hard state rows can be met."""
-    seen: np.ndarray
-    """Rows that the QP was shown."""
-
-
 class Solver:
     """One problem, solved again and again from new states, parameters and references.
 
@@ -91,17 +79,18 @@ class Solver:
         self._rows = Rows(problem)
         self._behind = remembered(problem.oracle)
         self._move = Bound(realise(build_rows(problem.model, problem.horizon, self._behind)))
-        self._sweep = self._bind(problem.oracle)
+        self._learned = self._subproblem(problem.oracle)
         nominal = LinearOracle(problem.model.d, problem.model.m, problem.oracle.pairs)
-        self._nominal_sweep = self._sweep if problem.oracle.name == nominal.name else self._bind(nominal)
+        same = problem.oracle.name == nominal.name
+        self._nominal = self._learned if same else self._subproblem(nominal)
         self._follow = Bound(realise(build_nominal(problem)))
-        self._shape = (problem.horizon, problem.model.m)
         # Built at the first preparation: a controller that converges every tick does not need it.
         self._tangent: Bound | None = None
         self._prepared: Prepared | None = None
 
-    def _bind(self, oracle: Oracle) -> Bound:
-        return Bound(self._realise(build_sweep(self.problem.model, oracle, self.problem.horizon)))
+    def _subproblem(self, oracle: Oracle) -> Subproblem:
+        sweep = Bound(self._realise(build_sweep(self.problem.model, oracle, self.problem.horizon)))
+        return Subproblem(sweep, self._move)
 
     def solve(
         self,
@@ -128,10 +117,13 @@ class Solver:
         self._rows.bound_first(first)
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
-            solution = self._solve(self._sweep, x, oracle_parameters, warm_start, xr, ur)
-            if solution.usable or self._sweep is self._nominal_sweep:
+            start = self._rows.clip(_numbers(warm_start))
+            self._learned.load(x, oracle_parameters, xr, ur)
+            solution = self._solve(self._learned, x, start)
+            if solution.usable or self._learned is self._nominal:
                 return solution
-            nominal = self._solve(self._nominal_sweep, x, np.zeros(0), warm_start, xr, ur)
+            self._nominal.load(x, np.zeros(0), xr, ur)
+            nominal = self._solve(self._nominal, x, start)
             return replace(nominal, status=Status.ORACLE_REFUSED) if nominal.usable else nominal
 
     # -- real-time iteration --------------------------------------------------------------------------------
@@ -145,27 +137,25 @@ class Solver:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
         self._rows.bound_first(None)
-        tangent, rows = self._tangent, self._rows
+        rows = self._rows
         with np.errstate(all="ignore"):
             v, status = rows.clip(_numbers(warm_start)), Status.NUMERICAL
-            for sweep, theta, trusted in (
-                (self._sweep, oracle_parameters, Status.REAL_TIME),
-                (self._nominal_sweep, np.zeros(0), Status.ORACLE_REFUSED),
+            for subproblem, theta, trusted in (
+                (self._learned, oracle_parameters, Status.REAL_TIME),
+                (self._nominal, np.zeros(0), Status.ORACLE_REFUSED),
             ):
-                self._load(sweep, x, theta, None, None)
-                cost = self._linearise(sweep, v)
-                if isfinite(cost) and _finite(sweep.outputs["zs"]):
+                subproblem.load(x, theta)
+                cost = subproblem.linearise(v)
+                if isfinite(cost) and finite(subproblem.sweep.outputs["zs"]):
                     status = trusted
                     break
-            for name in "ABKL":
-                tangent.inputs[name][:] = sweep.outputs[name]
-            tangent()
-            slopes, follow = tangent.outputs["M"].T, tangent.outputs["Y"].T
-            values, all_slopes = rows.values(sweep.outputs["vs"], sweep.outputs["zs"]), rows.apply(slopes)
+            moved = subproblem.propagate(self._tangent)
+            slopes, follow = moved["M"].T, moved["Y"].T
+            values, all_slopes = subproblem.values(rows), rows.apply(slopes)
             guess = None
-            if status is not Status.NUMERICAL and not self._inside(values):
+            if status is not Status.NUMERICAL and not rows.kept(values):
                 # At the measured state mostly the same rows will matter.
-                guess, _feasible = self._nearest(values, all_slopes, NO_ROWS)
+                guess, _feasible = rows.nearest(values, all_slopes)
             self._prepared = Prepared(
                 np.array(x, dtype=float),
                 status,
@@ -173,7 +163,7 @@ class Solver:
                 values,
                 all_slopes,
                 rows.apply(follow),
-                sweep.outputs["vs"].T.copy(),
+                subproblem.free.copy(),
                 slopes[: v.size],
                 follow[: v.size],
                 guess.shown if guess is not None else None,
@@ -197,45 +187,38 @@ class Solver:
         rows.bound_first(first)
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow.dot(change)
-            v, status = ready.free + ready.follow_v.dot(change).reshape(self._shape), ready.status
-            if status is Status.NUMERICAL or not _finite(values):
+            v, status = ready.free + ready.follow_v.dot(change).reshape(ready.free.shape), ready.status
+            if status is Status.NUMERICAL or not finite(values):
                 return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
-            if not self._inside(values):
+            if not rows.kept(values):
                 shown, hint = ready.shown, NO_ROWS
                 if shown is not None and first is not None and (shown.seen < rows.m).any():
                     # It was set up with other bounds on v_0.
                     hint, shown = shown.seen, None
-                nearest, feasible = self._nearest(values, ready.slopes, hint, shown)
+                nearest, feasible = rows.nearest(values, ready.slopes, hint, shown)
                 if nearest is None:
                     return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 1)
-                v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(self._shape))
+                v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(ready.free.shape))
                 status = status if feasible else Status.INFEASIBLE
             return self._finish(status, x, v, ready.cost, 1)
 
-    # -- one Gauss-Newton step -------------------------------------------------------------------------------
+    # -- to convergence --------------------------------------------------------------------------------------
 
-    def _solve(
-        self,
-        sweep: Bound,
-        x: np.ndarray,
-        theta: np.ndarray,
-        warm_start: np.ndarray,
-        xr: np.ndarray | None,
-        ur: np.ndarray | None,
-    ) -> Solution:
-        self._load(sweep, x, theta, xr, ur)
-        v, merit = self._rows.clip(_numbers(warm_start)), np.inf
-        self._linearise(sweep, v)
-        status, values, seen = Status.ITERATION_LIMIT, self._nominal(x, v)["values"][:, 0].copy(), NO_ROWS
+    def _solve(self, subproblem: Subproblem, x: np.ndarray, v: np.ndarray) -> Solution:
+        """Step after step from inputs v, (N, m), inside their bounds, with what was loaded."""
+        merit = np.inf
+        subproblem.linearise(v)
+        status, values, seen = Status.ITERATION_LIMIT, self._rollout(x, v)["values"][:, 0].copy(), NO_ROWS
         iterations, size = 0, 0.0
         while iterations < self.max_iterations:
             iterations += 1
-            target = self._subproblem(sweep, seen)
+            target = self._target(subproblem, seen)
             if target is None:
                 break
             seen = target.seen
+            arrived = Status.CONVERGED if target.feasible else Status.INFEASIBLE
             if not target.feasible:
-                status = Status.INFEASIBLE
+                status = arrived
             step = target.v - v
             size, before = float(np.abs(step).max()), size
             rate = size / before if before > 0 else np.inf
@@ -243,89 +226,48 @@ class Solver:
                 size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
             ):
                 # What is left to go is not worth another linearisation. v is feasible already.
-                v, status = target.v, Status.CONVERGED if target.feasible else status
+                v, status = target.v, arrived
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
             trial, trial_values = target.v, target.values
-            trial_merit = self._merit(sweep, trial, trial_values)
+            trial_merit = self._merit(subproblem, trial, trial_values)
             if not np.isfinite(trial_merit):
                 break
-            if sweep is self._nominal_sweep:
+            if subproblem is self._nominal:
                 # The model is linear, and the step exact.
-                v, merit, status = trial, trial_merit, Status.CONVERGED if target.feasible else status
+                v, merit, status = trial, trial_merit, arrived
                 break
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and np.abs(step).max() >= self.tolerance:
                 # The rows are linear in v, so half a step has half the change.
                 step, halvings = 0.5 * step, halvings + 1
                 trial, trial_values = v + step, 0.5 * (values + trial_values)
-                trial_merit = self._merit(sweep, trial, trial_values)
+                trial_merit = self._merit(subproblem, trial, trial_values)
             if not trial_merit <= merit:
                 # No descent is left at this precision: v is as good as this linearisation can tell.
-                status = Status.CONVERGED if target.feasible else status
+                status = arrived
                 break
             v, values, merit = trial, trial_values, trial_merit
             if np.abs(step).max() < self.tolerance:
-                status = Status.CONVERGED if target.feasible else status
+                status = arrived
                 break
         return self._finish(status, x, v, merit, iterations)
 
-    @staticmethod
-    def _load(
-        sweep: Bound, x: np.ndarray, theta: np.ndarray, xr: np.ndarray | None, ur: np.ndarray | None
-    ) -> None:
-        sweep.inputs["x"][:, 0] = x
-        sweep.inputs["theta"][:, 0] = theta
-        sweep.inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
-        sweep.inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
-
-    @staticmethod
-    def _linearise(sweep: Bound, v: np.ndarray) -> float:
-        """Linearise at v, (N, m), and return its true cost, soft constraints left out."""
-        sweep.inputs["v"][:] = v.T
-        sweep()
-        return float(sweep.outputs["cost"][0, 0])
-
-    def _merit(self, sweep: Bound, v: np.ndarray, values: np.ndarray) -> float:
+    def _merit(self, subproblem: Subproblem, v: np.ndarray, values: np.ndarray) -> float:
         """Linearise at v, (N, m), with row values (rows,); its true cost, soft constraints included, or inf."""
-        cost = self._linearise(sweep, v)
-        total = cost + self._rows.penalty.cost(violation(values, self._rows.lower, self._rows.upper))
+        total = subproblem.linearise(v) + self._rows.price(values)
         return total if np.isfinite(total) else np.inf
 
-    def _subproblem(self, sweep: Bound, hint: np.ndarray) -> Target | None:
+    def _target(self, subproblem: Subproblem, hint: np.ndarray) -> Target | None:
         """The minimiser of the linearised problem; None when the numbers are unusable."""
-        rows, outputs = self._rows, sweep.outputs
-        free = outputs["vs"]
-        values = rows.values(free, outputs["zs"])
-        if not _finite(values):
+        values = subproblem.values(self._rows)
+        if not finite(values):
             return None
-        if self._inside(values):
-            return Target(free.T.copy(), values, True, hint)
-        for name in "ABKL":
-            self._move.inputs[name][:] = outputs[name]
-        self._move()
-        slopes = self._move.outputs["M"].T
-        nearest, feasible = self._nearest(values, rows.apply(slopes), hint)
-        if nearest is None:
-            return None
-        v = free.T + (slopes[: free.size] @ nearest.w).reshape(self._shape)
-        return Target(rows.clip(v), nearest.values, feasible, nearest.shown.seen)
+        if self._rows.kept(values):
+            return Target(subproblem.free.copy(), values, True, hint)
+        return subproblem.constrained(self._rows, values, hint)
 
-    def _nearest(
-        self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray, ready: Shown | None = None
-    ) -> tuple[Nearest | None, bool]:
-        """The w nearest to 0 that the rows allow, softly where they are soft or contradict each other."""
-        rows, soft = self._rows, self.problem.soft
-        first = rows.penalty if soft else None
-        nearest = least_distance(values, slopes, rows.lower, rows.upper, first, hint, ready)
-        if nearest is not None or soft:
-            return nearest, True
-        return least_distance(values, slopes, rows.lower, rows.upper, rows.penalty, hint), False
-
-    def _inside(self, values: np.ndarray) -> bool:
-        return bool(((values <= self._rows.upper) & (values >= self._rows.lower)).all())
-
-    def _nominal(self, x: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    def _rollout(self, x: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """What `lbmpc.solver.nominal_rollout` says of inputs v, (N, m), from x or s; valid until the next call."""
         inputs, rows = self._follow.inputs, self._rows
         inputs["x"][:, 0], inputs["v"][:] = x[: self.problem.model.d], v.T
@@ -336,7 +278,7 @@ class Solver:
     def _finish(
         self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int
     ) -> Solution:
-        found = self._nominal(x, v)
+        found = self._rollout(x, v)
         slack, slack_row = self._rows.slack(found["outside"][:, 0])
         hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > HARD_TOLERANCE
         if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
@@ -346,10 +288,4 @@ class Solver:
 
 def _numbers(v: np.ndarray) -> np.ndarray:
     """`v` with a number in the place of what is none; to look first takes a tenth of the time."""
-    return v if _finite(v) else np.nan_to_num(v)
-
-
-def _finite(values: np.ndarray) -> bool:
-    """Whether all are numbers, none of them beyond 1e150; then, and only then, their sum of squares is one."""
-    flat = values.ravel(order="K")
-    return isfinite(flat.dot(flat))
+    return v if finite(v) else np.nan_to_num(v)

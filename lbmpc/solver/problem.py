@@ -47,10 +47,6 @@ class Problem:
     guard: Guard | None = None
     """Bounds v_0 by a certified family of sets; None: nothing is certified."""
 
-    @property
-    def X(self) -> Polytope:
-        return state_set(self.model)
-
 
 def build_problem(
     model: Model,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbmpc.solver.least_distance import Penalty
+from lbmpc.solver.least_distance import NO_ROWS, Nearest, Penalty, Shown, least_distance, violation
 from lbmpc.solver.problem import Problem
 
 Box = tuple[np.ndarray, np.ndarray]
@@ -12,11 +12,11 @@ Box = tuple[np.ndarray, np.ndarray]
 
 
 class Rows:
-    """The rows' bounds, their values, their slopes, and what their violation costs."""
+    """The rows' bounds, their values, their slopes, what their violation costs, and the step that they allow."""
 
     def __init__(self, problem: Problem):
         n, m, d = problem.horizon, problem.model.m, problem.model.d
-        self.n, self.m, self.d = n, m, d
+        self.n, self.m, self.d, self.soft = n, m, d, problem.soft
         if not all(part.is_box for part in problem.inputs):
             raise ValueError("input constraints must be boxes: they are kept by clipping, exactly")
         self.input_rows = problem.inputs[0].F
@@ -73,6 +73,28 @@ class Rows:
         k = many.shape[1]
         last = self.terminal_rows @ many[len(y) - self.d :]
         return np.concatenate([inputs.reshape(-1, k), states.reshape(-1, k), last]).reshape(-1, *y.shape[1:])
+
+    def kept(self, values: np.ndarray) -> bool:
+        """Whether values (rows,) are inside their bounds."""
+        return bool(((values <= self.upper) & (values >= self.lower)).all())
+
+    def price(self, values: np.ndarray) -> float:
+        """What it costs that values (rows,) are outside their bounds, were every state row soft."""
+        return self.penalty.cost(violation(values, self.lower, self.upper))
+
+    def nearest(
+        self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray = NO_ROWS, ready: Shown | None = None
+    ) -> tuple[Nearest | None, bool]:
+        """The w nearest to 0 that the rows allow, and whether the hard state rows can be met.
+
+        Softly where state rows are soft or contradict each other; None where the numbers are unusable. Arguments as for
+        `least_distance`.
+        """
+        first = self.penalty if self.soft else None
+        nearest = least_distance(values, slopes, self.lower, self.upper, first, hint, ready)
+        if nearest is not None or self.soft:
+            return nearest, True
+        return least_distance(values, slopes, self.lower, self.upper, self.penalty, hint), False
 
     def slack(self, outside: np.ndarray) -> tuple[float, str]:
         """The largest violation of a state row and the row's name, from all rows' violations, (rows,)."""

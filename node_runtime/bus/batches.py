@@ -8,59 +8,30 @@ from typing import NamedTuple
 
 from node_runtime.bus.mailbox import Delivery, Mailbox
 from node_runtime.realtime import clock
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
-from protocol.topics import Topic
 
 BATCH_TOPICS = {topic.name for topic in topics.BATCH.values()}
 
 
-class Gathered(NamedTuple):
+class Waiting(NamedTuple):
     """A message that waits for others."""
 
     topic: str
     published_ns: int
+    """On the monotonic clock."""
     payload: bytes
 
 
-class Gathering:
-    """What one process has published and not sent yet, in order. The caller keeps threads apart."""
-
-    def __init__(self, run_id: str):
-        self._run_id = run_id
-        self._waiting: list[Gathered] = []
-        self._size = 0
-        self._seq = 0
-
-    def add(self, topic: Topic, payload: bytes, now_ns: int) -> bool:
-        """Let a message wait, published at `now_ns` on the monotonic clock; whether it is time to send them all."""
-        self._waiting.append(Gathered(topic.name, now_ns, payload))
-        self._size += len(payload)
-        waited = now_ns - self._waiting[0].published_ns
-        return waited >= topics.GATHER_S * 1e9 or self._size > topics.BATCH_BYTES
-
-    def take(self) -> tuple[list[Gathered], int]:
-        """All that waits, and its bytes; nothing waits afterwards."""
-        taken = self._waiting, self._size
-        self._waiting, self._size = [], 0
-        return taken
-
-    def encode(self, gathered: list[Gathered]) -> bytes:
-        """The `Batch` of these messages, sent now."""
-        now_ns = clock.now_ns()
-        parts = [m.Gathered(topic, max(0, now_ns - at), payload) for topic, at, payload in gathered]
-        batch = m.Batch(run_id=self._run_id, seq=self._seq, messages=parts)
-        self._seq += 1
-        return codec.encode(batch)
+def encode_batch(run_id: str, seq: int, waiting: list[Waiting]) -> bytes:
+    """The `Batch` of these messages, sent now."""
+    now_ns = clock.now_ns()
+    parts = [m.Gathered(topic, max(0, now_ns - at), payload) for topic, at, payload in waiting]
+    return codec.encode(m.Batch(run_id=run_id, seq=seq, messages=parts))
 
 
-def size_of(gathered: list[Gathered]) -> int:
-    """Bytes of these messages."""
-    return sum(len(one.payload) for one in gathered)
-
-
-def separate(delivery: Delivery, bad: BadMessages) -> Iterator[Delivery]:
+def unbatch(delivery: Delivery, bad: RejectedMessages) -> Iterator[Delivery]:
     """The messages of a batch as if each had travelled alone, or the delivery itself when it is none.
 
     Each arrived, as it were, as long before the batch as it was published before the batch was sent. A batch that
@@ -82,25 +53,25 @@ def separate(delivery: Delivery, bad: BadMessages) -> Iterator[Delivery]:
         yield Delivery(prefix + one.topic, one.payload, delivery.received_ns - one.ago_ns)
 
 
-class Separating(Mailbox):
+class UnbatchingMailbox(Mailbox):
     """A mailbox that takes batches in and gives out what is in them; its capacity counts batches."""
 
-    def __init__(self, name: str, capacity: int, bad: BadMessages):
+    def __init__(self, name: str, capacity: int, bad: RejectedMessages):
         """`bad`: where batches that cannot be read are counted."""
         super().__init__(name, capacity)
         self._bad = bad
-        self._separated: deque[Delivery] = deque()
+        self._unbatched: deque[Delivery] = deque()
 
     def get(self, timeout_s: float = 0.0) -> Delivery | None:
         """The oldest message, waiting up to `timeout_s` for one; None when there is none. One thread only."""
-        if not self._separated:
+        if not self._unbatched:
             delivery = super().get(timeout_s)
             if delivery is not None:
-                self._separated.extend(separate(delivery, self._bad))
-        return self._separated.popleft() if self._separated else None
+                self._unbatched.extend(unbatch(delivery, self._bad))
+        return self._unbatched.popleft() if self._unbatched else None
 
     def drain(self) -> list[Delivery]:
         """Everything that is here, oldest first. One thread only."""
-        before = list(self._separated)
-        self._separated.clear()
-        return before + [one for delivery in super().drain() for one in separate(delivery, self._bad)]
+        before = list(self._unbatched)
+        self._unbatched.clear()
+        return before + [one for delivery in super().drain() for one in unbatch(delivery, self._bad)]

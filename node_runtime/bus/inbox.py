@@ -10,14 +10,11 @@ from typing import Generic, Literal, TypeVar, cast
 from node_runtime.bus.mailbox import Delivery, Mailbox
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.realtime import clock
-from node_runtime.rejected import BadMessages
 from protocol import codec
 from protocol.messages import Message
 from protocol.topics import Topic
 
 log = logging.getLogger(__name__)
-
-__all__ = ["AgeEstimate", "BadMessages", "Follower", "Inbox", "Received"]
 
 M = TypeVar("M", bound=Message)
 FollowVerdict = Literal["ok", "out of order", "foreign"]

@@ -19,7 +19,7 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 
 if TYPE_CHECKING:
-    from node_runtime.tls.client import Door
+    from node_runtime.tls.client import TlsClient
 
 log = logging.getLogger(__name__)
 
@@ -128,30 +128,30 @@ def connect(
         ConfigError: the endpoint is none; our certificate cannot be used; or the router and we refuse each other,
             which no waiting heals. The text says why.
     """
-    door = None
+    tls = None
     if secure(config.bus.endpoint):
         # Only here, for a machine that needs no certificates loads nothing for them.
-        from node_runtime.tls.client import Door
+        from node_runtime.tls.client import TlsClient
 
-        door = Door(config, process)
+        tls = TlsClient(config, process)
     with ExitStack() as undo:
         opened = []
         for _ in range(sessions):
-            opened.append(_connect(config, stop, process, door))
+            opened.append(_connect(config, stop, process, tls))
             undo.callback(opened[-1].close)
         undo.pop_all()
-    if door is not None:
-        door.watch(stop)
+    if tls is not None:
+        tls.watch(stop)
     return tuple(opened)
 
 
-def _connect(config: Config, stop: threading.Event, process: str, door: Door | None) -> zenoh.Session:
+def _connect(config: Config, stop: threading.Event, process: str, tls: TlsClient | None) -> zenoh.Session:
     """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
     endpoint = config.bus.endpoint
     more: Mapping[str, Any] = {"transport/unicast/open_timeout": OPEN_MS} if process in OBEYING else {}
-    if door is not None:
+    if tls is not None:
         # A handshake with certificates takes its time.
-        more = door.settings
+        more = tls.settings
     client = session_config("client", endpoint, lease_ms(config, process), more=more)
     result: Future[zenoh.Session] = Future()
 
@@ -168,7 +168,7 @@ def _connect(config: Config, stop: threading.Event, process: str, door: Door | N
         if stop.is_set():
             result.add_done_callback(_discard)
             raise OpenInterrupted(f"stopped while waiting for the router at {endpoint}")
-        if door is not None and (reason := door.refused(clock.now() - started)) is not None:
+        if tls is not None and (reason := tls.refused(clock.now() - started)) is not None:
             result.add_done_callback(_discard)
             raise ConfigError(f"no link to the router at {endpoint}: {reason}")
         if not told and clock.now() - started > 2.0:

@@ -7,7 +7,6 @@ the paper leaves out.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,18 +15,10 @@ import msgspec
 import tomli_w
 
 from network_model.description import LAYERS, Width
-from network_model.operations import BOUNDED, Activation, get_architecture
-from node_runtime.config.literals import (
-    AdoptionName,
-    AwakeMode,
-    CompileMode,
-    OracleName,
-    SolverMode,
-    StartName,
-    Strategy,
-    TighteningName,
-)
-from node_runtime.config.strict import ConfigError, Fail, apply_override, convert, failing, load_tree
+from network_model.operations import BOUNDED, Activation
+from network_model.registry import get_architecture
+from node_runtime.config import literals, strict
+from node_runtime.config.strict import ConfigError, Fail
 from protocol.codec import first_non_finite
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -57,9 +48,9 @@ class PlantConfig(Section, frozen=True):
 
 
 class SolverConfig(Section, frozen=True):
-    mode: SolverMode = "converged"
+    mode: literals.SolverMode = "converged"
     """"converged" solves every tick to its tolerance; "real_time" takes one prepared Gauss-Newton step."""
-    compile: CompileMode = "auto"
+    compile: literals.CompileMode = "auto"
     """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
     max_iterations: PositiveInt = 10
     tolerance: Positive = 1e-6
@@ -79,8 +70,8 @@ class BackupConfig(Section, frozen=True):
 
 class ControllerConfig(Section, frozen=True):
     horizon: PositiveInt = 60
-    oracle: OracleName = "dnn"
-    tightening: TighteningName = "first_step"
+    oracle: literals.OracleName = "dnn"
+    tightening: literals.TighteningName = "first_step"
     sets: str | None = None
     """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
     W: list[NonNegative] | None = None
@@ -128,7 +119,7 @@ class RefitConfig(Section, frozen=True):
 
 
 class TrialConfig(Section, frozen=True):
-    """Of new hidden weights, before they are adopted and for a while after (docs/decisions/0020)."""
+    """Of new hidden weights, before they are adopted and for a while after."""
 
     enabled: bool = True
     seconds: Positive = 4.0
@@ -154,9 +145,9 @@ class AdaptationConfig(Section, frozen=True):
     """Bound on the norm of each column of K, as h per second of period."""
     initial_scale: NonNegative = 6e-3
     """Standard deviation of the entries of K_0, as h per second of period."""
-    start: StartName = "random"
+    start: literals.StartName = "random"
     """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
-    at_adoption: AdoptionName = "keep"
+    at_adoption: literals.AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
     refit: RefitConfig = RefitConfig()
     trial: TrialConfig = TrialConfig()
@@ -186,7 +177,7 @@ class TrainerConfig(Section, frozen=True):
     """False: hidden layers are never trained (last layer only)."""
     capacity: PositiveInt = 2000
     """p_max of the replay buffer."""
-    strategy: Strategy = "fifo"
+    strategy: literals.Strategy = "fifo"
     train_every: PositiveInt = 10
     """New samples between two trainings."""
     min_samples: PositiveInt = 20
@@ -231,7 +222,7 @@ class LogConfig(Section, frozen=True):
 class RealtimeConfig(Section, frozen=True):
     priority: Annotated[int, msgspec.Meta(ge=0, le=99)] = 50
     """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
-    awake: AwakeMode = "auto"
+    awake: literals.AwakeMode = "auto"
     """Keep the cores from sleeping between slots; "auto": where there is a priority and the period is below 10 ms."""
     cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0)]] = "auto"
     """Core of the controller's loop and core of the plant's; "auto": two of their own where `awake` would be needed."""
@@ -278,9 +269,19 @@ def load(path: str | Path | None = None, overrides: list[str] | None = None) -> 
     Raises:
         ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
     """
-    tree = load_tree(path)
-    origins = {apply_override(tree, text): f"--set {text}" for text in overrides or []}
-    return from_tree(tree, str(path) if path is not None else "configuration", origins)
+    return _overridden(
+        strict.load_tree(path), overrides or [], str(path) if path is not None else "configuration"
+    )
+
+
+def override(config: Config, assignments: list[str]) -> Config:
+    """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
+    return _overridden(to_tree(config), assignments, "configuration")
+
+
+def _overridden(tree: dict[str, Any], assignments: list[str], where: str) -> Config:
+    origins = {strict.apply_override(tree, text): f"--set {text}" for text in assignments}
+    return from_tree(tree, where, origins)
 
 
 def from_tree(
@@ -291,8 +292,8 @@ def from_tree(
     where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
     """
 
-    fail = failing(where, origins)
-    config = convert(tree, Config, fail)
+    fail = strict.failing(where, origins)
+    config = strict.convert(tree, Config, fail)
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
@@ -323,12 +324,9 @@ def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
         fail("network.architecture", f"network.architecture: {error}")
     for key in network.options:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known) or 'none'}"
-            fail(
-                f"network.options.{key}",
-                f"network.options.{key}: {network.architecture} has no such option; {hint}",
-            )
+            hint = strict.did_you_mean(key, known, f"it has {', '.join(known) or 'none'}")
+            option = f"network.options.{key}"
+            fail(option, f"{option}: {network.architecture} has no such option; {hint}")
 
 
 def from_json(text: str) -> Config:
@@ -356,20 +354,7 @@ def to_toml(config: Config) -> str:
     return tomli_w.dumps(_without_none(to_tree(config)))
 
 
-def override(config: Config, assignments: list[str]) -> Config:
-    """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
-    tree = to_tree(config)
-    origins = {apply_override(tree, text): f"--set {text}" for text in assignments}
-    return from_tree(tree, "configuration", origins)
-
-
-def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: _without_none(value)
-        if isinstance(value, dict)
-        else [_without_none(item) if isinstance(item, dict) else item for item in value]
-        if isinstance(value, list)
-        else value
-        for key, value in tree.items()
-        if value is not None
-    }
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(below) for key, below in value.items() if below is not None}
+    return [_without_none(item) for item in value] if isinstance(value, list) else value

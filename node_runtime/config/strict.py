@@ -1,22 +1,29 @@
-"""A file's tables as typed Structs, strictly: what does not fit is named, with its place and the nearest right key."""
+"""A file's tables as typed Structs, strictly: what does not fit is said in a person's words.
+
+msgspec says "Expected `int` >= 1 - at `$.trainer.batch`"; a person wants the key, what was given, where, and what
+would be right.
+"""
 
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import msgspec
-import msgspec.inspect
-
-from node_runtime.config import wording
+from msgspec import inspect
 
 Fail = Callable[[str, str], NoReturn]
 """(key, text): raises `ConfigError`."""
 T = TypeVar("T", bound=msgspec.Struct)
+
+_PLACE = re.compile(r"^(?P<text>.*) - at `\$\.?(?P<key>.*)`$", re.DOTALL)
+_ABSENT = re.compile(r"missing required field `(\w+)`")
+_STEP = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
 
 
 class ConfigError(ValueError):
@@ -63,10 +70,10 @@ def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
 
     where: the file, for messages.
     """
-    return convert(tree, kind, failing(where, None))
+    return convert(tree, kind, failing(where))
 
 
-def failing(where: str, origins: Mapping[str, str] | None) -> Fail:
+def failing(where: str, origins: Mapping[str, str] | None = None) -> Fail:
     """What names the place of a mistake: the file, or for a key that came from elsewhere (`trainer.batch`) that."""
 
     def fail(key: str, text: str) -> NoReturn:
@@ -83,34 +90,106 @@ def convert(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
     try:
         return msgspec.convert(tree, kind)
     except msgspec.ValidationError as error:
-        key, text = wording.explain(str(error), tree, kind)
-        fail(key, text)
+        fail(*_explain(str(error), tree, kind))
+
+
+def did_you_mean(given: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
+    """A hint for a misspelt name: the nearest that is known, after `prefix`, or what is said otherwise."""
+    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
+    return f"did you mean {prefix + near[0]!r}?" if near else otherwise
 
 
 @cache
-def _type_info(kind: type) -> msgspec.inspect.Type:
-    return msgspec.inspect.type_info(kind)
+def _type_info(kind: type) -> inspect.Type:
+    return inspect.type_info(kind)
 
 
-def _reject_unknown(value: Any, kind: msgspec.inspect.Type, fail: Fail, path: str) -> None:
+def _reject_unknown(value: Any, kind: inspect.Type, fail: Fail, path: str) -> None:
     """msgspec would reject unknown keys too, but cannot say which key was meant."""
-    match wording.without_none(kind), value:
-        case msgspec.inspect.StructType(fields=known), dict():
-            fields = {field.name: field.type for field in known}
+    within = f"{path}." if path else ""
+    match _without_none(kind), value:
+        case inspect.StructType(fields=fields), dict():
+            known = {field.name: field.type for field in fields}
             for key, below in value.items():
-                full = f"{path}.{key}" if path else key
-                if key not in fields:
-                    near = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
-                    hint = (
-                        f"did you mean {(path + '.' if path else '') + near[0]!r}?"
-                        if near
-                        else f"known: {', '.join(fields)}"
-                    )
-                    fail(full, f"unknown key {full!r}; {hint}")
-                _reject_unknown(below, fields[key], fail, full)
-        case msgspec.inspect.ListType(item_type=item), list():
+                if key not in known:
+                    hint = did_you_mean(key, known, f"known: {', '.join(known)}", within)
+                    fail(within + key, f"unknown key {within + key!r}; {hint}")
+                _reject_unknown(below, known[key], fail, within + key)
+        case inspect.ListType(item_type=item), list():
             for i, below in enumerate(value):
                 _reject_unknown(below, item, fail, f"{path}[{i}]")
-        case msgspec.inspect.DictType(value_type=item), dict():
+        case inspect.DictType(value_type=item), dict():
             for key, below in value.items():
-                _reject_unknown(below, item, fail, f"{path}.{key}")
+                _reject_unknown(below, item, fail, within + key)
+
+
+def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
+    """The key at fault and a message for it.
+
+    text: of a `msgspec.ValidationError` raised while `tree` was converted to the Struct `kind`.
+    """
+    found = _PLACE.match(text)
+    if not found or not found["key"]:
+        return "", text
+    key = found["key"]
+    value: Any = tree
+    wanted = _type_info(kind)
+    for index, name in _STEP.findall(key):
+        match wanted, value:
+            case inspect.StructType(fields=fields), dict() if name:
+                wanted = next(field.type for field in fields if field.name == name)
+                value = value[name]
+            case inspect.ListType(item_type=item), list() if index:
+                wanted, value = item, value[int(index)]
+            case _:  # a place that these types do not have: msgspec's own words are all there is
+                return key, f"{key}: {found['text']}"
+        wanted = _without_none(wanted)
+    given = f"{key} = {_shown(value)}"
+    if isinstance(wanted, inspect.LiteralType):
+        choices = [str(choice) for choice in wanted.values]
+        hint = did_you_mean(str(value), choices, "")
+        return key, f"{given} is not one of {', '.join(choices)}{hint and f'; {hint}'}"
+    if absent := _ABSENT.search(found["text"]):
+        return f"{key}.{absent[1]}", f"{key}.{absent[1]} is missing"
+    if isinstance(wanted, inspect.StructType):
+        return key, f"{given} is a table: write [{key}] and its keys below"
+    return key, f"{given} is not {_allowed(wanted)}"
+
+
+def _allowed(kind: inspect.Type) -> str:
+    """What a value of this type may be: "an integer of at least 1 and at most 99"."""
+    match kind:
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.IntType():
+            return "an integer" + _range(kind)
+        case inspect.FloatType():
+            return "a number" + _range(kind)
+        case inspect.StrType():
+            return "a string" + (f" matching {kind.pattern}" if kind.pattern else "")
+        case inspect.StructType():
+            return f"a table with {', '.join(field.name for field in kind.fields)}"
+        case inspect.ListType():
+            return f"a list, each entry {_allowed(_without_none(kind.item_type))}"
+    return f"a {type(kind).__name__.removesuffix('Type').lower()}"
+
+
+def _range(kind: inspect.IntType | inspect.FloatType) -> str:
+    bounds = ("above", kind.gt), ("of at least", kind.ge), ("below", kind.lt), ("at most", kind.le)
+    said = " and ".join(f"{words} {limit}" for words, limit in bounds if limit is not None)
+    return said and f" {said}"
+
+
+def _without_none(kind: inspect.Type) -> inspect.Type:
+    """The type proper of `T | None`."""
+    if isinstance(kind, inspect.UnionType):
+        rest = [option for option in kind.types if not isinstance(option, inspect.NoneType)]
+        if len(rest) == 1:
+            return rest[0]
+    return kind
+
+
+def _shown(value: object) -> str:
+    plain = isinstance(value, str | float)
+    text = repr(value) if plain else msgspec.json.encode(value, enc_hook=str).decode()
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -104,7 +104,7 @@ def on_core(core: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def said_of(core: int | None) -> str:
+def core_note(core: int | None) -> str:
     """For `Health.note`."""
     return "" if core is None else f"its loop stays on core {core}"
 
@@ -122,11 +122,16 @@ def punctual(priority: int, *, keep_awake: bool = False, silent: bool = False) -
         silent: no warning; for a process beside others that warn.
     """
     before = (os.sched_getscheduler(0), os.sched_getparam(0))
+    collecting = gc.isenabled()
     note = _raise_priority(priority, silent)
-    with awake(keep_awake) as sleepy, one_blas_thread(), quick_handover(), collection_as_before():
+    with awake(keep_awake) as sleepy, one_blas_thread(), quick_handover():
         try:
             yield "; ".join(filter(None, (note, sleepy)))
         finally:
+            # What a `GarbageCollection` inside has set.
+            gc.unfreeze()
+            if collecting:
+                gc.enable()
             if priority and not note:
                 os.sched_setscheduler(0, *before)
 
@@ -145,18 +150,6 @@ def _raise_priority(priority: int, silent: bool) -> str:
         )
         return note
     return ""
-
-
-@contextmanager
-def collection_as_before() -> Iterator[None]:
-    """Undoes, at its end, what a `GarbageCollection` inside it has set."""
-    collecting = gc.isenabled()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        if collecting:
-            gc.enable()
 
 
 class GarbageCollection:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
-from node_runtime.bus.zenoh_bus import LARGEST_QUESTION
 from node_runtime.tls.credentials import Credentials
 from protocol import topics
 from protocol.rights import ROLES, common_name, rights_of
@@ -24,32 +23,27 @@ MESSAGES = [
 ]
 
 
-def client_settings(credentials: Credentials) -> dict[str, Any]:
+def client_settings(own: Credentials) -> dict[str, Any]:
     """For a session that connects by `tls/` or `quic/`."""
+    return {"transport/link/tls": _link("connect", own) | {"verify_name_on_connect": True}}
+
+
+def router_settings(own: Credentials, plant: str) -> dict[str, Any]:
+    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
     return {
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.authority),
-            "enable_mtls": True,
-            "connect_private_key": str(credentials.key),
-            "connect_certificate": str(credentials.certificate),
-            "verify_name_on_connect": True,
-            "close_link_on_expiration": True,
-        }
+        "transport/link/tls": _link("listen", own),
+        "access_control": access_control(plant),
+        "low_pass_filter": size_limits(plant),
     }
 
 
-def router_settings(credentials: Credentials, plant: str) -> dict[str, Any]:
-    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
+def _link(way: Literal["connect", "listen"], own: Credentials) -> dict[str, Any]:
     return {
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.authority),
-            "enable_mtls": True,
-            "listen_private_key": str(credentials.key),
-            "listen_certificate": str(credentials.certificate),
-            "close_link_on_expiration": True,
-        },
-        "access_control": access_control(plant),
-        "low_pass_filter": size_limits(plant),
+        "root_ca_certificate": str(own.authority),
+        "enable_mtls": True,
+        f"{way}_private_key": str(own.key),
+        f"{way}_certificate": str(own.certificate),
+        "close_link_on_expiration": True,
     }
 
 
@@ -58,12 +52,14 @@ def access_control(plant: str) -> dict[str, Any]:
 
     Default deny. "ingress" is what the router receives from the holder of a certificate, "egress" what it sends it.
     """
-    rules = [_rule("plain", MESSAGES, ["ingress", "egress"], ["**", f"{topics.PREFIX}/*/{topics.DIRECT}/**"])]
+    rules = [
+        _rule("plain", MESSAGES, ["ingress", "egress"], ["**", topics.below("*", f"{topics.DIRECT}/**")])
+    ]
     subjects: list[dict[str, Any]] = [{"id": "plain", "link_protocols": PLAIN}]
     policies = [{"rules": ["plain"], "subjects": ["plain"]}]
     # Who listens where: without it a publisher believes that nobody does, and sends nothing.
-    below = [topics.everything(plant), f"{topics.PREFIX}/{plant}/{topics.DIRECT}/**"]
-    rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], below))
+    all_keys = [topics.everything(plant), topics.below(plant, f"{topics.DIRECT}/**")]
+    rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], all_keys))
     for role in ROLES:
         rights = rights_of(role)
         own = [
@@ -95,15 +91,11 @@ def size_limits(plant: str) -> list[dict[str, Any]]:
     """What comes in by a certificate is no larger than its topic allows, already at the router."""
     limits: dict[int, list[str]] = {}
     for topic in topics.ALL:
-        keys = limits.setdefault(topic.max_bytes, [])
-        keys.append(topic.key(plant))
-        if topic.gathered and topic.lane == "control":
-            keys.append(topic.direct_key(plant))
+        limits.setdefault(topic.max_bytes, []).extend(topic.keys(plant))
     filters = [_limit(f"up to {size}", ["put"], keys, size) for size, keys in limits.items()]
-    below = [topics.everything(plant)]
-    largest = max(topic.max_bytes for topic in topics.ALL)
-    filters.append(_limit("questions", ["query"], below, LARGEST_QUESTION))
-    filters.append(_limit("answers", ["reply"], below, largest))
+    all_keys = [topics.everything(plant)]
+    filters.append(_limit("questions", ["query"], all_keys, topics.LARGEST_QUESTION))
+    filters.append(_limit("answers", ["reply"], all_keys, topics.LARGEST_MESSAGE))
     return filters
 
 

@@ -1,28 +1,50 @@
-"""A client's way in by TLS: its own certificate, checked first, and why the router does not open."""
+"""A client's way in by TLS: its own certificate, checked first, and why the router and it refuse each other.
+
+Zenoh's client tries a refused link again for ever and keeps the reason to itself. So a TLS handshake of our own, beside
+it, finds the reason out.
+"""
 
 from __future__ import annotations
 
 import logging
+import socket
+import ssl
 import threading
 from typing import Any
+from urllib.parse import urlsplit
 
 from node_runtime.config.sections import Config
 from node_runtime.tls import credentials
 from node_runtime.tls.access_control import client_settings
-from node_runtime.tls.handshake import knock
+from node_runtime.tls.credentials import Credentials
 from protocol.rights import role_of
 
 log = logging.getLogger(__name__)
 
 # Zenoh opens a link that is welcome within some ten milliseconds.
-FIRST_KNOCK_S = 0.5
-NEXT_KNOCK_S = 3.0
-LOOK_AGAIN_S = 3600.0
+FIRST_HANDSHAKE_S = 0.5
+NEXT_HANDSHAKE_S = 3.0
+TIMEOUT_S = 2.0
+# In TLS 1.3 the client has finished before the server looks at its certificate.
+VERDICT_S = 0.5
+CLOCK_CHECK_S = 3600.0
 """Seconds between two looks at the clock, which may be set meanwhile."""
 
+_ALERTS = {
+    "UNKNOWN_CA": "it does not know the authority of our certificate: {folder} was made by another authority",
+    "CERTIFICATE_EXPIRED": "our certificate has expired by its clock",
+    "CERTIFICATE_REQUIRED": "it wants a certificate and got none",
+    "BAD_CERTIFICATE": "it takes our certificate for malformed",
+    "CERTIFICATE_UNKNOWN": "it does not accept our certificate",
+    "DECRYPT_ERROR": "our certificate was made by another authority of the same name",
+}
+# Of OpenSSL's X509_V_ERR_*.
+_EXPIRED, _NOT_YET = 10, 9
+_HOSTNAME, _ADDRESS = 62, 64
 
-class Door:
-    """One process before a router that wants certificates.
+
+class TlsClient:
+    """One process that wants to reach a router by certificates.
 
     Raises:
         ConfigError: the process's certificate cannot be used, and why.
@@ -32,8 +54,8 @@ class Door:
         self._endpoint = config.bus.endpoint
         self._credentials = credentials.of_process(config.bus.tls.keys, role_of(process), config.name)
         self._reason: str | None = None
-        self._knocking: threading.Thread | None = None
-        self._next = FIRST_KNOCK_S
+        self._trying: threading.Thread | None = None
+        self._next = FIRST_HANDSHAKE_S
         left = self._credentials.days_left()
         if left < credentials.WARN_DAYS:
             log.warning(
@@ -51,10 +73,10 @@ class Door:
     def refused(self, waited_s: float) -> str | None:
         """Why the router and we refuse each other, once that is known; asked again and again while we wait."""
         if self._endpoint.startswith("tls/") and waited_s >= self._next:
-            self._next = waited_s + NEXT_KNOCK_S
-            if self._knocking is None or not self._knocking.is_alive():
-                self._knocking = threading.Thread(target=self._knock, name="knock", daemon=True)
-                self._knocking.start()
+            self._next = waited_s + NEXT_HANDSHAKE_S
+            if self._trying is None or not self._trying.is_alive():
+                self._trying = threading.Thread(target=self._try, name="handshake", daemon=True)
+                self._trying.start()
         return self._reason
 
     def watch(self, stop: threading.Event) -> None:
@@ -64,11 +86,62 @@ class Door:
             while (reason := self._credentials.expired()) is None:
                 # A little later than that moment, so that it is over in any case.
                 left_s = self._credentials.days_left() * 86400.0
-                if stop.wait(min(LOOK_AGAIN_S, left_s + 0.1)):
+                if stop.wait(min(CLOCK_CHECK_S, left_s + 0.1)):
                     return
             log.error("%s; our links to %s end now. Start again with the new one", reason, self._endpoint)
 
         threading.Thread(target=look, name="certificate", daemon=True).start()
 
-    def _knock(self) -> None:
-        self._reason = self._credentials.expired() or knock(self._endpoint, self._credentials)
+    def _try(self) -> None:
+        self._reason = self._credentials.expired() or refusal(self._endpoint, self._credentials)
+
+
+def refusal(endpoint: str, own: Credentials) -> str | None:
+    """Why the router at `tls/HOST:PORT` and we refuse each other, from the end of a TLS handshake.
+
+    None when we do not, or nobody is there.
+    """
+    place = urlsplit(f"tls://{endpoint.partition('/')[2]}")
+    host, port = place.hostname, place.port
+    if host is None or port is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        context.load_verify_locations(own.authority)
+        context.load_cert_chain(own.certificate, own.key)
+        with (
+            socket.create_connection((host, port), TIMEOUT_S) as plain,
+            context.wrap_socket(plain, server_hostname=host) as link,
+        ):
+            link.settimeout(VERDICT_S)
+            link.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        return _refused_by_us(error, host, own)
+    except ssl.SSLError as error:
+        return _refused_by_router(error.reason or str(error), own)
+    except OSError:  # nobody there, or nothing said within the time: no refusal
+        return None
+    return None
+
+
+def _refused_by_us(error: ssl.SSLCertVerificationError, host: str, own: Credentials) -> str:
+    if error.verify_code in (_EXPIRED, _NOT_YET):
+        return "the router's certificate has expired or is not valid yet: `tandem keys renew --role router`"
+    if error.verify_code in (_HOSTNAME, _ADDRESS):
+        return (
+            f"the router's certificate is not for {host}: "
+            f"`tandem keys renew --role router --host {host}`, then start the router again"
+        )
+    return (
+        f"the router's certificate does not come from the authority in {own.authority} "
+        f"({error.verify_message}): it is another router, or its keys were made anew"
+    )
+
+
+def _refused_by_router(reason: str, own: Credentials) -> str:
+    for alert, text in _ALERTS.items():
+        if alert in reason:
+            return f"the router refused us: {text.format(folder=own.folder)} ({reason})"
+    if reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNEXPECTED_EOF_WHILE_READING"):
+        return f"what listens there does not speak TLS ({reason}): is it the router's plain endpoint?"
+    return f"the router refused us: {reason}"

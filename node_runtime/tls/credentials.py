@@ -47,9 +47,9 @@ class Credentials:
     def authority(self) -> Path:
         return self.folder / AUTHORITY
 
-    def days_left(self, now: datetime | None = None) -> float:
+    def days_left(self) -> float:
         """Days until it expires, negative afterwards."""
-        return ((self.not_after - (now or datetime.now(UTC))).total_seconds()) / 86400.0
+        return (self.not_after - datetime.now(UTC)).total_seconds() / 86400.0
 
     def expired(self) -> str | None:
         """Why the certificate is not valid now, or None."""

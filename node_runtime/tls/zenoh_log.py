@@ -19,7 +19,7 @@ from collections.abc import Iterator
 
 import zenoh
 
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import topics
 
 REFUSED = "error,zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info"
@@ -60,12 +60,12 @@ _REASONS = (
 class Refusals:
     """Reads Zenoh's log line by line. `bad` counts what was refused and logs the first of each kind."""
 
-    def __init__(self, bad: BadMessages):
+    def __init__(self, bad: RejectedMessages):
         self._bad = bad
         self._wondering: set[str] = set()
         self._names: OrderedDict[str, str] = OrderedDict()
 
-    def hear(self, line: str) -> bool:
+    def read(self, line: str) -> bool:
         """Whether `line` was one of Zenoh's log."""
         found = _OURS.match(_COLOUR.sub("", line).rstrip())
         if found is None:
@@ -105,7 +105,7 @@ class Refusals:
 
 
 @contextlib.contextmanager
-def listening(bad: BadMessages, filters: str) -> Iterator[None]:
+def counting_refusals(bad: RejectedMessages, filters: str) -> Iterator[None]:
     """While a router listens for other machines: `bad` counts what it refuses. Once in a process, before it opens.
 
     filters: `REFUSED` or `DENIED`; the environment's RUST_LOG goes before.
@@ -139,6 +139,6 @@ def _read(reading: int, real: int, refusals: Refusals) -> None:
             # What was allowed is most of it, and must cost next to nothing.
             if b"is authorized to" in line and not any(mark in line for mark in _TOLD):
                 continue
-            if not refusals.hear(line.decode(errors="replace")):
+            if not refusals.read(line.decode(errors="replace")):
                 os.write(real, line + b"\n")
     os.close(reading)

@@ -203,7 +203,7 @@ def _replay_tick(
     if seq in recorded.weights and outputs.output_weights is not None:
         comparison.compare(recorded.weights[seq], outputs.output_weights, "output_weights")
     if seq in recorded.keyframes:
-        comparison.compare(recorded.keyframes[seq], core.keyframe(seq), "keyframe")
+        comparison.compare(recorded.keyframes[seq], core.memory.keyframe(seq), "keyframe")
         comparison.keyframes += 1
     comparison.ticks += 1
 
@@ -215,10 +215,10 @@ def _begin(
     entry = recorded.keyframes[start]
     if start == -1 and not entry.message.resumed:
         # The memory before the first tick follows from the configuration and the seed: that is compared too.
-        comparison.compare(entry, core.keyframe(-1), "keyframe")
+        comparison.compare(entry, core.memory.keyframe(-1), "keyframe")
         comparison.keyframes += 1
     try:
-        core.restore(entry.message)
+        core.memory.restore(entry.message)
     except ValueError as error:
         if start == -1 and not entry.message.resumed:
             return  # a difference, and already noted; a changed configuration begins with its own memory

@@ -119,7 +119,7 @@ def _shipped_files() -> dict[str, Path]:
 
 def _find(what: str) -> Path:
     """A shipped name, or a file. Raises `Refused`."""
-    from node_runtime.config.wording import nearest
+    from node_runtime.config.strict import did_you_mean
 
     files = _shipped_files()
     if what in files:
@@ -127,4 +127,5 @@ def _find(what: str) -> Path:
     path = Path(what)
     if path.suffix == ".toml" or path.exists():
         return path
-    raise Refused(f"no experiment is called {what!r}; {nearest(what, files)} Or name a file, FILE.toml")
+    hint = did_you_mean(what, files, f"there are {', '.join(files) or 'none'}")
+    raise Refused(f"no experiment is called {what!r}; {hint} Or name a file, FILE.toml")

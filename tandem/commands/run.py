@@ -50,7 +50,7 @@ class Run(Configured):
             raise terminal.Refused(f"--seconds {self.seconds:g}: less than one period of {config.period:g} s")
         import msgspec
 
-        from controller_node.build import build_plant
+        from controller_node.build import build_model, build_plant
         from controller_node.guarantee import guarantee
         from node_runtime.config.sections import to_toml
         from tandem.live.files import claimed
@@ -59,7 +59,7 @@ class Run(Configured):
 
         require("matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
         plant = build_plant(config)
-        said = guarantee(config)
+        said = guarantee(config, build_model(config))
         with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
             self.say(*moved, style="dim")
             self.say(said)

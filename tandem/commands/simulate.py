@@ -54,6 +54,7 @@ class Simulate(Configured):
             raise Refused(
                 f"{self.log}: exists already, and a log never overwrites anything; choose another name"
             )
+        from controller_node.build import build_model
         from controller_node.guarantee import guarantee
         from lbmpc.plants import PlantError
         from node_runtime.config.sections import override
@@ -64,7 +65,7 @@ class Simulate(Configured):
 
         if self.adapt_only:
             config = override(config, ["trainer.enabled=false"])
-        self.say(guarantee(config))
+        self.say(guarantee(config, build_model(config)))
         with terminal.progress_bar(self.console) as bar:
             task = bar.add_task(f"simulating, {config.controller.oracle}", total=self.steps)
             try:

@@ -13,7 +13,7 @@ from lbmpc.plants import Plant
 from node_runtime.bus.inbox import Follower
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.config.sections import Config
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.reporting.summary import SOFT
@@ -129,7 +129,7 @@ class Monitor:
     config: Config
     plant: Plant
     seconds: float
-    bad: BadMessages = field(default_factory=BadMessages)
+    bad: RejectedMessages = field(default_factory=RejectedMessages)
     phase: str = ""
     """See `Snapshot`; whoever supervises says it."""
     first_command: float | None = None
@@ -235,10 +235,10 @@ class Monitor:
         if result.weights_rolled_back:
             self._rolled_back += 1
             self.say(f"tick {result.seq}: hidden weights {result.weights_rolled_back}", now, "bad")
-        if result.weights_verdict == "adopted":
+        if result.weights_outcome == "adopted":
             self._adopted += 1
             self.say(f"tick {result.seq}: hidden weights {result.hidden_version} adopted", now, "good")
-        elif result.weights_verdict.startswith("refused"):
+        elif result.weights_outcome == "refused":
             self._refused += 1
             self.say(f"tick {result.seq}: hidden weights {result.weights_verdict}", now, "bad")
         if result.prediction_error is not None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from benchmarks.solver import command, document, tables
-from benchmarks.solver.measure import Plan, Report, measure
+from benchmarks.solver import reporting
+from benchmarks.solver.__main__ import Benchmark, main
+from benchmarks.solver.measure import Report, Scope, measure
 from benchmarks.solver.recording import build_case, record
-from tandem.cli import main
 
 KEYS = {
     "solver",
@@ -26,7 +26,7 @@ KEYS = {
     "iterations",
     "compiled",
 }
-TINY = Plan(
+TINY = Scope(
     ticks=5,
     rounds=1,
     horizons=(10,),
@@ -88,7 +88,7 @@ def test_the_same_states_every_time() -> None:
 
 
 def test_ratios_are_of_medians(report: Report) -> None:
-    found = tables.ratios(report, N=10)
+    found = reporting.ratios(report, N=10)
     ours = report.find("tandem", "converged", "dnn", 10, 32, False)
     ipopt = report.find("ipopt", "converged", "dnn", 10, 32, False)
     assert ours is not None
@@ -99,9 +99,9 @@ def test_ratios_are_of_medians(report: Report) -> None:
 
 def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Path) -> None:
     path = tmp_path / "performance.md"
-    path.write_text(f"before\n{document.MARKS.begin}\nlast year's\n{document.MARKS.end}\nafter\n")
+    path.write_text(f"before\n{reporting.MARKS.begin}\nlast year's\n{reporting.MARKS.end}\nafter\n")
     for _ in range(2):
-        picture = document.write(report, path, "tandem bench solver")
+        picture = reporting.write(report, path, "python -m benchmarks.solver")
     text = path.read_text()
     assert text.startswith("before\n")
     assert text.endswith("after\n")
@@ -113,10 +113,10 @@ def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Pa
 def test_a_document_without_marks_is_refused_before_anything_is_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.solver.measure.measure", lambda *_: pytest.fail("measured all the same"))
+    monkeypatch.setattr("benchmarks.solver.__main__.measure", lambda *_: pytest.fail("measured all the same"))
     path = tmp_path / "notes.md"
     path.write_text("nothing here\n")
-    assert main(["bench", "solver", "--document", str(path)]) == 2
+    assert main(Benchmark(document=path)) == 2
     assert "two lines that it lacks" in " ".join(capsys.readouterr().err.split())
     assert path.read_text() == "nothing here\n"
 
@@ -124,8 +124,8 @@ def test_a_document_without_marks_is_refused_before_anything_is_measured(
 def test_the_command_prints_one_json_object(
     report: Report, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("benchmarks.solver.measure.measure", lambda *_: report)
-    assert command.solver(quick=True, document=None, as_json=True) == 0
+    monkeypatch.setattr("benchmarks.solver.__main__.measure", lambda *_: report)
+    assert main(Benchmark(quick=True, json=True)) == 0
     printed = json.loads(capsys.readouterr().out)
     assert len(printed["rows"]) == len(report.rows)
     assert set(printed["rows"][0]) >= KEYS

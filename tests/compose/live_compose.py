@@ -23,7 +23,7 @@ from protocol import messages as m
 from protocol import topics
 from tandem import certificate_authority
 from tests.compose.project import BASE, Project, docker, limits
-from tests.helpers.live import Ear, health_of, wait_for
+from tests.helpers.live import BusListener, health_of, wait_for
 
 MAIN, TEST = "docker-compose.yml", "tests/compose/docker-compose.test.yml"
 REMOTE = "docker-compose.remote.yml"
@@ -56,7 +56,7 @@ class Watch:
     """Listens from outside, and says how long things took."""
 
     def __init__(self, bus: Bus):
-        self.ear = Ear(bus)
+        self.ear = BusListener(bus)
 
     def until(self, what: str, wanted: Callable[[m.Message], bool]) -> m.Message:
         began = clock.now()
@@ -115,7 +115,7 @@ def say(text: str) -> None:
 
 
 def adopted(message: m.Message) -> bool:
-    return isinstance(message, m.TickResult) and message.weights_verdict == "adopted"
+    return isinstance(message, m.TickResult) and message.weights_outcome == "adopted"
 
 
 def assert_steady(sources: list[str]) -> None:

@@ -17,8 +17,8 @@ from controller_node.checkpoint import (
     Checkpoint,
     CheckpointError,
     CheckpointWriter,
-    Memory,
     OtherController,
+    Snapshot,
     read,
     resume,
 )
@@ -34,7 +34,7 @@ from protocol import messages as m
 from run_log.reading.reader import gather
 from run_log.replaying.replay import replay
 from tandem.experiments.simulation.lockstep import simulate
-from tests.helpers.live import HANG_S, Ear, Process, health_of, live_config, wait_for
+from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, wait_for
 
 SMALL = ("controller.horizon=20", "network.hidden=[8, 8]", "controller.solver.compile=never")
 BELONGS = {"plant": "jet1", "rate": "20.0"}
@@ -69,8 +69,8 @@ def counts() -> dict[str, int]:
     return {"checkpoints written": 0, "checkpoints failed": 0}
 
 
-def memory(seq: int = 7) -> Memory:
-    return Memory(seq, {"K": m.Array.of(np.arange(6.0).reshape(2, 3))}, {"ticks": 8})
+def memory(seq: int = 7) -> Snapshot:
+    return Snapshot(seq, {"K": m.Array.of(np.arange(6.0).reshape(2, 3))}, {"ticks": 8})
 
 
 def written(path: Path, outbox: Outbox | None = None, samples: int = 100) -> Checkpoint:
@@ -155,7 +155,7 @@ def test_another_controllers_file_is_refused_says_what_differs_and_is_kept(
 def test_numbers_that_are_not_finite_are_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "memory"
     with CheckpointWriter(path, BELONGS, Outbox("controller-a"), 10, counts()) as writer:
-        writer.offer(Memory(0, {"K": m.Array.of(np.array([1.0, np.nan]))}, {}))
+        writer.offer(Snapshot(0, {"K": m.Array.of(np.array([1.0, np.nan]))}, {}))
     with pytest.raises(CheckpointError, match="array K is not finite"):
         read(path, BELONGS)
 
@@ -203,17 +203,17 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
     for entry in run.entries(topics.TICK)[:60]:
         before.step(entry.message)
     after = ControllerCore(config(), "controller-b")
-    fresh = after.keyframe(-1)
-    after.go_on(before.lasting(), "controller-a")
-    first = after.keyframe(-1)
+    fresh = after.memory.keyframe(-1)
+    after.memory.go_on(before.memory.lasting(), "controller-a")
+    first = after.memory.keyframe(-1)
     assert first.resumed == "controller-a"
-    kept = before.keyframe(59).arrays
+    kept = before.memory.keyframe(59).arrays
     for name, array in first.arrays.items():
         if name.startswith("oracle.") or name == "delay":
             assert array == kept[name], name
         else:
             assert array == fresh.arrays[name], name
-    snapshot, then = after.hidden_snapshot(-1), before.hidden_snapshot(59)
+    snapshot, then = after.memory.hidden_snapshot(-1), before.memory.hidden_snapshot(59)
     assert snapshot is not None
     assert then is not None
     assert snapshot.hidden_sha256 == then.hidden_sha256
@@ -233,7 +233,7 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
             assert outputs.result.h_hat == run.results[60].h_hat
         log += [(topics.TICK, tick, tick.seq), (topics.COMMAND, outputs.command, tick.seq)]
         log += [(topics.RESULT, outputs.result, tick.seq)]
-    log.append((topics.KEYFRAME, after.keyframe(20), 20))
+    log.append((topics.KEYFRAME, after.memory.keyframe(20), 20))
     found = replay(gather(config(), log))
     assert found.equal, found.first_difference
     assert any("goes on from the memory of controller-a" in note for note in found.notes)
@@ -242,7 +242,7 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
 def test_memory_of_another_shape_is_named() -> None:
     core, other = ControllerCore(config(), "a"), ControllerCore(config("network.hidden=[9, 8]"), "b")
     with pytest.raises(ValueError, match=r"array oracle\.W1 is"):
-        core.go_on(other.lasting(), "b")
+        core.memory.go_on(other.memory.lasting(), "b")
 
 
 @pytest.mark.parametrize(
@@ -255,8 +255,10 @@ def test_memory_of_another_shape_is_named() -> None:
     ],
 )
 def test_what_a_checkpoint_belongs_to(change: str, word: str) -> None:
-    mine, other = (ControllerCore(c, "a").belongs() for c in (config(), config(change)))
-    assert mine == ControllerCore(override(config(), ["seed=5", "controller.horizon=25"]), "b").belongs()
+    mine, other = (ControllerCore(c, "a").memory.belongs() for c in (config(), config(change)))
+    assert (
+        mine == ControllerCore(override(config(), ["seed=5", "controller.horizon=25"]), "b").memory.belongs()
+    )
     differing = {name for name in mine if mine[name] != other.get(name)}
     assert word in differing
 
@@ -294,14 +296,14 @@ def test_a_killed_controller_comes_back_with_its_memory(tmp_path: Path) -> None:
     path = tmp_path / "memory"
     live = live_config(*SMALL, f'controller.checkpoint="{path}"', "rate=50", "trainer.enabled=false")
     states: list[m.PlantState] = simulate(live, 140).plant_states
-    belongs = ControllerCore(live, "x").belongs()
+    belongs = ControllerCore(live, "x").memory.belongs()
     waiting = health_of("controller", note="no plant: waiting for its states")
     with (
         Router(live),
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("controller_node.node", live) as first:
             ear.until(waiting, 60.0)
             play(plant, states[:100], live.period)
@@ -345,15 +347,15 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
         path.write_bytes(os.urandom(5000))
     else:
         other = ControllerCore(override(live, ['name="jet2"', "network.hidden=[9, 8]"]), "controller-z")
-        with CheckpointWriter(path, other.belongs(), Outbox("controller-z"), 10, counts()) as writer:
-            writer.offer(Memory(5, other.lasting(), {"ticks": 1000}))
+        with CheckpointWriter(path, other.memory.belongs(), Outbox("controller-z"), 10, counts()) as writer:
+            writer.offer(Snapshot(5, other.memory.lasting(), {"ticks": 1000}))
     states: list[m.PlantState] = simulate(live, 3).plant_states
     with (
         Router(live),
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("controller_node.node", live) as process:
             ear.until(health_of("controller", note="no plant: waiting for its states"), 60.0)
             play(plant, states, live.period)
@@ -368,4 +370,4 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
     assert aside.suffix == (".damaged" if content == "garbage" else ".other")
     assert ear.of(topics.KEYFRAME)[0].resumed == ""
     # At its orderly end it left a checkpoint of its own.
-    assert read(path, ControllerCore(live, "x").belongs()).run_id == ear.of(topics.TICK)[0].run_id
+    assert read(path, ControllerCore(live, "x").memory.belongs()).run_id == ear.of(topics.TICK)[0].run_id

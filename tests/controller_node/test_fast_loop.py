@@ -17,7 +17,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.health import HealthPublisher
 from node_runtime.realtime.pacer import Slot
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
@@ -29,7 +29,7 @@ class BusThatWritesDown:
 
     def __init__(self, config: Config):
         self.config = config
-        self.bad = BadMessages()
+        self.bad = RejectedMessages()
         self.said: list[tuple[str, m.Message | None]] = []
 
     def queue(self, topic: Topic, capacity: int) -> Mailbox:
@@ -83,7 +83,7 @@ class Loop:
             self.node._tick(Slot(k, k * period, 0), 0.0, Latched("fresh", received, 0.0))
 
 
-def test_ticks_commands_and_results_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
+def test_ticks_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
     loop = Loop("rate=1000")
     loop.tick(250)
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.TIMING):
@@ -103,7 +103,7 @@ def test_at_twenty_hertz_every_tick_says_everything() -> None:
 def test_the_trainer_hears_of_an_adoption_at_once() -> None:
     loop = Loop("rate=1000", "adaptation.trial.enabled=false")
     loop.tick(5)
-    description = loop.core.description
+    description = loop.core.controller.oracle.description
     assert description is not None
     layers = [np.full(shape, 0.125) for shape in description.layer_shapes]
     loop.node._weights = m.HiddenWeights(
@@ -138,7 +138,7 @@ def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else()
     loop.bus.said.clear()
     loop.tick()
     assert [name for name, _ in loop.bus.said][:3] == [topics.COMMAND.name, "prepare", topics.TICK.name]
-    assert loop.core.controller._prepared_for is loop.core.state
+    assert loop.core.controller._prepared_for is loop.core.memory.state
 
 
 def test_however_many_samples_come_a_training_begins_at_most_every_so_often(

@@ -23,7 +23,7 @@ from node_runtime.realtime.scheduling import one_blas_thread
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.live import HANG_S, Ear, Process, health_of, live_config, wait_for
+from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
 
 PLANT = get_plant("moore_greitzer")
 SETTINGS = ("controller.horizon=20", "controller.keyframe_every=20", "network.hidden=[8, 8]")
@@ -71,7 +71,7 @@ class Run:
     """What was heard of one run, and the answers to the queries near its end."""
 
     config: Config
-    ear: Ear
+    ear: BusListener
     run_id: str
     outbox: list[m.Sample]
     snapshot: m.HiddenSnapshot
@@ -123,12 +123,12 @@ def run() -> Iterator[Run]:
         Bus(config, "trainer", "trainer-a") as trainer,
         Process("plant_sim.node", config),
     ):
-        ear = Ear(trainer)
+        ear = BusListener(trainer)
         ear.until(health_of("plant", status="ready"))
         with Process("controller_node.node", config) as process:
             ear.until(lambda message: isinstance(message, m.Tick))
             snapshot = snapshot_of(trainer)
-            wait_for(lambda: trainer.matched(topics.HIDDEN_WEIGHTS))
+            wait_for(lambda: matched(trainer, topics.HIDDEN_WEIGHTS))
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 1, for_run="controller-other"))
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 2, sha256="0" * 64))
             ear.until(tick_with_weights)
@@ -197,7 +197,7 @@ def test_samples_come_in_batches_and_the_outbox_has_them_all(run: Run) -> None:
 def test_the_ticks_alone_give_every_command_again(run: Run) -> None:
     with one_blas_thread():
         core = ControllerCore(run.config, run.run_id)
-        core.restore(run.of(topics.KEYFRAME)[0])
+        core.memory.restore(run.of(topics.KEYFRAME)[0])
         again = [codec.encode(core.step(tick).command) for tick in run.of(topics.TICK)]
     assert again == [codec.encode(command) for command in run.of(topics.COMMAND)]
 
@@ -207,7 +207,7 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     latched = [tick.weights.seq for tick in run.of(topics.TICK) if tick.weights is not None]
     assert latched == [2, 3]
     verdicts = [
-        result.weights_verdict for result in run.of(topics.RESULT) if result.weights_verdict != "none"
+        result.weights_verdict for result in run.of(topics.RESULT) if result.weights_outcome != "none"
     ]
     assert len(verdicts) == 2
     assert verdicts[0].startswith("refused: ")
@@ -284,12 +284,12 @@ class Script:
 def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
     config = live_config(*SETTINGS)
     with Router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
         script = Script(config)
         with Process("controller_node.node", config) as process:
             waiting = health_of("controller", status="ready", note="no plant: waiting for its states")
             ear.until(waiting)
-            wait_for(lambda: script.bus.matched(topics.PLANT_STATE))
+            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
             # Whoever comes first is followed.
             good = [script.send().seq]
             ear.until(lambda message: isinstance(message, m.Tick))
@@ -343,7 +343,7 @@ def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None
     """The plant's clock has lost five seconds: no ticks without a state meanwhile, and control afterwards."""
     config = live_config(*SETTINGS)
     with Router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
         script = Script(config)
 
         def played(behind: float, until: Callable[[], bool]) -> None:
@@ -358,7 +358,7 @@ def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None
 
         with Process("controller_node.node", config) as process:
             ear.until(health_of("controller", status="ready", note="no plant: waiting for its states"))
-            wait_for(lambda: script.bus.matched(topics.PLANT_STATE))
+            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
             played(0.0, lambda: len(fresh()) > 10)
             before = len(fresh())
             played(5.0, lambda: len(fresh()) > before + 10)
@@ -378,7 +378,7 @@ def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None
 def test_another_plant_is_followed_after_silence() -> None:
     config = live_config(*SETTINGS, "bus.follow_silence=0.3")
     with Router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
 
         def fresh_from(run_id: str) -> m.Tick:
             tick = ear.until(
@@ -411,7 +411,7 @@ def test_another_plant_is_followed_after_silence() -> None:
 def test_a_controller_ends_though_the_router_is_frozen() -> None:
     config = live_config(*SETTINGS)
     with Process("node_runtime.router", config) as router, Bus(config, "recorder", "recorder-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("plant_sim.node", config), Process("controller_node.node", config) as process:
             ear.until(lambda message: isinstance(message, m.Tick))
             router.signal(signal.SIGSTOP)

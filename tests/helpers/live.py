@@ -12,13 +12,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from typing import get_args
 
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
 from node_runtime.config.sections import Config, override, to_json
 from node_runtime.realtime import clock
 from protocol import codec
 from protocol import messages as m
-from protocol.topics import Topic, topic_of
+from protocol.topics import Lane, Topic, topic_of
 
 PROGRAM = (
     "import logging, sys; logging.basicConfig(format='%(message)s', level='INFO');"
@@ -82,7 +83,17 @@ class Process:
             self._popen.communicate()
 
 
-class Ear:
+def matched(bus: Bus, topic: Topic) -> bool:
+    """Whether somebody is subscribed to this topic; a message sent before that reaches nobody."""
+    return bus._publisher(topic).matching_status.matching
+
+
+def connected(bus: Bus) -> bool:
+    """Whether both lanes have the router at this moment."""
+    return all(list(bus._lanes.session(lane).info.routers_zid()) for lane in get_args(Lane))
+
+
+class BusListener:
     """Remembers every message that it hears, in order of arrival."""
 
     def __init__(self, bus: Bus):

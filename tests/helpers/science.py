@@ -8,7 +8,7 @@ from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle
 from lbmpc.plants import get_plant
 from network_model.description import NetworkDescription
-from network_model.operations import get_architecture
+from network_model.registry import get_architecture
 
 
 def compressor(period: float = 0.05) -> Model:

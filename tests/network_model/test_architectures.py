@@ -14,17 +14,18 @@ import numpy as np
 import pytest
 import torch
 
-from lbmpc.controller.step import Controller, HiddenSet, Observation
-from lbmpc.oracles import DnnOracle
+from lbmpc.controller.signals import Observation
+from lbmpc.controller.step import Controller
+from lbmpc.oracles import DnnOracle, HiddenSet, Verdict
 from lbmpc.oracles.base import follow
 from lbmpc.plants import Truth
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.ipopt_reference import ReferenceSolver
 from lbmpc.solver.problem import build_problem
 from lbmpc.solver.solution import Status
-from network_model import architectures, operations
+from network_model import architectures, registry
 from network_model.description import NetworkDescription, hash_layers
-from network_model.operations import get_architecture
+from network_model.registry import get_architecture
 from node_runtime.config.sections import Config, load, override
 from node_runtime.config.strict import ConfigError
 from protocol import topics
@@ -150,20 +151,22 @@ def test_weights_of_another_architecture_are_refused() -> None:
         layer.astype(np.float32).astype(float)
         for layer in cnn.hidden(cnn.initial_state(np.random.default_rng(0)))
     ]
-    after, verdict = rnn.adopt(state, 1, foreign, hash_layers(foreign), cnn.description.sha256())
-    assert verdict == "refused: trained for another network description"
+    after, verdict = rnn.adopt(state, HiddenSet(1, foreign, hash_layers(foreign), cnn.description.sha256()))
+    assert verdict == Verdict("refused", "trained for another network description")
     assert after is state
     # And one that lies about what it was trained for.
-    after, verdict = rnn.adopt(state, 1, foreign, hash_layers(foreign), rnn.description.sha256())
-    assert verdict.startswith("refused: shapes")
+    after, verdict = rnn.adopt(state, HiddenSet(1, foreign, hash_layers(foreign), rnn.description.sha256()))
+    assert verdict.outcome == "refused"
+    assert verdict.reason.startswith("shapes")
     assert after is state
     huge = [layer * 1e3 for layer in rnn.hidden(state)]
-    _, verdict = rnn.adopt(state, 1, huge, hash_layers(huge), rnn.description.sha256())
-    assert verdict.startswith("refused: layer 1 has norm")
+    _, verdict = rnn.adopt(state, HiddenSet(1, huge, hash_layers(huge), rnn.description.sha256()))
+    assert verdict.outcome == "refused"
+    assert verdict.reason.startswith("layer 1 has norm")
     hidden = HiddenSet(1, foreign, hash_layers(foreign), cnn.description.sha256())
     controller = Controller(build_problem(MODEL, rnn, 5), Solver(build_problem(MODEL, rnn, 5)))
     _, result = controller.step(controller.initial_state(0), Observation(X0, None, 1, 0, hidden))
-    assert result.verdict == "refused: trained for another network description"
+    assert result.verdict == Verdict("refused", "trained for another network description")
 
 
 def test_every_field_is_in_the_hash_and_that_of_an_mlp_is_what_it_always_was() -> None:
@@ -236,7 +239,7 @@ def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) 
         "controller.keyframe_every=20",
     ]
     run = simulate(override(Config(), [*QUICK, *settings]), 50)
-    assert any(result.weights_verdict == "adopted" for result in run.results)
+    assert any(result.weights_outcome == "adopted" for result in run.results)
     assert replay(run).equal
     middle = replay(run, 45)
     assert middle.equal
@@ -284,10 +287,10 @@ def gru(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_the_example_of_the_docs_is_the_same_network_on_both_sides_and_runs(gru: str) -> None:
-    assert gru in operations.architecture_names()
+    assert gru in registry.architecture_names()
     for window in (1, 4):
         for seed in range(3):
             check_parity(describe(MODEL, [7, 6], architecture=gru, window=window), seed)
     run = simulate(override(Config(), [*QUICK, f"network.architecture={gru}"]), 40)
-    assert any(result.weights_verdict == "adopted" for result in run.results)
+    assert any(result.weights_outcome == "adopted" for result in run.results)
     assert replay(run).equal

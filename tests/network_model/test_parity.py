@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from lbmpc.oracles.dnn.oracle import DnnOracle
 from network_model.description import NetworkDescription
-from network_model.operations import BOUNDED, Activation, architecture_names, get_architecture
+from network_model.operations import BOUNDED, Activation
+from network_model.registry import architecture_names, get_architecture
 from trainer_node.network import Network
 
 ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)

@@ -17,7 +17,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher, run_info
-from node_runtime.lifecycle import SAME_WISH, new_run_id, stopped_by_signals
+from node_runtime.lifecycle import REPEATED_SIGNAL_S, new_run_id, run_process, stopped_by_signals
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import (
     GarbageCollection,
@@ -30,7 +30,7 @@ from node_runtime.realtime.scheduling import (
 from node_runtime.router import Router
 from protocol import messages as m
 from protocol import topics
-from tests.helpers.live import HANG_S, Ear, health_of, live_config, wait_for
+from tests.helpers.live import HANG_S, BusListener, health_of, live_config, matched, wait_for
 
 STUBBORN = """
 import threading
@@ -44,7 +44,7 @@ with stopped_by_signals() as stop:
 """
 UNPRIVILEGED = """
 import logging, os, resource, sys
-from node_runtime.realtime import punctual
+from node_runtime.realtime.scheduling import punctual
 logging.basicConfig(format="%(message)s")
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 if os.geteuid() == 0:
@@ -71,12 +71,12 @@ def test_a_first_signal_asks_and_a_later_one_ends(number: signal.Signals) -> Non
             process.send_signal(number)
             assert process.stdout.readline() == "told\n"
             # What comes at once is the same wish, so the process must still be there.
-            assert process.poll() is None or clock.now() - first > SAME_WISH
+            assert process.poll() is None or clock.now() - first > REPEATED_SIGNAL_S
             while process.poll() is None:
                 assert clock.now() - first < HANG_S
                 clock.sleep_until(clock.now() + 0.1)
                 process.send_signal(number)
-            assert clock.now() - first > SAME_WISH
+            assert clock.now() - first > REPEATED_SIGNAL_S
             assert process.returncode == -number
         finally:
             process.kill()
@@ -101,6 +101,24 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [given]
+
+
+def test_a_process_ends_well_when_told_to_stop_before_there_is_a_router() -> None:
+    def body(stopping: threading.Event) -> int:
+        with Bus(live_config(), "plant", "plant-a", stopping):
+            return 7
+
+    stop = threading.Event()
+    threading.Timer(0.2, stop.set).start()
+    assert run_process(body, stop) == 0
+
+
+def test_a_configuration_that_cannot_be_used_is_an_exit_code(caplog: pytest.LogCaptureFixture) -> None:
+    def body(_stopping: threading.Event) -> int:
+        raise ConfigError("rate = -1.0 is not a number above 0")
+
+    assert run_process(body) == 2
+    assert "rate = -1.0 is not a number above 0" in caplog.text
 
 
 def test_without_the_privilege_one_warning_and_a_note() -> None:
@@ -201,7 +219,7 @@ def test_everything_is_as_before_after_a_punctual_loop() -> None:
 def test_a_child_does_not_inherit_its_supervisors_priority() -> None:
     program = (
         "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1));"
-        "from tandem import child; sys.argv = ['child', str(os.getppid()), 'config', 'show', '--json'];"
+        "from tandem.live import child; sys.argv = ['child', str(os.getppid()), 'config', 'show', '--json'];"
         "child.main(); print(os.sched_getscheduler(0), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
@@ -238,8 +256,8 @@ def test_garbage_is_collected_between_steps_only() -> None:
 def test_health_is_heard_regularly_and_at_every_change() -> None:
     config = live_config()
     with Router(config), Bus(config, "recorder", "r") as listener, Bus(config, "plant", "plant-a") as bus:
-        ear = Ear(listener)
-        wait_for(lambda: bus.matched(topics.HEALTH["plant"]) and bus.matched(topics.RUN_INFO["plant"]))
+        ear = BusListener(listener)
+        wait_for(lambda: matched(bus, topics.HEALTH["plant"]) and matched(bus, topics.RUN_INFO["plant"]))
         info = run_info(config, "plant", "plant-a", {"z": "1"})
         with HealthPublisher(bus, info, lambda: {"samples": 7}, "standing note") as health:
             ear.until(lambda message: isinstance(message, m.RunInfo))

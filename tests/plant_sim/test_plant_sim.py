@@ -20,7 +20,7 @@ from plant_sim.simulator import PlantSim
 from plant_sim.watchdog import Orders, Standby
 from protocol import messages as m
 from protocol import topics
-from tests.helpers.live import Ear, Process, health_of, live_config, wait_for
+from tests.helpers.live import BusListener, Process, health_of, live_config, matched, wait_for
 
 PLANT: Plant = get_plant("moore_greitzer")
 PERIOD = 0.05
@@ -317,12 +317,12 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
     # The stranger must stay one, however slow this machine is.
     config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]", "bus.follow_silence=60.0")
     with Router(config), Bus(config, "controller", "controller-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
             stranger = Bus(config, "controller", "controller-b")
             stranger.open()
-            wait_for(lambda: bus.matched(topics.COMMAND) and stranger.matched(topics.COMMAND))
+            wait_for(lambda: matched(bus, topics.COMMAND) and matched(stranger, topics.COMMAND))
             for k in range(5):
                 ear.of(topics.PLANT_STATE)
                 state = ear.until(lambda message: isinstance(message, m.PlantState))
@@ -356,10 +356,10 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
     config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
     high = float(PLANT.u_max[0])
     with Router(config), Bus(config, "controller", "controller-a") as bus:
-        ear = Ear(bus)
+        ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             failed = health_of("plant", status="failed")
-            wait_for(lambda: bus.matched(topics.COMMAND))
+            wait_for(lambda: matched(bus, topics.COMMAND))
             health, seq = None, 0
             # Until it has had one in time: a command that answers an old state is refused.
             while not isinstance(health, m.Health):

@@ -20,7 +20,7 @@ from run_log.reading.gaps import lost_ticks, stretches
 from run_log.reading.reader import gather, read_run
 from run_log.reporting.summary import summarise
 from run_log.writing.writer import LogWriter
-from tests.helpers.live import HANG_S, Process, live_config, wait_for
+from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
 from tests.helpers.run_log_samples import RUN, synthetic
 
 LEASE_S = 0.3
@@ -41,7 +41,7 @@ def test_a_recorder_without_a_core_for_longer_than_the_lease_loses_nothing(tmp_p
     with Router(config), Process("run_log.writing.recorder", config) as recorder:
         # The lease in question is the recorder's: the other side's link holds, however late this process is.
         with Bus(override(config, ["bus.lease_ms=60000"]), "controller", "controller-a") as bus:
-            wait_for(lambda: bus.matched(topics.TIMING) and bus.matched(topics.BATCH["controller"]))
+            wait_for(lambda: matched(bus, topics.TIMING) and matched(bus, topics.BATCH["controller"]))
             bus.publish(topics.TIMING, timing(0))
             recorder.signal(signal.SIGSTOP)
             seq, end = 0, clock.now() + 3 * LEASE_S

@@ -175,7 +175,7 @@ def test_garbage_is_logged_as_it_came(tmp_path: Path, config: Config) -> None:
 
 
 @pytest.mark.parametrize(("rate", "views"), [(20, 40), (100, 200), (1000, 200)])
-def test_a_fast_loop_has_all_its_bytes_in_the_log_and_a_view_a_hundred_times_a_second(
+def test_a_fast_loop_has_all_its_bytes_in_the_log_and_100_views_a_second(
     tmp_path: Path, config: Config, rate: int, views: int
 ) -> None:
     path = tmp_path / "run.mcap"

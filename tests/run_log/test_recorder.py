@@ -25,7 +25,7 @@ from run_log.reading.recover import recover
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import summarise
 from run_log.writing.parts import existing_parts
-from tests.helpers.live import Ear, Process, free_endpoint, health_of, live_config, wait_for
+from tests.helpers.live import BusListener, Process, free_endpoint, health_of, live_config, matched, wait_for
 
 pytestmark = pytest.mark.live
 
@@ -51,8 +51,8 @@ def plant(config: Config) -> Iterator[Bus]:
 
 
 @pytest.fixture
-def ear(plant: Bus) -> Ear:
-    return Ear(plant)
+def ear(plant: Bus) -> BusListener:
+    return BusListener(plant)
 
 
 def state(seq: int, x: float = 1.0) -> m.PlantState:
@@ -77,13 +77,13 @@ def noted(text: str) -> Callable[[m.Message], bool]:
     return lambda message: running(message) and isinstance(message, m.Health) and text in message.note
 
 
-def recorded(plant: Bus, ear: Ear, process: Process, config: Config) -> None:
+def recorded(plant: Bus, ear: BusListener, process: Process, config: Config) -> None:
     """Wait until the recorder hears the plant."""
     ear.until(noted("writing"))
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
 
 
-def test_everything_said_is_in_the_log(config: Config, plant: Bus, ear: Ear) -> None:
+def test_everything_said_is_in_the_log(config: Config, plant: Bus, ear: BusListener) -> None:
     timings = [timing(i) for i in range(300)]
     garbage = [b"", b"\x00" * 100, codec.encode(state(1, float("nan")))]
     with recorder(config) as process:
@@ -132,7 +132,7 @@ def readable(path: str) -> int:
         return 0
 
 
-def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: Ear) -> None:
+def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: BusListener) -> None:
     with recorder(override(config, ["log.split_minutes=0.01"])) as process:
         recorded(plant, ear, process, config)
         plant.publish(topics.TIMING, timing(0))
@@ -151,7 +151,7 @@ def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: Ear) -> 
 
 
 def test_a_killed_recorder_leaves_what_was_said_before_its_last_flush(
-    config: Config, plant: Bus, ear: Ear
+    config: Config, plant: Bus, ear: BusListener
 ) -> None:
     """That it is all but the last half second, `make faults` measures."""
     stop = threading.Event()
@@ -185,7 +185,7 @@ def test_a_killed_recorder_leaves_what_was_said_before_its_last_flush(
 
 
 def talk_while_full(
-    config: Config, plant: Bus, ear: Ear, fill: Callable[[int], None], free: Callable[[int], None]
+    config: Config, plant: Bus, ear: BusListener, fill: Callable[[int], None], free: Callable[[int], None]
 ):
     """The disk fills up, stays full for a while, and has room again: nothing is lost, and Health says it all."""
     noise = [m.Keyframe(run_id="plant-a", seq=i, arrays={"a": array(i)}) for i in range(20)]
@@ -217,7 +217,7 @@ def array(seed: int) -> m.Array:
     return m.Array.of(np.random.default_rng(seed).normal(size=2000))
 
 
-def test_a_full_quota_is_waited_for(config: Config, plant: Bus, ear: Ear) -> None:
+def test_a_full_quota_is_waited_for(config: Config, plant: Bus, ear: BusListener) -> None:
     full, none = (100_000, resource.RLIM_INFINITY), (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     talk_while_full(
         config,
@@ -239,7 +239,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
-def test_a_full_disk_is_waited_for(config: Config, plant: Bus, ear: Ear, small_disk: Path) -> None:
+def test_a_full_disk_is_waited_for(config: Config, plant: Bus, ear: BusListener, small_disk: Path) -> None:
     grow = ["mount", "-o", "remount,size=10m", str(small_disk)]
     talk_while_full(
         override(config, [f'log.path="{small_disk / "run.mcap"}"']),
@@ -250,7 +250,9 @@ def test_a_full_disk_is_waited_for(config: Config, plant: Bus, ear: Ear, small_d
     )
 
 
-def test_a_place_that_can_never_be_written(config: Config, plant: Bus, ear: Ear, tmp_path: Path) -> None:
+def test_a_place_that_can_never_be_written(
+    config: Config, plant: Bus, ear: BusListener, tmp_path: Path
+) -> None:
     (tmp_path / "file").write_bytes(b"")
     with recorder(override(config, [f'log.path="{tmp_path / "file" / "run.mcap"}"'])) as process:
         ear.until(noted("NOT LOGGED"))
@@ -277,7 +279,7 @@ def test_stopped_before_there_was_a_router(config: Config) -> None:
     assert not read_run(config.log.path).truncated
 
 
-def test_a_live_loop_replays_byte_for_byte(config: Config, ear: Ear) -> None:
+def test_a_live_loop_replays_byte_for_byte(config: Config, ear: BusListener) -> None:
     """Three real processes; the log alone gives every command back."""
     with recorder(config) as log:
         ear.until(noted("writing"))

@@ -81,7 +81,7 @@ def flip(value: float, bit: int) -> float:
 
 
 def test_every_command_comes_back(run: Run) -> None:
-    assert any(r.weights_verdict == "adopted" for r in run.results)
+    assert any(r.weights_outcome == "adopted" for r in run.results)
     told = []
     found = replay(run, progress=lambda done, total: told.append((done, total)))
     assert found.equal
@@ -126,7 +126,7 @@ def test_bad_ticks_replay_too(config: Config) -> None:
 
     source = simulate(config, 40)
     core = ControllerCore(config, RUN)
-    log: list[tuple[Topic, m.Message, int]] = [(topics.KEYFRAME, core.keyframe(-1), 0)]
+    log: list[tuple[Topic, m.Message, int]] = [(topics.KEYFRAME, core.memory.keyframe(-1), 0)]
     weights = source.hidden_weights[0]
     for tick in source.ticks:
         if tick.seq in (7, 8, 30):
@@ -139,10 +139,10 @@ def test_bad_ticks_replay_too(config: Config) -> None:
         log += [(topics.TICK, tick, tick.seq), (topics.COMMAND, outputs.command, tick.seq)]
         log += [(topics.RESULT, outputs.result, tick.seq)]
         if tick.seq == 24:
-            log.append((topics.KEYFRAME, core.keyframe(24), 24))
+            log.append((topics.KEYFRAME, core.memory.keyframe(24), 24))
     run = gather(config, log)
     assert {r.mode for r in run.results} > {"solver"}
-    assert any(r.weights_verdict.startswith("refused") for r in run.results)
+    assert any(r.weights_outcome == "refused" for r in run.results)
     assert replay(run).equal
 
 

@@ -421,9 +421,9 @@ def test_a_network_that_nobody_could_hold_takes_no_memory(config: Config) -> Non
 def process(config: Config) -> subprocess.Popen[bytes]:
     code = (
         "import sys\n"
-        "from node_runtime import config\n"
+        "from node_runtime.config.sections import from_json\n"
         "from trainer_node.main import main\n"
-        "sys.exit(main(config.from_json(sys.argv[1])))"
+        "sys.exit(main(from_json(sys.argv[1])))"
     )
     return subprocess.Popen([sys.executable, "-c", code, configuration.to_json(config)])
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from node_runtime.config.sections import Strategy
+from node_runtime.config.literals import Strategy
 from trainer_node.replay_buffer import ReplayBuffer, Seen
 
 STRATEGIES: list[Strategy] = ["fifo", "reservoir", "novelty"]

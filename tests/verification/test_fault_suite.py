@@ -24,7 +24,7 @@ from node_runtime.config.sections import override, to_json
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.live import HANG_S, Process, live_config, wait_for
+from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
 from tests.helpers.paths import ROOT
 from verification.faults import facts as measured
 from verification.faults import holds, link, suite, table
@@ -356,8 +356,8 @@ def test_a_wire_delays_drops_and_cuts() -> None:
 LINGER_S = 10.0
 FAR = """
 import sys, threading
-from node_runtime.bus import Bus
-from node_runtime.config import from_json
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import from_json
 from protocol import topics
 with Bus(from_json(sys.argv[1]), "plant", "plant-far") as bus:
     kept = [bus.queue(topics.OUTPUT_WEIGHTS), bus.queue(topics.COMMAND)]
@@ -388,7 +388,7 @@ def test_a_client_that_vanishes_does_not_stop_the_router() -> None:
                 assert client.stdout is not None
                 assert client.stdout.readline()
                 wait_for(
-                    lambda: controller.matched(topics.OUTPUT_WEIGHTS) and plant.matched(topics.PLANT_STATE)
+                    lambda: matched(controller, topics.OUTPUT_WEIGHTS) and matched(plant, topics.PLANT_STATE)
                 )
                 wire.shape(link.Shape(cut=True))
                 K = m.Array.of(np.zeros((65, 4)))

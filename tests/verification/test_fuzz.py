@@ -50,7 +50,7 @@ def test_twenty_thousand_bad_payloads(tmp_path: Path) -> None:
 def test_what_a_reader_does_not_declare_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from verification.fuzz import work
 
-    class Ear:
+    class BusListener:
         said = b""
 
         def send_bytes(self, payload: bytes) -> None:
@@ -64,7 +64,7 @@ def test_what_a_reader_does_not_declare_is_found(monkeypatch: pytest.MonkeyPatch
 
     make = mutate.Mutator([b"\x81\xa1a\x01"], [b"\x90"], mutate.BINARY, 0)
     monkeypatch.setattr(work, "targets", lambda seed, folder: [Target("clumsy", clumsy, make, 1.0)])
-    ear: Any = Ear()
+    ear: Any = BusListener()
     monkeypatch.setattr(work.logging, "disable", lambda: None)
     work.Work(2000, 0, str(tmp_path)).run(ear)
     report = msgspec.json.decode(ear.said, type=Report)

@@ -13,13 +13,13 @@ from typing import Protocol
 import msgspec
 import zenoh
 
+from node_runtime.bus.lanes import Lanes
 from node_runtime.bus.session import OpenInterrupted, secure
 from node_runtime.config.sections import PLANT_NAME, Config, PlantPlace
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from protocol import topics
 from protocol.topics import Topic
-from trainer_node.fleet.plant_bus import Sessions
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ MOST = 1024
 TRY_AGAIN = 10.0
 """Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
 LET_GO = 1.0
-"""Seconds from the end of a certificate until its sessions are closed."""
+"""Seconds from the end of a certificate until its lanes are closed."""
 NAME = re.compile(PLANT_NAME)
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
 READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
@@ -57,7 +57,7 @@ class Finder(Protocol):
         """With the plant's name, and the address under which it is reached."""
         ...
 
-    def sessions(self, plant: str) -> Sessions:
+    def lanes(self, plant: str) -> Lanes:
         """Where it is reached."""
         ...
 
@@ -98,9 +98,9 @@ class Heard:
 class OneRouter:
     """Plants behind the router of the configuration: one, followed from the start, or all that match a pattern."""
 
-    def __init__(self, config: Config, plants: str, sessions: Sessions):
+    def __init__(self, config: Config, plants: str, lanes: Lanes):
         """`plants`: a pattern as of fnmatch, or one name."""
-        self._config, self._sessions = config, sessions
+        self._config, self._lanes = config, lanes
         self._named = [plants] if NAME.fullmatch(plants) else []
         self.many, self.looks_for = not self._named, f"a plant that matches {plants!r}"
         self._heard = Heard(plants)
@@ -108,7 +108,7 @@ class OneRouter:
 
     def __enter__(self) -> OneRouter:
         if not self._named:
-            self._subscribers = self._heard.listen(self._sessions.bulk, "*", FOUND_BY)
+            self._subscribers = self._heard.listen(self._lanes.session("bulk"), "*", FOUND_BY)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -120,8 +120,8 @@ class OneRouter:
     def config(self, plant: str) -> Config:
         return msgspec.structs.replace(self._config, name=plant)
 
-    def sessions(self, plant: str) -> Sessions:
-        return self._sessions
+    def lanes(self, plant: str) -> Lanes:
+        return self._lanes
 
 
 class OwnRouters:
@@ -138,7 +138,7 @@ class OwnRouters:
         self.looks_for = f"the controller of {', '.join(self._places)}"
         self._heard = Heard("*")
         self._lock = threading.Lock()
-        self._reached: dict[str, Sessions] = {}
+        self._reached: dict[str, Lanes] = {}
         """The latest of each plant, whether they are open still or not."""
         self._open: set[str] = set()
         self._leaving = threading.Event()
@@ -169,19 +169,19 @@ class OwnRouters:
         trainer = msgspec.structs.replace(self._config.trainer, fleet=[])
         return msgspec.structs.replace(self._config, name=plant, bus=bus, trainer=trainer)
 
-    def sessions(self, plant: str) -> Sessions:
+    def lanes(self, plant: str) -> Lanes:
         return self._reached[plant]
 
     def _reach(self, name: str) -> None:
-        """In a thread of its own: keep the plant's sessions open, anew with a new certificate when one is over."""
+        """In a thread of its own: keep the plant's lanes open, anew with a new certificate when one is over."""
         config = self.config(name)
         while not self._leaving.is_set():
             try:
                 valid_s = _valid_s(config)
-                with Sessions(config, "trainer", self._stop) as sessions:
-                    subscribers = self._heard.listen(sessions.bulk, name, READABLE)
+                with Lanes(config, "trainer", self._stop) as lanes:
+                    subscribers = self._heard.listen(lanes.session("bulk"), name, READABLE)
                     with self._lock:
-                        self._reached[name] = sessions
+                        self._reached[name] = lanes
                         self._open.add(name)
                     log.info("%s: reached at %s", name, config.bus.endpoint)
                     self._leaving.wait(valid_s)

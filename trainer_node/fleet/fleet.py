@@ -18,11 +18,12 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from node_runtime.health import HealthPublisher, Heart, run_info
+from node_runtime.bus.lanes import Lanes
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.health import HealthPublisher, HealthThread, run_info
 from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from trainer_node.fleet.discovery import SILENT, Finder
-from trainer_node.fleet.plant_bus import PlantBus, Sessions
 from trainer_node.node import NAMES, POLL, SHARE, TrainerNode, train_round
 
 log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ def seed_of(seed: int, plant: str) -> int:
 
 class _Followed(NamedTuple):
     node: TrainerNode
-    sessions: Sessions
+    lanes: Lanes
     end: ExitStack
 
 
@@ -57,7 +58,7 @@ class Fleet:
         self._nodes: dict[str, _Followed] = {}
         self._shunned: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(ASKERS, "ask")
-        self._heart = Heart()
+        self._health_thread = HealthThread()
         self._share = FLEET_SHARE if finder.many else SHARE
         self._train_at = 0.0
         self._say_at = 0.0
@@ -69,7 +70,7 @@ class Fleet:
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
-        with self._finder, self._heart:
+        with self._finder, self._health_thread:
             try:
                 while not stop.wait(POLL):
                     self.turn(clock.now())
@@ -105,7 +106,7 @@ class Fleet:
             self._drop(name)
         for name in self.plants:
             # It may have been away and back between two looks: after a long round, with a new certificate.
-            if self._finder.sessions(name) is not self._nodes[name].sessions:
+            if self._finder.lanes(name) is not self._nodes[name].lanes:
                 self._drop(name)
         # A few at a time: those that are here must not wait for all that come.
         for name in [name for name in present if name not in self._nodes][:AT_ONCE]:
@@ -122,13 +123,13 @@ class Fleet:
         config = msgspec.structs.replace(said, seed=seed_of(said.seed, name))
         run_id, counts = new_run_id("trainer"), dict.fromkeys(NAMES, 0)
         with ExitStack() as stack:
-            sessions = self._finder.sessions(name)
-            bus = stack.enter_context(PlantBus(config, "trainer", run_id, sessions))
+            lanes = self._finder.lanes(name)
+            bus = stack.enter_context(Bus(config, "trainer", run_id, lanes=lanes))
             info = run_info(said, "trainer", run_id)
-            health = stack.enter_context(HealthPublisher(bus, info, counts.copy, heart=self._heart))
+            health = stack.enter_context(HealthPublisher(bus, info, counts.copy, thread=self._health_thread))
             node = TrainerNode(config, bus, health, counts, self._pool)
             node.start()
-            self._nodes[name] = _Followed(node, sessions, stack.pop_all())
+            self._nodes[name] = _Followed(node, lanes, stack.pop_all())
         if self._finder.many:
             log.info("%s has come; %d plants", name, len(self._nodes))
 

@@ -192,7 +192,7 @@ def gather(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         fault_tick=sum(at < fault_at for at, _ in witness.of(topics.RESULT)),
         view_at_end=_view(rig),
         log_time_off=_log_time_off(log),
-        verdicts=dict(Counter(_short(r.weights_verdict) for r in results if r.weights_verdict != "none")),
+        verdicts=dict(Counter(_short(r.weights_verdict) for r in results if r.weights_outcome != "none")),
         counted=_counted(witness),
         said=_said(rig, witness),
         extra=extra,

@@ -26,7 +26,7 @@ from node_runtime.config.sections import Config, load
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from node_runtime.tls import access_control, credentials
-from node_runtime.tls.handshake import knock
+from node_runtime.tls.client import refusal
 from protocol import codec, topics
 from protocol import messages as m
 from tandem import certificate_authority
@@ -55,7 +55,7 @@ def try_door(config: Config, kind: str, folder: Path) -> tuple[bool, str]:
         return without_certificate(config.bus.endpoint, folder / "good" / "trainer" / "authority.pem")
     place = folder / "late" if kind == "expired certificate" else folder / "other" / "trainer"
     own = credentials.read(place)
-    said = knock(config.bus.endpoint, own)
+    said = refusal(config.bus.endpoint, own)
     local = own.expired()
     return said is not None, f"{said or 'let in'}{f'; {local}' if local else ''}"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
-from node_runtime.bus.batches import Gathered, Gathering
+from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.sections import Config, override
 from node_runtime.health import run_info
 from plant_sim.node import build
@@ -43,7 +43,7 @@ def seeds() -> dict[str, list[bytes]]:
     def said(topic: Topic, message: m.Message) -> None:
         out[topic.name].append(codec.encode(message))
 
-    said(topics.KEYFRAME, core.keyframe(-1))
+    said(topics.KEYFRAME, core.memory.keyframe(-1))
     for step in range(STEPS):
         state = plant.sample(step * settings.period)
         weights = _weights(core, step) if step == STEPS - 1 else None
@@ -81,8 +81,8 @@ def seeds() -> dict[str, list[bytes]]:
     for batch in outbox.batches(outbox.since(-1)):
         said(topics.SAMPLES, batch)
         said(ANSWERS[1], batch)
-    said(topics.KEYFRAME, core.keyframe(STEPS - 1))
-    snapshot = core.hidden_snapshot(STEPS - 1)
+    said(topics.KEYFRAME, core.memory.keyframe(STEPS - 1))
+    snapshot = core.memory.hidden_snapshot(STEPS - 1)
     assert snapshot is not None
     said(ANSWERS[0], snapshot)
     said(
@@ -101,16 +101,16 @@ def seeds() -> dict[str, list[bytes]]:
         said(topics.HEALTH[process], health)
     for name, topic in topics.BATCH.items():
         inside = topics.PLANT_STATE if name == "plant" else topics.COMMAND
-        parts = [Gathered(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
-        out[topic.name].append(Gathering(f"{name}-1").encode(parts))
+        parts = [Waiting(inside.name, i, payload) for i, payload in enumerate(out[inside.name])]
+        out[topic.name].append(encode_batch(f"{name}-1", 0, parts))
     return out
 
 
 def _weights(core: ControllerCore, seq: int) -> m.HiddenWeights:
     """Acceptable ones."""
-    snapshot = core.hidden_snapshot(seq)
+    snapshot = core.memory.hidden_snapshot(seq)
     assert snapshot is not None
-    assert core.description is not None
+    assert core.controller.oracle.description is not None
     return m.HiddenWeights(
         run_id="trainer-1",
         seq=1,
@@ -120,7 +120,7 @@ def _weights(core: ControllerCore, seq: int) -> m.HiddenWeights:
         samples=20,
         loss_before=1e-3,
         loss_after=1e-4,
-        network_sha256=core.description.sha256(),
+        network_sha256=core.controller.oracle.description.sha256(),
         sha256=snapshot.hidden_sha256,
         layers=snapshot.layers,
     )

@@ -17,11 +17,11 @@ from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from lbmpc.sets.certificate import CertificateError
 from network_model.description import NetworkDescription
-from node_runtime.bus.batches import separate
+from node_runtime.bus.batches import unbatch
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.config.sections import Config, from_json, from_tree, to_json, to_toml
 from node_runtime.config.strict import ConfigError
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
@@ -77,7 +77,7 @@ def targets(seed: int, folder: Path) -> list[Target]:
     add(
         "outbox: a question", _asking(), [b"run=controller-1;since=3;last=10", b"since=-1"], 0.5, textual=True
     )
-    described = msgspec.json.encode(core.description)
+    described = msgspec.json.encode(core.controller.oracle.description)
     add("network description", _describing, [described], 0.2, textual=True)
     add("configuration, TOML", _configuring, [to_toml(settings).encode(), b"rate = 20\n"], 0.02, textual=True)
     add("configuration, JSON", _reconfiguring, [to_json(settings).encode()], 0.02, textual=True)
@@ -105,11 +105,11 @@ def _glancing(payload: bytes) -> str:
 
 
 def _separating(topic: Topic) -> Read:
-    bad = BadMessages()
+    bad = RejectedMessages()
     key = topic.key("jet1")
 
     def read(payload: bytes) -> str:
-        parts = list(separate(Delivery(key, payload, 10**9), bad))
+        parts = list(unbatch(Delivery(key, payload, 10**9), bad))
         return "accepted" if parts and parts[0].key != key else "malformed"
 
     return read
@@ -117,7 +117,7 @@ def _separating(topic: Topic) -> Read:
 
 def _adopting(core: ControllerCore) -> Read:
     """From the bus to the controller's memory, through a whole step."""
-    before = core.state
+    before = core.memory.state
     states = [codec.decode(topics.TICK, payload) for payload in seeds()[topics.TICK.name]]
     tick = states[-1]
     assert isinstance(tick, m.Tick)
@@ -128,10 +128,10 @@ def _adopting(core: ControllerCore) -> Read:
         except BadMessage as error:
             return error.reason
         assert isinstance(weights, m.HiddenWeights)
-        core.state = before
-        seen = core._observe(msgspec.structs.replace(tick, weights=weights))
-        _, verdict = core.controller._adopt(before.oracle, seen.hidden)
-        return "accepted" if verdict == "adopted" else _kind(verdict)
+        seen = core.translation.observation(msgspec.structs.replace(tick, weights=weights))
+        assert seen.hidden is not None
+        _, verdict = core.controller.oracle.adopt(before.oracle, seen.hidden)
+        return "accepted" if verdict.outcome == "adopted" else _kind(verdict.reason)
 
     return read
 
@@ -146,7 +146,7 @@ def _restoring(core: ControllerCore) -> Read:
         try:
             # Weights that no float32 holds are infinite in a hash of float32; numpy says so, and it is no mistake.
             with np.errstate(over="ignore"):
-                core.restore(keyframe)
+                core.memory.restore(keyframe)
         except ValueError:
             return "does not fit"
         return "accepted"
@@ -217,9 +217,9 @@ def _logging(path: Path) -> Read:
     return read
 
 
-def _kind(verdict: str) -> str:
+def _kind(reason: str) -> str:
     """Without its figures."""
-    return re.sub(r"\(.*|\[.*|-?\d[\d.e+-]*", "", verdict)[:40].strip(" ,")
+    return re.sub(r"\(.*|\[.*|-?\d[\d.e+-]*", "", reason)[:40].strip(" ,")
 
 
 def _sets() -> bytes:

@@ -5,34 +5,32 @@ They could be compiled, and then cost a fifth of what numpy takes for so few num
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import is_
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-
-if TYPE_CHECKING:
-    from lbmpc.oracles.dnn.oracle import DnnOracle
-
-Realise = Callable[[ca.Function], ca.Function]
+from lbmpc.oracles.base import Realise
+from lbmpc.oracles.dnn.expressions import NetworkExpressions
 
 
 class LastLayer:
     """h_hat = s * K' phi and the law of `lbmpc.oracles.dnn.adaptation_law`, on arrays that stay in place.
 
     Args:
-        oracle: whose network it is.
+        net: the network.
+        gamma: learning rate.
+        bounds: Wbar_i, (d,), scaled.
         realise: may compile the functions.
     """
 
-    def __init__(self, oracle: DnnOracle, realise: Realise):
-        estimate, learn = build_last_layer(oracle)
+    def __init__(self, net: NetworkExpressions, gamma: float, bounds: np.ndarray, realise: Realise):
+        estimate, learn = build_last_layer(net)
         self._estimate, self._learn = Bound(realise(estimate)), Bound(realise(learn))
-        self._learn.inputs["gamma"][0, 0] = oracle.gamma
-        self._learn.inputs["bounds"][:, 0] = oracle.bounds
+        self._learn.inputs["gamma"][0, 0] = gamma
+        self._learn.inputs["bounds"][:, 0] = bounds
         self._hidden: Sequence[np.ndarray] = ()
 
     def estimate(
@@ -80,22 +78,22 @@ class LastLayer:
             point[d:-m] = past
 
 
-def build_last_layer(oracle: DnnOracle) -> tuple[ca.Function, ca.Function]:
+def build_last_layer(net: NetworkExpressions) -> tuple[ca.Function, ca.Function]:
     """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, gamma, bounds) -> K_next, K (d, 1 + n_L)."""
-    features, d = oracle.description.features, oracle.d
-    su = ca.MX.sym("su", d + (oracle.pairs - 1) * (d + oracle.m) + oracle.m)
-    hidden, K = ca.MX.sym("hidden", oracle.parameters - features * d), ca.MX.sym("K", d, features)
+    features, d = net.description.features, net.d
+    su = ca.MX.sym("su", d + (net.pairs - 1) * (d + net.m) + net.m)
+    hidden, K = ca.MX.sym("hidden", net.parameters - features * d), ca.MX.sym("K", d, features)
     h, gamma, bounds = ca.MX.sym("h", d), ca.MX.sym("gamma"), ca.MX.sym("bounds", d)
-    parts = oracle.split(ca.vertcat(hidden, ca.vec(K)))
-    phi = ca.vertcat(1, oracle.activation(su, parts))
+    parts = net.split(ca.vertcat(hidden, ca.vec(K)))
+    phi = ca.vertcat(1, net.activation(su, parts))
     unit = K @ phi
-    error = unit - h / oracle.output_scale
+    error = unit - h / net.output_scale
     moved = K - (gamma / ca.dot(phi, phi)) * (error @ phi.T)
     norms = ca.sqrt(ca.sum2(moved * moved))
     # bounds / bounds is 1 exactly, so what keeps its bound is not touched.
     kept = moved * ca.repmat(bounds / ca.fmax(norms, bounds), 1, features)
     estimate = ca.Function(
-        "estimate", [su, hidden, K], [unit * oracle.output_scale], ["su", "hidden", "K"], ["h_hat"]
+        "estimate", [su, hidden, K], [unit * net.output_scale], ["su", "hidden", "K"], ["h_hat"]
     )
     names = ["su", "hidden", "K", "h", "gamma", "bounds"]
     learn = ca.Function("learn", [su, hidden, K, h, gamma, bounds], [ca.densify(kept)], names, ["K_next"])

@@ -24,7 +24,7 @@ class SetsCheck(Configured):
     def run(self) -> int:
         """0: everything holds; 3: refused, and why."""
         config, _ = self.resolve()
-        from controller_node.build import model_for
+        from controller_node.build import build_model
         from controller_node.certified_sets import read_sets
         from lbmpc.sets.certificate import CertificateError, require_match
         from lbmpc.sets.check import check
@@ -32,7 +32,7 @@ class SetsCheck(Configured):
 
         if self.samples < 1:
             raise terminal.Refused(f"--samples {self.samples}: at least 1")
-        model = model_for(config)
+        model = build_model(config)
         result: dict[str, Any] = {"file": str(self.file), "certificate": "ok"}
         reason = ""
         try:

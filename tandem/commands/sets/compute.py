@@ -46,7 +46,7 @@ class SetsCompute(Configured):
         config, _ = self.resolve()
         import numpy as np
 
-        from controller_node.build import model_for
+        from controller_node.build import build_model
         from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
         from lbmpc.sets.enclosures.search import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
@@ -55,7 +55,7 @@ class SetsCompute(Configured):
             raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
         if self.out.is_dir():
             raise Refused(f"{self.out}: is a folder; name a file")
-        model = model_for(config)
+        model = build_model(config)
         W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
         start = start_of(config, model)
         kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)

@@ -109,21 +109,23 @@ class _LockStep:
         return None if noise is None else np.array(noise)
 
     def _trainer(self) -> Trainer | None:
-        snapshot = self.core.hidden_snapshot(-1)
-        if snapshot is None or self.core.description is None:
+        snapshot = self.core.memory.hidden_snapshot(-1)
+        if snapshot is None or self.core.controller.oracle.description is None:
             return None
         # torch is imported only where there is a network to train.
         from trainer_node.training import Trainer, use_one_thread
 
         use_one_thread()
         hidden = [layer.numpy().astype(float) for layer in snapshot.layers]
-        return Trainer(self.core.description, self.config.trainer, self.config.seed, TRAINER, hidden)
+        return Trainer(
+            self.core.controller.oracle.description, self.config.trainer, self.config.seed, TRAINER, hidden
+        )
 
     def run(self, steps: int, progress: Progress | None) -> Outcome:
         self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
         if (sets := self.core.certified_sets()) is not None:
             self._note(topics.SETS, sets, 0)
-        self._note(topics.KEYFRAME, self.core.keyframe(-1), 0)
+        self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
         lost, seq = None, -1
         try:
             for seq in range(steps):
@@ -134,7 +136,7 @@ class _LockStep:
         except PlantError as error:
             lost = f"at step {seq} of {steps}: {error}"
         if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
-            self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
+            self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
         return Outcome(gather(self.config, self.log), lost)
 
     def _step(self, seq: int) -> None:
@@ -178,7 +180,7 @@ class _LockStep:
             self._note(topic, message, seq)
         self._learn(seq, outputs)
         if (seq + 1) % self.config.controller.keyframe_every == 0:
-            self._note(topics.KEYFRAME, self.core.keyframe(seq), seq)
+            self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
         """The newest hidden weights that are here by now."""

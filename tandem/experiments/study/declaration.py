@@ -11,8 +11,7 @@ import msgspec
 
 from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, PositiveInt, Section, from_tree
-from node_runtime.config.strict import ConfigError, apply_override, load_tree, strict
-from node_runtime.config.wording import nearest
+from node_runtime.config.strict import ConfigError, apply_override, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults
 
 Picture = Literal["trajectories", "states", "survival", "lemma", "recovery", "rows"]
@@ -197,7 +196,8 @@ def _x0s(declared: Declaration, case: Case, plant: Plant, where: str) -> list[li
 
 def _known(path: Path, key: str, name: str, names: list[str]) -> None:
     if name not in names:
-        raise ConfigError(f"{path}: {key} = {name!r} is not known; {nearest(name, names)}")
+        hint = did_you_mean(name, names, f"there are {', '.join(names)}")
+        raise ConfigError(f"{path}: {key} = {name!r} is not known; {hint}")
 
 
 def _merged(tree: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from controller_node.build import build_oracle, model_for
-from lbmpc.oracles import DnnOracle
+from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
 from run_log.reading.reader import Run
 from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
@@ -104,8 +103,9 @@ def _traces(run: Run) -> Traces:
 
 
 def _lemma(run: Run, config: Config) -> Lemma | None:
-    oracle = build_oracle(config, model_for(config))
-    return measure(run, oracle) if isinstance(oracle, DnnOracle) else None
+    if config.controller.oracle != "dnn":
+        return None
+    return measure(run, build_network_oracle(config, build_plant(config)))
 
 
 def write_whole(path: Path, data: bytes) -> None:

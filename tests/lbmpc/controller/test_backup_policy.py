@@ -115,7 +115,7 @@ def test_a_margin_that_costs_nothing_is_kept(
         solved.append(arguments)
         return least_distance(*arguments)
 
-    monkeypatch.setattr("lbmpc.controller.backup_policy.least_distance", counted)
+    monkeypatch.setattr("lbmpc.solver.rows.least_distance", counted)
     theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
     policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
     assert policy is not None
@@ -232,10 +232,10 @@ def test_in_plant_units_it_is_the_same_policy() -> None:
     backup = core.backup(outputs.command)
     assert backup is not None
     codec.check_dimensions(topics.BACKUP, backup, 4, 1)
-    expected = core.state.predicted + PLANT.x_e
+    expected = core.memory.state.predicted + PLANT.x_e
     u = np.array(backup.inputs[0]) + np.array(backup.gain) @ expected
     planner = BackupPlanner(core.controller.problem, CONFIG.controller.backup.margin)
-    policy = core.controller.backup(planner, core.state)
+    policy = core.controller.backup(planner, core.memory.state)
     assert policy is not None
     v = policy.inputs[0] + policy.gain @ policy.states[0]
     assert u == pytest.approx(v + PLANT.u_e, abs=1e-12)

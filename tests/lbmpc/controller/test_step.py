@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lbmpc.controller.step import Controller, ControllerState, HiddenSet, Observation, same_memory
+from lbmpc.controller.signals import Observation
+from lbmpc.controller.state import ControllerState, same_memory
+from lbmpc.controller.step import Controller
 from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
+from lbmpc.oracles.base import HiddenSet, Verdict
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem
 from lbmpc.solver.rows import Box
@@ -51,7 +54,7 @@ def test_a_swap_learns_the_old_label_with_the_old_features() -> None:
     state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
     plain, _ = CONTROLLER.step(state, seen(X_NEXT, 1))
     swapped, result = CONTROLLER.step(state, seen(X_NEXT, 1, hidden=offered(0.5)))
-    assert result.verdict == "adopted"
+    assert result.verdict == Verdict("adopted")
     np.testing.assert_array_equal(swapped.oracle["K"], plain.oracle["K"])
     assert not np.array_equal(swapped.oracle["W1"], plain.oracle["W1"])
     # And from then on the new features count.
@@ -87,10 +90,10 @@ def test_a_refused_set_is_named_and_the_loop_goes_on_with_the_old_one() -> None:
     broken = offered(0.1)
     broken.layers[0][0, 0] = np.nan
     after, result = CONTROLLER.step(state, seen(X, 0, None, hidden=broken))
-    assert result.verdict == "refused: layer 1 is not finite"
+    assert result.verdict == Verdict("refused", "layer 1 is not finite")
     assert result.mode == "solver"
     np.testing.assert_array_equal(after.oracle["W1"], state.oracle["W1"])
-    assert CONTROLLER.step(after, seen(X_NEXT, 1, hidden=offered(0.1)))[1].verdict == "adopted"
+    assert CONTROLLER.step(after, seen(X_NEXT, 1, hidden=offered(0.1)))[1].verdict == Verdict("adopted")
 
 
 class Failing:

@@ -7,9 +7,8 @@ import pytest
 
 from controller_node.codegen.compiler import Compiler
 from lbmpc.oracles import DnnOracle, L2nwOracle
-from lbmpc.oracles.base import function
+from lbmpc.oracles.base import HiddenSet, Realise, Verdict, function
 from lbmpc.oracles.dnn.adaptation_law import adapt
-from lbmpc.oracles.dnn.last_layer import Realise
 from network_model.description import hash_layers
 from tests.helpers.science import compressor, describe, oracle_named
 
@@ -133,14 +132,14 @@ def _offer(oracle: DnnOracle, state, **change):  # type: ignore[no-untyped-def]
         "sha256": hash_layers(layers),
         "network_sha256": oracle.description.sha256(),
     }
-    return oracle.adopt(state, **(offer | change))
+    return oracle.adopt(state, HiddenSet(**(offer | change)))
 
 
 def test_adoption_swaps_the_hidden_layers_and_keeps_K() -> None:
     oracle = DnnOracle(describe(MODEL, [5, 4]))
     state = oracle.initial_state(np.random.default_rng(0))
     after, verdict = _offer(oracle, state)
-    assert verdict == "adopted"
+    assert verdict == Verdict("adopted")
     assert after["version"][0] == 1
     np.testing.assert_array_equal(after["K"], state["K"])
     np.testing.assert_allclose(after["W1"], state["W1"] + 0.25, atol=1e-6)
@@ -161,6 +160,6 @@ def test_a_bad_set_is_refused_by_name_and_changes_nothing(change: dict, reason: 
     oracle = DnnOracle(describe(MODEL, [5, 4]))
     state = oracle.initial_state(np.random.default_rng(0))
     after, verdict = _offer(oracle, state, **change)
-    assert verdict.startswith("refused: ")
-    assert reason in verdict
+    assert verdict.outcome == "refused"
+    assert reason in verdict.reason
     assert after is state

@@ -10,8 +10,8 @@ import pytest
 from controller_node.build import describe_trial
 from controller_node.core import ControllerCore
 from lbmpc.oracles import DnnOracle
-from lbmpc.oracles.base import OracleState
-from lbmpc.oracles.dnn.oracle import IN_USE, NEWEST
+from lbmpc.oracles.base import HiddenSet, OracleState, Verdict
+from lbmpc.oracles.dnn.adoption import IN_USE, NEWEST
 from lbmpc.oracles.dnn.trial import TRIED, Finding, Trial, empty, had, newest, remember, tried
 from network_model.description import hash_layers
 from node_runtime.config.sections import Config, load, override
@@ -85,9 +85,9 @@ def more(oracle: DnnOracle, state: OracleState, x: np.ndarray) -> OracleState:
     return oracle.learn(state, x, np.array([0.1]), 0.01 * np.array([x[0] + 0.3, x[1], 0.0, 0.2]))
 
 
-def offer(oracle: DnnOracle, state: OracleState, layers: Layers, version: int) -> tuple[OracleState, str]:
+def offer(oracle: DnnOracle, state: OracleState, layers: Layers, version: int) -> tuple[OracleState, Verdict]:
     layers = [layer.astype(np.float32).astype(float) for layer in layers]
-    return oracle.adopt(state, version, layers, hash_layers(layers), oracle.description.sha256())
+    return oracle.adopt(state, HiddenSet(version, layers, hash_layers(layers), oracle.description.sha256()))
 
 
 def nudged(hidden: Layers) -> Layers:
@@ -105,7 +105,7 @@ def assert_as_it_was(after: OracleState, state: OracleState) -> None:
 def test_nothing_can_be_tried_without_samples() -> None:
     state = learned(9)
     after, verdict = offer(ORACLE, state, ORACLE.hidden(state), 1)
-    assert verdict == "refused: trial: 9 samples so far, 10 are needed"
+    assert verdict == Verdict("refused", "trial: 9 samples so far, 10 are needed")
     assert after is state
 
 
@@ -115,11 +115,12 @@ def test_a_set_that_predicts_worse_is_refused_with_both_figures(architecture: st
     state = learned(60, oracle)
     hidden = oracle.hidden(state)
     after, verdict = offer(oracle, state, [*hidden[:-1], -hidden[-1]], 1)
-    assert verdict.startswith("refused: trial: error ")
-    assert " against " in verdict
+    assert verdict.outcome == "refused"
+    assert verdict.reason.startswith("trial: error ")
+    assert " against " in verdict.reason
     assert_as_it_was(after, state)
     adopted, verdict = offer(oracle, state, nudged(hidden), 1)
-    assert verdict == "adopted"
+    assert verdict.outcome == "adopted"
     np.testing.assert_array_equal(adopted["K"], state["K"])
     assert list(adopted["version"]) == [1, 1]
 
@@ -138,7 +139,7 @@ def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> N
     state = learned(60, spread=0.01)
     before = {name: state[name].copy() for name in ("W1", "W2", "K")}
     state, verdict = offer(ORACLE, state, _worse_elsewhere(state), 7)
-    assert verdict == "adopted", verdict
+    assert verdict.outcome == "adopted", verdict
     assert ORACLE.confirm(state) == (state, "")
     said = ""
     for _ in range(TRIAL.window):
@@ -151,14 +152,16 @@ def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> N
     assert int(state["version"][IN_USE]) == 0
     # What comes next must be newer than what was rolled back.
     assert int(state["version"][NEWEST]) == 7
-    assert offer(ORACLE, state, ORACLE.hidden(state), 7)[1] == "refused: version 7 is not newer than 7"
-    assert offer(ORACLE, state, nudged(ORACLE.hidden(state)), 8)[1] == "adopted"
+    assert offer(ORACLE, state, ORACLE.hidden(state), 7)[1] == Verdict(
+        "refused", "version 7 is not newer than 7"
+    )
+    assert offer(ORACLE, state, nudged(ORACLE.hidden(state)), 8)[1].outcome == "adopted"
 
 
 def test_a_set_that_holds_is_confirmed_and_the_one_before_is_forgotten() -> None:
     state = learned(60)
     state, verdict = offer(ORACLE, state, nudged(ORACLE.hidden(state)), 1)
-    assert verdict == "adopted"
+    assert verdict.outcome == "adopted"
     for _ in range(TRIAL.window):
         assert state["watch"][0] == 1
         state, said = ORACLE.confirm(more(ORACLE, state, np.full(4, 0.01)))
@@ -175,14 +178,16 @@ def test_a_set_that_was_there_before_is_refused_under_any_version() -> None:
     worse = [*first[:-1], -first[-1]]
     for version, layers in ((1, second), (2, third)):
         state, verdict = offer(ORACLE, state, layers, version)
-        assert verdict == "adopted"
+        assert verdict.outcome == "adopted"
     state, verdict = offer(ORACLE, state, worse, 3)
-    assert verdict.startswith("refused: trial: ")
+    assert verdict.outcome == "refused"
+    assert verdict.reason.startswith("trial: ")
     for layers in (first, second, third, worse):
         after, verdict = offer(ORACLE, state, layers, 9)
-        assert verdict.startswith("refused: stale: ")
+        assert verdict.outcome == "refused"
+        assert verdict.reason.startswith("stale: ")
         assert after is state
-    assert offer(ORACLE, state, nudged(third), 9)[1] == "adopted"
+    assert offer(ORACLE, state, nudged(third), 9)[1].outcome == "adopted"
 
 
 def test_the_memory_of_trials_has_an_end() -> None:
@@ -197,7 +202,7 @@ def test_the_memory_of_trials_has_an_end() -> None:
 
 def test_a_version_near_the_end_of_all_numbers_does_not_shut_out_everybody_else() -> None:
     state = learned(60)
-    assert "leaps too far" in offer(ORACLE, state, ORACLE.hidden(state), 2**62)[1]
+    assert "leaps too far" in offer(ORACLE, state, ORACLE.hidden(state), 2**62)[1].reason
 
 
 # -- the closed loop under attack ----------------------------------------------------------------------------
@@ -240,9 +245,7 @@ LOOSE = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adap
 SMALL = ["controller.horizon=15", "controller.keyframe_every=10", "network.hidden=[8, 8]", "trainer.steps=20"]
 
 
-def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe_between_adoption_and_rollback() -> (
-    None
-):
+def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> None:
     run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = [result.seq for result in run.results if result.weights_rolled_back]
     assert back
@@ -282,7 +285,7 @@ def test_after_a_rollback_the_newest_version_and_the_hash_in_use_are_told() -> N
 def test_a_keyframe_carries_the_trial() -> None:
     config = override(Config(), SMALL)
     core = ControllerCore(config, "controller-a")
-    arrays = core.keyframe(-1).arrays
+    arrays = core.memory.keyframe(-1).arrays
     assert {
         "oracle.recent",
         "oracle.seen",
@@ -291,4 +294,4 @@ def test_a_keyframe_carries_the_trial() -> None:
         "oracle.before.K",
         "oracle.before.W1",
     } <= arrays.keys()
-    core.restore(core.keyframe(-1))
+    core.memory.restore(core.memory.keyframe(-1))

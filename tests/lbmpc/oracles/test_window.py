@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from controller_node.outbox import BATCH, Outbox
-from lbmpc.controller.step import Controller, ControllerState, Observation, StepResult
+from lbmpc.controller.signals import Observation, StepResult
+from lbmpc.controller.state import ControllerState
+from lbmpc.controller.step import Controller
 from lbmpc.oracles import DnnOracle
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from lbmpc.controller.step import Controller, Observation
+from lbmpc.controller.signals import Observation
+from lbmpc.controller.step import Controller
 from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant

@@ -144,7 +144,7 @@ def test_one_real_time_iteration_is_close_to_the_optimum(name: str) -> None:
     assert np.median(differences) < limit / 20
 
 
-def test_the_feedback_keeps_the_constraints_of_the_measured_state_and_not_of_the_predicted_one() -> None:
+def test_the_feedback_keeps_the_constraints_of_the_measured_state() -> None:
     model = compressor()
     oracle = oracle_named("dnn", model)
     solver = Solver(build_problem(model, oracle, 15, "tube"))

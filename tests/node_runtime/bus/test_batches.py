@@ -7,15 +7,17 @@ from collections.abc import Iterator
 
 import pytest
 
-from node_runtime.bus.batches import Gathering, Separating
+from node_runtime.bus.batches import UnbatchingMailbox
+from node_runtime.bus.bulk_queue import BulkQueue
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.live import HANG_S, live_config, wait_for
+from protocol.topics import Topic
+from tests.helpers.live import HANG_S, live_config, matched, wait_for
 
 BATCH = topics.BATCH["controller"]
 KEY = BATCH.key("jet1")
@@ -38,20 +40,33 @@ def hear(heard: list[Delivery], new: list[Delivery]) -> list[Delivery]:
     return heard
 
 
-def gathered(count: int) -> tuple[bytes, list[bytes]]:
-    gathering = Gathering("controller-a")
+class Sent:
+    """A queue whose messages are sent at once, to here."""
+
+    def __init__(self) -> None:
+        self.batches: list[bytes] = []
+        self.queue = BulkQueue("controller-a", BATCH, lambda send: send(), self._send)
+
+    def _send(self, topic: Topic, payload: bytes) -> None:
+        assert topic is BATCH
+        self.batches.append(payload)
+
+
+def batched(count: int) -> tuple[bytes, list[bytes]]:
+    sent = Sent()
     payloads = [codec.encode(timing(seq)) for seq in range(count)]
     for k, payload in enumerate(payloads):
-        gathering.add(topics.TIMING, payload, 1_000_000 * k)
-    waiting, size = gathering.take()
-    assert size == sum(map(len, payloads))
-    assert gathering.take() == ([], 0)
-    return gathering.encode(waiting), payloads
+        sent.queue.put_batched(topics.TIMING, payload, 100_000 * k)
+    assert sent.batches == []
+    assert sent.queue.flush(0.0)
+    assert sent.queue.flush(0.0)
+    (batch,) = sent.batches
+    return batch, payloads
 
 
-def test_what_was_gathered_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
-    batch, payloads = gathered(30)
-    mailbox = Separating("everything", 10, BadMessages())
+def test_a_batch_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
+    batch, payloads = batched(30)
+    mailbox = UnbatchingMailbox("everything", 10, RejectedMessages())
     mailbox.put(Delivery("tandem/jet1/plant/state", b"alone", 5))
     mailbox.put(Delivery(KEY, batch, 10**9))
     first = mailbox.get()
@@ -62,20 +77,22 @@ def test_what_was_gathered_comes_out_byte_for_byte_in_order_with_its_own_times()
     assert [one.payload for one in rest] == payloads
     assert {one.key for one in rest} == {topics.TIMING.key("jet1")}
     steps = {b.received_ns - a.received_ns for a, b in itertools.pairwise(rest)}
-    assert steps == {1_000_000}
+    assert steps == {100_000}
     assert rest[-1].received_ns <= 10**9
 
 
 def test_messages_wait_twenty_milliseconds_and_no_longer() -> None:
-    gathering = Gathering("controller-a")
-    due = [gathering.add(topics.TIMING, b"x", 1_000_000 * k) for k in range(21)]
-    assert due == [False] * 20 + [True]
+    sent, due = Sent(), []
+    for k in range(21):
+        sent.queue.put_batched(topics.TIMING, b"x", 1_000_000 * k)
+        due.append(len(sent.batches))
+    assert due == [0] * 20 + [1]
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", codec.encode(timing(0))])
 def test_a_batch_that_cannot_be_read_is_counted_and_handed_on(payload: bytes) -> None:
-    bad = BadMessages()
-    mailbox = Separating("everything", 10, bad)
+    bad = RejectedMessages()
+    mailbox = UnbatchingMailbox("everything", 10, bad)
     delivery = Delivery(KEY, payload, 1)
     mailbox.put(delivery)
     assert mailbox.drain() == [delivery]
@@ -83,11 +100,11 @@ def test_a_batch_that_cannot_be_read_is_counted_and_handed_on(payload: bytes) ->
 
 
 @pytest.mark.parametrize(("rate", "together"), [(20.0, False), (100.0, False), (101.0, True), (1000.0, True)])
-def test_only_a_fast_loop_gathers(rate: float, together: bool) -> None:
+def test_only_a_fast_loop_sends_batches(rate: float, together: bool) -> None:
     for topic in (topics.TICK, topics.RESULT, topics.TIMING, topics.PLANT_STATE, topics.COMMAND):
-        assert topics.gathers(topic, rate) is together
+        assert topic.batched_at(rate) is together
     for topic in (topics.KEYFRAME, topics.OUTPUT_WEIGHTS, topics.SAMPLES, topics.HIDDEN_WEIGHTS):
-        assert not topics.gathers(topic, rate)
+        assert not topic.batched_at(rate)
 
 
 @pytest.fixture(scope="module")
@@ -105,12 +122,12 @@ def test_control_goes_straight_to_who_needs_it_and_once_to_who_logs_it(config: C
         Bus(config, "recorder", "recorder-a") as recorder,
     ):
         states, everything = controller.queue(topics.PLANT_STATE), recorder.everything()
-        wait_for(lambda: plant.matched(topics.PLANT_STATE) and plant.matched(topics.BATCH["plant"]))
+        wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(plant, topics.BATCH["plant"]))
         payloads = [codec.encode(state(seq)) for seq in range(50)]
         # One by one, as a loop sends them: the control lane drops what a full link cannot take at once.
         for seq in range(50):
             plant.publish(topics.PLANT_STATE, state(seq))
-            wait_for(lambda: states.received == seq + 1)  # noqa: B023 - called before the loop goes on
+            wait_for(lambda: len(states) == seq + 1)  # noqa: B023 - called before the loop goes on
         # Long before the batch is due, and under the key that it has at any rate.
         assert [one.payload for one in states.drain()] == payloads
         assert plant.flush(HANG_S)
@@ -125,16 +142,16 @@ def test_a_plant_that_speaks_under_the_plain_key_is_heard_at_any_rate(config: Co
     slow = override(config, ["rate=20"])
     with Bus(slow, "plant", "plant-a") as stranger, Bus(config, "controller", "controller-a") as controller:
         states = controller.queue(topics.PLANT_STATE)
-        wait_for(lambda: stranger.matched(topics.PLANT_STATE))
+        wait_for(lambda: matched(stranger, topics.PLANT_STATE))
         stranger.publish(topics.PLANT_STATE, state(7))
-        wait_for(lambda: states.received == 1)
+        wait_for(lambda: len(states) == 1)
 
 
 @pytest.mark.live
 def test_what_was_published_before_goes_out_before(config: Config) -> None:
     with Bus(config, "controller", "controller-a") as bus, Bus(config, "recorder", "recorder-a") as recorder:
         everything = recorder.everything()
-        wait_for(lambda: bus.matched(BATCH) and bus.matched(topics.KEYFRAME))
+        wait_for(lambda: matched(bus, BATCH) and matched(bus, topics.KEYFRAME))
         for seq in range(3):
             bus.publish(topics.TIMING, timing(seq))
         bus.publish(topics.KEYFRAME, m.Keyframe(run_id="controller-a", seq=2, arrays={}))

@@ -19,7 +19,7 @@ from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
+from tests.helpers.live import HANG_S, Process, connected, free_endpoint, live_config, matched, wait_for
 
 pytestmark = pytest.mark.live
 BLOCKED_S = 5.0
@@ -55,45 +55,45 @@ def controller(config: Config) -> Iterator[Bus]:
         yield bus
 
 
-def seq_of(payload: bytes | None) -> int:
-    assert payload is not None
-    return codec.decode(topics.PLANT_STATE, payload).seq
+def seq_of(delivery: Delivery | None) -> int:
+    assert delivery is not None
+    return codec.decode(topics.PLANT_STATE, delivery.payload).seq
 
 
 # -- receiving -------------------------------------------------------------------------------------------
 
 
-def test_latest_is_the_newest_and_only_once(plant: Bus, controller: Bus) -> None:
-    latest = controller.latest(topics.PLANT_STATE)
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
-    assert latest.take() is None
+def test_of_a_queue_of_one_the_newest_is_read_and_only_once(plant: Bus, controller: Bus) -> None:
+    latest = controller.queue(topics.PLANT_STATE, capacity=1)
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
+    assert latest.get() is None
     for seq in range(10):
         plant.publish(topics.PLANT_STATE, state(seq))
         # One by one: the control lane drops what a full link cannot take at once.
-        wait_for(lambda: latest.received == seq + 1)  # noqa: B023 - called before the loop goes on
-    assert seq_of(latest.take()) == 9
-    assert latest.take() is None
-    assert latest.superseded == 9
+        wait_for(lambda: len(latest) + latest.overflow == seq + 1)  # noqa: B023 - called before the loop goes on
+    assert seq_of(latest.get()) == 9
+    assert latest.get() is None
+    assert latest.overflow == 9
 
 
 def test_waiting_ends_with_the_arrival_or_in_time(plant: Bus, controller: Bus) -> None:
-    latest = controller.latest(topics.PLANT_STATE)
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
-    assert latest.wait(0.02) is None
+    latest = controller.queue(topics.PLANT_STATE, capacity=1)
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
+    assert latest.get(0.02) is None
     threading.Timer(0.05, plant.publish, (topics.PLANT_STATE, state(3))).start()
     before = clock.now()
-    assert seq_of(latest.wait(2 * HANG_S)) == 3
+    assert seq_of(latest.get(2 * HANG_S)) == 3
     assert clock.now() - before < HANG_S
 
 
 def test_a_queue_keeps_order_and_its_bound(plant: Bus, controller: Bus) -> None:
     mailbox = controller.queue(topics.PLANT_STATE, capacity=5)
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
     for seq in range(20):
         plant.publish(topics.PLANT_STATE, state(seq))
-        wait_for(lambda: mailbox.received == seq + 1)  # noqa: B023 - called before the loop goes on
+        wait_for(lambda: len(mailbox) + mailbox.overflow == seq + 1)  # noqa: B023 - called before the loop goes on
     deliveries = [mailbox.get(0.0) for _ in range(6)]
-    assert [seq_of(d.payload) for d in deliveries if d] == [15, 16, 17, 18, 19]
+    assert [seq_of(d) for d in deliveries if d] == [15, 16, 17, 18, 19]
     assert deliveries[5] is None
     assert controller.counters()["overflow plant/state"] == 15
 
@@ -109,7 +109,7 @@ def test_a_mailbox_is_bounded_in_bytes_too() -> None:
 def test_everything_is_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus) -> None:
     mailbox = controller.everything()
     health = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={"n": 1}, note="")
-    wait_for(lambda: plant.matched(topics.PLANT_STATE) and plant.matched(topics.HEALTH["plant"]))
+    wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(plant, topics.HEALTH["plant"]))
     plant.publish(topics.PLANT_STATE, state(1))
     plant.publish(topics.HEALTH["plant"], health)
     controller.publish(topics.KEYFRAME, keyframe(0, 100_000))
@@ -123,23 +123,23 @@ def test_everything_is_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus
 
 def test_a_slow_reader_stalls_nobody(plant: Bus, controller: Bus) -> None:
     unread = controller.queue(topics.HEALTH["plant"], capacity=3)
-    latest = controller.latest(topics.PLANT_STATE)
+    latest = controller.queue(topics.PLANT_STATE, capacity=1)
     health = m.Health(
         run_id="plant-a", seq=0, process="plant", status="ready", counters={}, note="x" * 20_000
     )
-    wait_for(lambda: plant.matched(topics.PLANT_STATE) and plant.matched(topics.HEALTH["plant"]))
+    wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(plant, topics.HEALTH["plant"]))
     for seq in range(300):
         plant.publish(topics.HEALTH["plant"], health)
         if seq % 50 == 0:
             plant.publish(topics.PLANT_STATE, state(seq))
-            assert seq_of(latest.wait(HANG_S)) == seq
-    wait_for(lambda: unread.received == 300)
+            assert seq_of(latest.get(HANG_S)) == seq
+    wait_for(lambda: len(unread) + unread.overflow == 300)
     assert unread.overflow == 297
 
 
 def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, controller: Bus) -> None:
     mailbox = controller.everything()
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
     stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
     key = topics.PLANT_STATE.key(config.name)
     publisher = stranger.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
@@ -152,7 +152,7 @@ def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, 
     plant.publish(topics.HEALTH["plant"], large)
     assert plant.counters()["not sent, oversized plant/health"] == 1
     plant.publish(topics.PLANT_STATE, state(0))
-    wait_for(lambda: mailbox.received > 0)
+    wait_for(lambda: len(mailbox) > 0)
     assert [delivery.key for delivery in mailbox.drain()] == [key]
 
 
@@ -162,14 +162,14 @@ def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, 
 def test_what_is_pending_is_sent_before_closing(config: Config, controller: Bus) -> None:
     mailbox = controller.queue(topics.HEALTH["plant"])
     with Bus(config, "plant", "plant-b") as bus:
-        wait_for(lambda: bus.matched(topics.HEALTH["plant"]))
+        wait_for(lambda: matched(bus, topics.HEALTH["plant"]))
         for seq in range(200):
             note = "y" * 30_000
             health = m.Health(
                 run_id="plant-b", seq=seq, process="plant", status="stopping", counters={}, note=note
             )
             bus.publish(topics.HEALTH["plant"], health)
-    wait_for(lambda: mailbox.received == 200)
+    wait_for(lambda: len(mailbox) == 200)
 
 
 def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
@@ -180,7 +180,7 @@ def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
         Bus(config, "plant", "plant-a") as reader,
     ):
         reader.everything()
-        wait_for(lambda: bus.matched(topics.KEYFRAME) and bus.matched(topics.COMMAND))
+        wait_for(lambda: matched(bus, topics.KEYFRAME) and matched(bus, topics.COMMAND))
         frozen.signal(signal.SIGSTOP)
         command = m.Command(
             run_id="controller-a",
@@ -262,12 +262,12 @@ def test_an_oversized_question_is_dropped_unread(plant: Bus, controller: Bus) ->
 def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controller: Bus) -> None:
     release = threading.Event()
     controller.serve("controller/slow", lambda _: [b"late"] if release.wait(HANG_S) else [])
-    latest = controller.latest(topics.PLANT_STATE)
-    wait_for(lambda: plant.matched(topics.PLANT_STATE))
+    latest = controller.queue(topics.PLANT_STATE, capacity=1)
+    wait_for(lambda: matched(plant, topics.PLANT_STATE))
     assert plant.ask("controller/slow", {}, 0.3) == []
     for seq in range(50):
         plant.publish(topics.PLANT_STATE, state(seq))
-        assert seq_of(latest.wait(HANG_S)) == seq
+        assert seq_of(latest.get(HANG_S)) == seq
     release.set()
 
 
@@ -281,16 +281,18 @@ def test_a_router_restart_is_survived() -> None:
         Bus(config, "plant", "plant-a") as plant,
         Bus(config, "controller", "controller-a") as controller,
     ):
-        latest = controller.latest(topics.PLANT_STATE)
+        latest = controller.queue(topics.PLANT_STATE, capacity=1)
         controller.serve(topics.OUTBOX_QUERY, lambda _: [b"answer"])
-        wait_for(lambda: plant.matched(topics.PLANT_STATE))
+        wait_for(lambda: matched(plant, topics.PLANT_STATE))
         first.close()
-        wait_for(lambda: not plant.connected and not controller.connected)
+        wait_for(lambda: not connected(plant) and not connected(controller))
         plant.publish(topics.PLANT_STATE, state(0))
         with Router(config):
-            wait_for(lambda: plant.connected and controller.connected and plant.matched(topics.PLANT_STATE))
+            wait_for(
+                lambda: connected(plant) and connected(controller) and matched(plant, topics.PLANT_STATE)
+            )
             plant.publish(topics.PLANT_STATE, state(1))
-            assert seq_of(latest.wait(HANG_S)) == 1
+            assert seq_of(latest.get(HANG_S)) == 1
             wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {}, 1.0) == [b"answer"])
 
 
@@ -304,7 +306,7 @@ def test_opening_waits_for_the_router() -> None:
     with Router(config):
         opening.join(HANG_S)
         assert not opening.is_alive()
-        assert bus.connected
+        assert connected(bus)
         bus.close()
 
 

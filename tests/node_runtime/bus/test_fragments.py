@@ -1,4 +1,4 @@
-"""Large messages in pieces: put together in any order, in bounded memory, and what does not fit is not used."""
+"""Large messages in fragments: put together in any order, in bounded memory, and what does not fit is not used."""
 
 from __future__ import annotations
 
@@ -10,77 +10,87 @@ import numpy as np
 import pytest
 import zenoh
 
-from node_runtime.bus.fragments import HEADER, MARK, PARTIAL, PIECE, Assembler, Piece, split
+from node_runtime.bus.fragments import (
+    FRAGMENT_BYTES,
+    HEADER_BYTES,
+    INCOMPLETE,
+    MARK,
+    Fragment,
+    Fragmenter,
+    Reassembler,
+)
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.live import HANG_S, live_config, wait_for
+from tests.helpers.live import HANG_S, live_config, matched, wait_for
 
-MESSAGE = np.random.default_rng(0).bytes(5 * PIECE + 17)
-LIMIT = 64 * PIECE
+MESSAGE = np.random.default_rng(0).bytes(5 * FRAGMENT_BYTES + 17)
+LIMIT = 64 * FRAGMENT_BYTES
 
 
-def pieces(message: bytes = MESSAGE, writer: str = "trainer-a", number: int = 0) -> list[bytes]:
-    return list(split(message, writer, number))
+def fragments(message: bytes = MESSAGE, writer: str = "trainer-a", number: int = 0) -> list[bytes]:
+    """Of the process's message with that number, which counts from 0."""
+    sending = Fragmenter(writer)
+    return [list(sending.split(message)) for _ in range(number + 1)][-1]
 
 
 def altered(payload: bytes, **changes: object) -> bytes:
-    piece = msgspec.msgpack.decode(payload[1:], type=Piece)
-    return MARK + msgspec.msgpack.encode(msgspec.structs.replace(piece, **changes))
+    fragment = msgspec.msgpack.decode(payload[1:], type=Fragment)
+    return MARK + msgspec.msgpack.encode(msgspec.structs.replace(fragment, **changes))
 
 
 class Receiver:
     def __init__(self, limit: int = LIMIT) -> None:
-        self.bad = BadMessages()
-        self.assembler = Assembler(limit, self.bad)
+        self.bad = RejectedMessages()
+        self.reassembler = Reassembler(limit, self.bad)
 
     def take(self, *payloads: bytes, name: str = "x") -> list[bytes]:
-        found = (self.assembler.whole(name, payload, LIMIT) for payload in payloads)
+        found = (self.reassembler.whole(name, payload, LIMIT) for payload in payloads)
         return [whole for whole in found if whole is not None]
 
 
 def test_what_is_small_travels_as_it_is() -> None:
-    assert pieces(MESSAGE[:PIECE]) == [MESSAGE[:PIECE]]
-    assert Receiver().take(b"", b"\x80", MESSAGE[:PIECE]) == [b"", b"\x80", MESSAGE[:PIECE]]
+    assert fragments(MESSAGE[:FRAGMENT_BYTES]) == [MESSAGE[:FRAGMENT_BYTES]]
+    assert Receiver().take(b"", b"\x80", MESSAGE[:FRAGMENT_BYTES]) == [b"", b"\x80", MESSAGE[:FRAGMENT_BYTES]]
 
 
-def test_no_message_begins_like_a_piece() -> None:
+def test_no_message_begins_like_a_fragment() -> None:
     health = m.Health(run_id="a", seq=0, process="plant", status="ready", counters={}, note="")
     assert codec.encode(health)[:1] != MARK
 
 
-def test_pieces_make_the_message_in_any_order_and_twice() -> None:
-    parts = pieces()
+def test_fragments_make_the_message_in_any_order_and_twice() -> None:
+    parts = fragments()
     assert len(parts) == 6
-    assert max(map(len, parts)) <= PIECE + HEADER
+    assert max(map(len, parts)) <= FRAGMENT_BYTES + HEADER_BYTES
     receiver = Receiver()
     order = np.random.default_rng(1).permutation(6)
     assert receiver.take(*(parts[k] for k in order)) == [MESSAGE]
-    assert receiver.assembler.held == 0
+    assert receiver.reassembler.held == 0
     twice = [part for part in parts for _ in range(2)][:-1]
     assert receiver.take(*twice) == [MESSAGE]
     assert receiver.bad.counters() == {}
 
 
-def test_a_lost_piece_loses_its_message_and_no_other() -> None:
+def test_a_lost_fragment_loses_its_message_and_no_other() -> None:
     receiver = Receiver()
-    assert receiver.take(*pieces()[1:], *pieces(number=1)) == [MESSAGE]
+    assert receiver.take(*fragments()[1:], *fragments(number=1)) == [MESSAGE]
     assert receiver.bad.counters() == {"bad x: pieces lost": 1}
-    assert receiver.take(*pieces()[:1]) == []
-    receiver.assembler.end()
-    assert receiver.assembler.held == 0
+    assert receiver.take(*fragments()[:1]) == []
+    receiver.reassembler.end()
+    assert receiver.reassembler.held == 0
     assert receiver.bad.counters() == {"bad x: pieces lost": 2}
 
 
 def test_writers_and_topics_do_not_mix() -> None:
     receiver = Receiver()
-    mixed = zip(pieces(), pieces(MESSAGE[::-1], "trainer-b"), strict=True)
+    mixed = zip(fragments(), fragments(MESSAGE[::-1], "trainer-b"), strict=True)
     assert receiver.take(*(part for pair in mixed for part in pair)) == [MESSAGE, MESSAGE[::-1]]
-    assert receiver.take(*pieces()[:3]) == []
-    assert receiver.take(*pieces()[3:], name="y") == []
+    assert receiver.take(*fragments()[:3]) == []
+    assert receiver.take(*fragments()[3:], name="y") == []
 
 
 @pytest.mark.parametrize(
@@ -88,45 +98,45 @@ def test_writers_and_topics_do_not_mix() -> None:
     [
         (MARK, "malformed piece"),
         (MARK + b"\x00" * 40, "malformed piece"),
-        (pieces()[0][:-1], "malformed piece"),
-        (MARK + bytes(PIECE + HEADER), "oversized piece"),
-        (altered(pieces()[0], size=LIMIT + 1), "oversized"),
-        (altered(pieces()[0], size=PIECE), "malformed piece"),
-        (altered(pieces()[0], index=6), "malformed piece"),
-        (altered(pieces()[0], index=5), "malformed piece"),
-        (altered(pieces()[0], data=b""), "malformed piece"),
-        (altered(pieces()[0], writer="w" * 200), "malformed piece"),
+        (fragments()[0][:-1], "malformed piece"),
+        (MARK + bytes(FRAGMENT_BYTES + HEADER_BYTES), "oversized piece"),
+        (altered(fragments()[0], size=LIMIT + 1), "oversized"),
+        (altered(fragments()[0], size=FRAGMENT_BYTES), "malformed piece"),
+        (altered(fragments()[0], index=6), "malformed piece"),
+        (altered(fragments()[0], index=5), "malformed piece"),
+        (altered(fragments()[0], data=b""), "malformed piece"),
+        (altered(fragments()[0], writer="w" * 200), "malformed piece"),
     ],
 )
-def test_what_is_no_piece_is_counted_and_disturbs_nothing(payload: bytes, reason: str) -> None:
-    receiver, parts = Receiver(), pieces()
+def test_what_is_no_fragment_is_counted_and_disturbs_nothing(payload: bytes, reason: str) -> None:
+    receiver, parts = Receiver(), fragments()
     assert receiver.take(*parts[:3], payload, *parts[3:]) == [MESSAGE]
     assert receiver.bad.counters() == {f"bad x: {reason}": 1}
 
 
 def test_a_message_that_is_not_what_was_sent_is_not_used() -> None:
-    receiver, parts = Receiver(), pieces()
-    assert receiver.take(altered(parts[0], data=bytes(PIECE)), *parts[1:]) == []
+    receiver, parts = Receiver(), fragments()
+    assert receiver.take(altered(parts[0], data=bytes(FRAGMENT_BYTES)), *parts[1:]) == []
     assert receiver.bad.counters() == {"bad x: pieces do not make the message": 1}
     assert receiver.take(parts[0], altered(parts[1], crc32=zlib.crc32(b"")), *parts[1:]) == [MESSAGE]
 
 
 def test_strangers_under_many_names_cannot_fill_it_either() -> None:
     """With a byte each the bytes held are few."""
-    receiver, small = Receiver(), altered(pieces()[0], size=PIECE + 1, index=1, data=b"x")
-    for k in range(PARTIAL + 500):
+    receiver, small = Receiver(), altered(fragments()[0], size=FRAGMENT_BYTES + 1, index=1, data=b"x")
+    for k in range(INCOMPLETE + 500):
         receiver.take(altered(small, writer=f"stranger-{k}"))
-    assert receiver.assembler.held == PARTIAL
+    assert receiver.reassembler.held == INCOMPLETE
     assert receiver.bad.counters() == {"bad x: pieces lost": 500}
-    assert receiver.take(*pieces()) == [MESSAGE]
+    assert receiver.take(*fragments()) == [MESSAGE]
 
 
 def test_strangers_cannot_fill_the_memory() -> None:
-    receiver = Receiver(limit=8 * PIECE)
+    receiver = Receiver(limit=8 * FRAGMENT_BYTES)
     for k in range(300):
-        receiver.take(*pieces(writer=f"stranger-{k}")[:2])
-        assert receiver.assembler.held <= 8 * PIECE
-    assert receiver.take(*pieces()) == [MESSAGE]
+        receiver.take(*fragments(writer=f"stranger-{k}")[:2])
+        assert receiver.reassembler.held <= 8 * FRAGMENT_BYTES
+    assert receiver.take(*fragments()) == [MESSAGE]
 
 
 # -- over a real router --------------------------------------------------------------------------------------
@@ -145,7 +155,7 @@ def keyframe(size: int) -> m.Keyframe:
 
 
 @pytest.mark.live
-def test_on_the_bus_only_pieces_travel_and_every_reader_gets_the_message(config: Config) -> None:
+def test_on_the_bus_only_fragments_travel_and_every_reader_gets_the_message(config: Config) -> None:
     sent = keyframe(3_000_000)
     travelled: list[int] = []
     with (
@@ -155,20 +165,20 @@ def test_on_the_bus_only_pieces_travel_and_every_reader_gets_the_message(config:
     ):
         all_of_it, one = recorder.everything(), recorder.queue(topics.KEYFRAME)
         stranger.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
-        wait_for(lambda: controller.matched(topics.KEYFRAME))
+        wait_for(lambda: matched(controller, topics.KEYFRAME))
         controller.publish(topics.KEYFRAME, sent)
-        wait_for(lambda: one.received == 1 and all_of_it.received == 1)
+        wait_for(lambda: len(one) == 1 and len(all_of_it) == 1)
         for mailbox in (all_of_it, one):
             delivery = mailbox.get()
             assert delivery is not None
             assert delivery.payload == codec.encode(sent)
         wait_for(lambda: sum(travelled) > 3_000_000)
-        assert max(travelled) <= PIECE + HEADER
+        assert max(travelled) <= FRAGMENT_BYTES + HEADER_BYTES
         assert controller.counters()["sent bulk"] == len(travelled)
 
 
 @pytest.mark.live
-def test_answers_travel_in_pieces(config: Config) -> None:
+def test_answers_travel_in_fragments(config: Config) -> None:
     answers = [codec.encode(keyframe(size)) for size in (700_000, 10, 2_000_000)]
     with (
         Bus(config, "controller", "controller-a") as controller,

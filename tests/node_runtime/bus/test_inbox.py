@@ -12,10 +12,11 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from node_runtime.bus.inbox import AgeEstimate, BadMessages, Follower, Inbox
+from node_runtime.bus.inbox import AgeEstimate, Follower, Inbox
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.realtime import clock
+from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
@@ -112,7 +113,7 @@ def test_clocks_that_drift_apart_do_not_age_the_messages() -> None:
 
 
 def test_bad_messages_are_counted_and_named_once(caplog: pytest.LogCaptureFixture) -> None:
-    bad = BadMessages()
+    bad = RejectedMessages()
     with caplog.at_level(logging.WARNING):
         for k in range(50):
             bad.count("plant/state", "not finite", f"field x.{k}")
@@ -122,7 +123,7 @@ def test_bad_messages_are_counted_and_named_once(caplog: pytest.LogCaptureFixtur
 
 
 def test_the_kinds_of_bad_messages_are_bounded() -> None:
-    bad = BadMessages()
+    bad = RejectedMessages()
     for k in range(10_000):
         bad.count(f"topic {k}", "malformed", "")
     assert len(bad.counters()) <= 201

@@ -19,15 +19,15 @@ from node_runtime.bus.zenoh_bus import Bus, Mailbox
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from node_runtime.router import Router, open_to_all
 from node_runtime.tls import access_control, credentials
-from node_runtime.tls.handshake import knock
+from node_runtime.tls.client import refusal
 from node_runtime.tls.zenoh_log import MAX_NAMES, Refusals
 from protocol import rights, topics
 from protocol.topics import Topic
 from tandem import certificate_authority
-from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
+from tests.helpers.live import HANG_S, Process, connected, free_endpoint, live_config, matched, wait_for
 
 pytestmark = pytest.mark.live
 
@@ -115,7 +115,7 @@ def test_a_trainer_elsewhere_hears_samples_asks_and_sends_weights(site: Site):
     ):
         controller.serve(topics.OUTBOX_QUERY, lambda _parameters: [b"answer"])
         weights, samples = controller.queue(topics.HIDDEN_WEIGHTS), trainer.queue(topics.SAMPLES)
-        wait_for(lambda: trainer.matched(topics.HIDDEN_WEIGHTS) and controller.matched(topics.SAMPLES))
+        wait_for(lambda: matched(trainer, topics.HIDDEN_WEIGHTS) and matched(controller, topics.SAMPLES))
         trainer._put(topics.HIDDEN_WEIGHTS, b"weights")
         controller._put(topics.SAMPLES, b"samples")
         arrived = weights.get(HANG_S), samples.get(HANG_S)
@@ -132,7 +132,7 @@ def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site
     ):
         states, commands = controller.queue(topics.PLANT_STATE), plant.queue(topics.COMMAND)
         logged, seen = recorder.everything(), operator.everything()
-        wait_for(lambda: plant.matched(topics.PLANT_STATE) and controller.matched(topics.COMMAND))
+        wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(controller, topics.COMMAND))
         loop = {topic.key("jet1") for topic in (topics.PLANT_STATE, topics.COMMAND)}
         keys: dict[Mailbox, set[str]] = {box: set() for box in (logged, seen)}
 
@@ -173,11 +173,11 @@ def test_a_router_under_another_name_is_not_believed(site: Site):
     far = site.far("trainer", "jet1", f'bus.endpoint="{site.remote.replace("127.0.0.1", "127.0.0.2")}"')
     own = credentials.read(site.folder / "jet1" / "trainer")
     # Nobody listens on 127.0.0.2: that is no refusal, and is waited for.
-    assert knock(far.bus.endpoint, own) is None
-    assert knock(site.remote, own) is None
+    assert refusal(far.bus.endpoint, own) is None
+    assert refusal(site.remote, own) is None
     relay = _relay(site.remote.replace("tls/", ""))
     try:
-        reason = knock(f"tls/127.0.0.2:{relay.getsockname()[1]}", own)
+        reason = refusal(f"tls/127.0.0.2:{relay.getsockname()[1]}", own)
     finally:
         relay.close()
     assert reason is not None
@@ -203,7 +203,7 @@ def _relay(place: str) -> socket.socket:
 
 def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
     """What our own checks would stop before: an expired certificate, another authority's, none."""
-    reason = knock(site.remote, credentials.read(site.folder / "jet1" / "expired"))
+    reason = refusal(site.remote, credentials.read(site.folder / "jet1" / "expired"))
     assert reason is not None
     assert "our certificate has expired by its clock" in reason
     site.router.heard("bad TLS link: refused, its certificate has expired")
@@ -214,7 +214,7 @@ def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
         (mixed / name).write_bytes((site.folder / "other" / "trainer" / name).read_bytes())
     (mixed / "authority.pem").write_bytes((site.folder / "jet1" / "trainer" / "authority.pem").read_bytes())
     mine = credentials.read(site.folder / "jet1" / "trainer")
-    reason = knock(site.remote, credentials.Credentials(mixed, mine.name, mine.not_before, mine.not_after))
+    reason = refusal(site.remote, credentials.Credentials(mixed, mine.name, mine.not_before, mine.not_after))
     assert reason is not None
     assert "does not know the authority of our certificate" in reason
     site.router.heard("bad TLS link: refused, its certificate comes from another authority")
@@ -273,7 +273,10 @@ def test_what_a_role_may_not_publish_reaches_nobody(site: Site, role: str):
     """The last message is one that it may publish, so all before it have arrived or never will."""
     with Bus(site.local, "operator", "o-1") as ear, site.session(role) as session:
         heard, block = ear.everything(), zenoh.CongestionControl.BLOCK
-        fast = [ear._session().declare_subscriber(topic.direct_key("jet1")) for topic in (topics.COMMAND,)]
+        fast = [
+            ear._lanes.session("bulk").declare_subscriber(topic.direct_key("jet1"))
+            for topic in (topics.COMMAND,)
+        ]
         # Only now does the router know that somebody listens.
         _until(heard, topics.HEALTH["router"].key("jet1"))
         for name, topic in FOREIGN:
@@ -312,7 +315,7 @@ def test_a_trainer_hears_no_commands_and_answers_no_questions(site: Site):
             complete=True,
         )
         controller.serve(topics.OUTBOX_QUERY, lambda _parameters: [b"true"])
-        wait_for(lambda: controller.matched(topics.SAMPLES))
+        wait_for(lambda: matched(controller, topics.SAMPLES))
         controller._put(topics.COMMAND, b"command")
         controller._put(topics.SAMPLES, b"samples")
         sample = samples.recv()
@@ -328,7 +331,7 @@ def test_a_trainer_hears_no_commands_and_answers_no_questions(site: Site):
 def test_a_message_beyond_its_topic_s_size_ends_at_the_router(site: Site):
     health = topics.HEALTH["trainer"]
     with Bus(site.local, "recorder", "r-1") as ear, site.session("trainer") as session:
-        heard = ear._session().declare_subscriber(health.key("jet1"))
+        heard = ear._lanes.session("bulk").declare_subscriber(health.key("jet1"))
         own = session.declare_publisher(health.key("jet1"))
         wait_for(lambda: own.matching_status.matching)
         block = zenoh.CongestionControl.BLOCK
@@ -359,8 +362,8 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
         weights, commands = controller.queue(topics.HIDDEN_WEIGHTS), controller.queue(topics.COMMAND)
         heard = trainer.queue(topics.SAMPLES), brief.queue(topics.SAMPLES)
         # The rights are the same by either protocol.
-        wait_for(lambda: trainer.matched(topics.HIDDEN_WEIGHTS))
-        trainer._session().put(topics.COMMAND.key("jet1"), b"bad")
+        wait_for(lambda: matched(trainer, topics.HIDDEN_WEIGHTS))
+        trainer._lanes.session("bulk").put(topics.COMMAND.key("jet1"), b"bad")
         trainer._put(topics.HIDDEN_WEIGHTS, b"weights")
         arrived = weights.get(HANG_S)
         assert arrived is not None
@@ -372,9 +375,9 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
             return all(box.drain() for box in heard)
 
         wait_for(both_hear, every=0.05)
-        wait_for(lambda: not brief.connected)
+        wait_for(lambda: not connected(brief))
         wait_for(lambda: any("expired on" in text and "our links to" in text for text in caplog.messages))
-        assert trainer.connected
+        assert connected(trainer)
         controller._put(topics.SAMPLES, b"later")
         wait_for(lambda: b"later" in [one.payload for one in heard[0].drain()])
         assert b"later" not in [one.payload for one in heard[1].drain()]
@@ -425,7 +428,7 @@ def test_which_plain_endpoints_others_may_reach(endpoint: str, is_open: bool):
 
 
 def test_zenoh_s_questions_to_itself_are_no_denials():
-    bad = BadMessages()
+    bad = RejectedMessages()
     refusals = Refusals(bad)
     head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
     who = "a6 on Interface(lo)+CertCommonName(trainer.jet1)+Transport(Tls)+a6 is unauthorized to "
@@ -435,33 +438,33 @@ def test_zenoh_s_questions_to_itself_are_no_denials():
         who + "Declare Liveliness Subscriber (ingress) on tandem/jet1/controller/samples",
         "Using cached result: a6 is authorized to Declare Subscriber (ingress) on tandem/jet1/controller/samples",
     ):
-        assert refusals.hear(head + text)
+        assert refusals.read(head + text)
     assert bad.total == 0
-    assert refusals.hear(
+    assert refusals.read(
         head + "Using cached result: a6 is unauthorized to Put (ingress) on tandem/jet1/controller/tick"
     )
-    assert refusals.hear(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
+    assert refusals.read(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
     assert bad.counters() == {
         "bad from trainer.jet1: denied, put controller/tick": 1,
         "bad from trainer.jet1: denied, put elsewhere": 1,
     }
-    assert not refusals.hear("a line of somebody else")
+    assert not refusals.read("a line of somebody else")
 
 
 def test_who_was_denied_is_known_after_any_number_of_sessions():
     """A health check alone opens one every few seconds."""
-    bad = BadMessages()
+    bad = RejectedMessages()
     refusals = Refusals(bad)
     head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
     who = "+CertCommonName({})+Transport(Tls)+a6 is {}authorized to "
     for k in range(MAX_NAMES + 500):
-        refusals.hear(
+        refusals.read(
             head
             + f"{k:x} on Interface(lo)"
             + who.format("operator.jet1", "")
             + "Put (ingress) on tandem/jet1/x"
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
-    refusals.hear(last + "Put (ingress) on tandem/jet1/controller/command")
+    refusals.read(last + "Put (ingress) on tandem/jet1/controller/command")
     assert bad.counters() == {"bad from trainer.jet1: denied, put controller/command": 1}
     assert len(refusals._names) == MAX_NAMES

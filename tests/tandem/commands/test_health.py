@@ -14,13 +14,13 @@ import zenoh
 
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
-from node_runtime.health import HealthPublisher, Heart, run_info
+from node_runtime.health import HealthPublisher, HealthThread, run_info
 from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import topics
 from protocol.messages import ProcessStatus
 from tandem.commands import health
-from tests.helpers.live import HANG_S, Ear, health_of, live_config
+from tests.helpers.live import HANG_S, BusListener, health_of, live_config
 
 pytestmark = pytest.mark.live
 
@@ -44,7 +44,7 @@ def test_the_exit_code_follows_the_status(
         Bus(config, "plant", "plant-1") as bus,
         HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,
     ):
-        ear = Ear(other)
+        ear = BusListener(other)
         said.set(status, "held at x0")
         # What it said before is on nobody's way any more.
         ear.until(health_of("plant", status=status, note="held at x0"))
@@ -72,7 +72,7 @@ def test_garbage_is_not_health(config: Config) -> None:
         Bus(config, "recorder", "recorder-1") as other,
         zenoh.open(session_config("client", config.bus.endpoint, 1500)) as raw,
     ):
-        ear = Ear(other)
+        ear = BusListener(other)
 
         def garble() -> None:
             while not done.wait(0.01):
@@ -110,14 +110,14 @@ def test_it_loads_nothing_heavy() -> None:
     assert ran.stdout.strip() == "[]"
 
 
-def test_one_heart_lets_many_speak_until_they_leave(config: Config) -> None:
-    with Bus(config, "recorder", "recorder-1") as other, Heart() as heart, ExitStack() as stack:
-        ear = Ear(other)
+def test_one_health_thread_lets_many_speak_until_they_leave(config: Config) -> None:
+    with Bus(config, "recorder", "recorder-1") as other, HealthThread() as thread, ExitStack() as stack:
+        ear = BusListener(other)
         before = threading.active_count()
         buses = [stack.enter_context(Bus(config, "plant", f"plant-{k}")) for k in range(3)]
         of_buses = threading.active_count() - before
         said = [
-            stack.enter_context(HealthPublisher(bus, run_info(config, "plant", bus.run_id), heart=heart))
+            stack.enter_context(HealthPublisher(bus, run_info(config, "plant", bus.run_id), thread=thread))
             for bus in buses
         ]
         assert threading.active_count() - before == of_buses
@@ -137,4 +137,4 @@ def test_one_heart_lets_many_speak_until_they_leave(config: Config) -> None:
         assert gone == said[2]._seq
         last = [message for message in ear.of(topics.HEALTH["plant"]) if message.run_id == "plant-2"][-1]
         assert last.status == "stopping"
-        heart.add(said[2])
+        thread.add(said[2])

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller_node.build import model_for
+from controller_node.build import build_model
 from controller_node.certified_sets import (
     SHIPPED,
     CertifiedSets,
@@ -260,7 +260,7 @@ def test_the_picture(cached: Path):
 
 
 def test_the_shipped_sets_are_about_the_shipped_configuration():
-    model = model_for(load(Path("configs/compressor.toml"), []))
+    model = build_model(load(Path("configs/compressor.toml"), []))
     (file,) = SHIPPED.glob("moore_greitzer-20Hz-*")
     sets = read_sets(file)
     assert sets.found.contains_x0

@@ -75,7 +75,7 @@ def test_refitted_weights_explain_the_samples_and_stay_within_their_bounds() -> 
 
 def test_refit_at_an_adoption_changes_K_and_replays() -> None:
     kept, fitted = (follow(config(f"adaptation.at_adoption={how}"), 40).run for how in ("keep", "refit"))
-    adopted = [r.seq for r in fitted.results if r.weights_verdict == "adopted"]
+    adopted = [r.seq for r in fitted.results if r.weights_outcome == "adopted"]
     assert adopted
     first = adopted[0]
     K = {
@@ -91,7 +91,7 @@ def test_without_adaptation_the_last_layer_stays() -> None:
     run = follow(config("adaptation.enabled=false"), 30).run
     weights = [w.K.numpy() for w in run.output_weights]
     np.testing.assert_array_equal(weights[0], weights[-1])
-    assert any(r.weights_verdict == "adopted" for r in run.results)
+    assert any(r.weights_outcome == "adopted" for r in run.results)
 
 
 def test_the_three_starts_of_K() -> None:

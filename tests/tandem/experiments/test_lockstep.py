@@ -103,7 +103,7 @@ def test_progress_is_told_step_by_step() -> None:
 
 def test_every_adopted_set_is_one_that_was_trained() -> None:
     run = simulate(load(None, []), 60)
-    adopted = [result for result in run.results if result.weights_verdict == "adopted"]
+    adopted = [result for result in run.results if result.weights_outcome == "adopted"]
     hashes = [weights.sha256 for weights in run.hidden_weights]
     assert [result.hidden_sha256 for result in adopted] == hashes[: len(adopted)]
     assert np.all(np.diff([result.hidden_version for result in adopted]) == 1)

@@ -11,18 +11,18 @@ import pytest
 import torch
 
 from network_model.description import NetworkDescription, initial_hidden
+from node_runtime.bus.lanes import Lanes
 from node_runtime.bus.mailbox import Mailbox
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, TrainerConfig
 from node_runtime.health import HealthPublisher
-from node_runtime.rejected import BadMessages
+from node_runtime.rejected import RejectedMessages
 from protocol.messages import Array, OutputWeights, Sample
 from protocol.topics import Topic
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import discovery
 from trainer_node.fleet.discovery import Heard, OneRouter
 from trainer_node.fleet.fleet import SAY_EVERY, Fleet, _Followed, seed_of
-from trainer_node.fleet.plant_bus import Sessions
 from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
 from trainer_node.training import Draw, Trainer, use_one_thread
 
@@ -137,7 +137,7 @@ class Nobody(OneRouter):
     """A router behind which there is no plant."""
 
     def __init__(self) -> None:
-        super().__init__(Config(), "jet*", cast(Sessions, None))
+        super().__init__(Config(), "jet*", cast(Lanes, None))
 
 
 def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
@@ -159,7 +159,7 @@ def test_a_plant_that_was_away_between_two_looks_is_taken_in_anew(monkeypatch: p
     taken: list[str] = []
     fleet, end = Fleet(Renewed()), ExitStack()
     end.callback(ended.append, "jet1")
-    fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Sessions, "those before"), end)
+    fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Lanes, "those before"), end)
     monkeypatch.setattr(Fleet, "_take_in", lambda _fleet, name: taken.append(name))
     fleet._gather(0.0)
     assert (ended, taken) == (["jet1"], ["jet1"])
@@ -173,7 +173,7 @@ class Silent:
     """In place of a bus and of a health: what is published is counted."""
 
     def __init__(self, config: Config):
-        self.config, self.bad, self.run_id, self.published = config, BadMessages(), "trainer", 0
+        self.config, self.bad, self.run_id, self.published = config, RejectedMessages(), "trainer", 0
 
     def queue(self, topic: Topic, capacity: int) -> Mailbox:
         return Mailbox(topic.name, capacity)

@@ -1,0 +1,124 @@
+"""A controller's memory as others hold it: in keyframes, in checkpoints, and the hidden layers for a trainer."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Literal
+
+import msgspec
+
+from lbmpc.controller.state import ControllerState
+from lbmpc.controller.step import Controller
+from network_model.description import hash_layers
+from node_runtime.config.sections import Config
+from protocol import messages as m
+
+WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
+
+
+class Memory:
+    """The state of one controller.
+
+    Args:
+        controller: whose state it is.
+        config: the resolved configuration.
+        run_id: stamped on every message.
+    """
+
+    def __init__(self, controller: Controller, config: Config, run_id: str):
+        self._controller, self._config, self._run_id = controller, config, run_id
+        self.state: ControllerState = controller.initial_state(config.seed)
+        self._resumed = ""
+        self._hash_hidden()
+
+    def advance(self, state: ControllerState, new_network: bool) -> None:
+        """The state after a step; `new_network`: whether its hidden layers are others."""
+        self.state = state
+        if new_network:
+            self._hash_hidden()
+
+    def _hash_hidden(self) -> None:
+        network = self._controller.oracle.network(self.state.oracle)
+        self.hidden_sha256 = "" if network is None else hash_layers(network.hidden)
+
+    def keyframe(self, seq: int) -> m.Keyframe:
+        """The whole memory after tick `seq`, -1 before the first."""
+        arrays = {
+            name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in self.state.to_arrays().items()
+        }
+        return m.Keyframe(
+            run_id=self._run_id, seq=seq, arrays=arrays, resumed=self._resumed if seq == -1 else ""
+        )
+
+    def restore(self, keyframe: m.Keyframe) -> None:
+        """Take over a keyframe's memory.
+
+        Raises:
+            ValueError: the keyframe does not fit this configuration; the text names the array.
+        """
+        arrays = {name: array.numpy() for name, array in keyframe.arrays.items()}
+        expected = self.state.to_arrays()
+        for name in sorted(expected.keys() | arrays.keys()):
+            if name not in arrays or name not in expected or arrays[name].shape != expected[name].shape:
+                raise ValueError(
+                    f"the keyframe of tick {keyframe.seq} does not fit this configuration: array {name}"
+                )
+        self.state = ControllerState.from_arrays(arrays)
+        self._hash_hidden()
+        self._resumed = keyframe.resumed
+
+    def lasting(self) -> dict[str, m.Array]:
+        """What of the memory outlives this process: all that was learned, nothing that was planned."""
+        arrays = self.keyframe(0).arrays
+        return {name: array for name, array in arrays.items() if _lasts(name)}
+
+    def go_on(self, lasting: dict[str, m.Array], run_id: str) -> None:
+        """Begin with what the run `run_id` left, and no plan; before the first tick.
+
+        Raises:
+            ValueError: it does not fit this configuration; the text names the array.
+        """
+        begin = self.keyframe(-1).arrays
+        expected = {name for name in begin if _lasts(name)}
+        for name in sorted(expected ^ lasting.keys()):
+            raise ValueError(f"array {name} is {'missing' if name in expected else 'not known'}")
+        for name in sorted(expected):
+            if (lasting[name].shape, lasting[name].dtype) != (begin[name].shape, begin[name].dtype):
+                raise ValueError(f"array {name} is {lasting[name].shape} there and {begin[name].shape} here")
+        arrays = {**begin, **lasting}
+        self.restore(m.Keyframe(run_id=self._run_id, seq=-1, arrays=arrays, resumed=run_id))
+
+    def belongs(self) -> dict[str, str]:
+        """Whose memory this is, in words: what must be equal for another process to go on with it."""
+        model, what = self._controller.model, self._controller.oracle.description
+        plant = model.plant
+        numbers = b"".join(array.tobytes() for array in (model.A, model.B, plant.x_e, plant.u_e))
+        words = {
+            "plant": self._config.name,
+            "model": f"{plant.name} {hashlib.sha256(numbers).hexdigest()[:12]}",
+            "rate": f"{self._config.rate:g} Hz",
+            "oracle": self._config.controller.oracle,
+        }
+        if what is not None:
+            layers = "-".join(map(str, what.hidden))
+            words["network"] = f"{what.architecture} {layers} {what.sha256()[:12]}"
+        return words
+
+    def hidden_snapshot(self, seq: int) -> m.HiddenSnapshot | None:
+        """The hidden weights in force, for a trainer that joins late; None without a network."""
+        network = self._controller.oracle.network(self.state.oracle)
+        if network is None:
+            return None
+        return m.HiddenSnapshot(
+            run_id=self._run_id,
+            seq=seq,
+            hidden_version=network.newest,
+            hidden_sha256=self.hidden_sha256,
+            description=msgspec.json.encode(self._controller.oracle.description).decode(),
+            layers=[m.Array.of(layer, "<f4") for layer in network.hidden],
+        )
+
+
+def _lasts(name: str) -> bool:
+    """Whether a new process can go on with this array. Not with a plan, or with a state whose successor it missed."""
+    return name == "delay" or name.startswith("oracle.")

@@ -1,0 +1,172 @@
+"""Messages in plant units to deviations from the equilibrium, and back: one tick's way in and its way out."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from lbmpc.controller.backup_policy import Policy
+from lbmpc.controller.signals import Observation, StepResult
+from lbmpc.oracles.base import HiddenSet, LearnedNetwork
+from lbmpc.plants import Plant
+from protocol import messages as m
+from protocol.codec import encode
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Everything one tick produces; `sample` and `output_weights` are None where there is none."""
+
+    command: m.Command
+    result: m.TickResult
+    sample: m.Sample | None
+    new_network: bool
+    """Whether other hidden layers are in use from now on."""
+    _weights: Callable[[], m.OutputWeights] | None
+
+    @cached_property
+    def output_weights(self) -> m.OutputWeights | None:
+        """Made when they are asked for: a fast loop sends them at few of its ticks."""
+        return None if self._weights is None else self._weights()
+
+
+@dataclass(frozen=True, eq=False)
+class Translation:
+    """For one run of one controller."""
+
+    run_id: str
+    """Stamped on every message."""
+    plant: Plant
+    period: float
+    """Seconds."""
+
+    def observation(self, tick: m.Tick) -> Observation:
+        """What a tick lets the controller see."""
+        state = tick.state if tick.state_verdict == "fresh" else None
+        hidden = None
+        if tick.weights is not None:
+            layers = [array.numpy().astype(float) for array in tick.weights.layers]
+            hidden = HiddenSet(tick.weights.seq, layers, tick.weights.sha256, tick.weights.network_sha256)
+        if state is None:
+            return Observation(None, None, 0, -1, hidden)
+        applied = None if state.applied is None else np.array(state.applied) - self.plant.u_e
+        pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
+        total = sum(seconds for seconds, _u in pieces)
+        if pieces and not math.isclose(total, self.period, rel_tol=1e-3):
+            # Not the whole period: what acted in the rest of it is not known.
+            applied, pieces = None, ()
+        x = np.array(state.x) - self.plant.x_e
+        return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces)
+
+    def outputs(
+        self, tick: m.Tick, result: StepResult, network: LearnedNetwork | None, hidden_sha256: str
+    ) -> Outputs:
+        """What a step says to others.
+
+        Args:
+            tick: what it was given.
+            result: what it decided.
+            network: the oracle's, after the step.
+            hidden_sha256: hash of that network's hidden layers; empty without one.
+        """
+        command = self._command(tick, result)
+        return Outputs(
+            command,
+            self._result(tick, command, result, network, hidden_sha256),
+            self._sample(tick, result),
+            result.new_network,
+            None if network is None else self._weights(tick, network, hidden_sha256),
+        )
+
+    def backup(self, policy: Policy, command: m.Command) -> m.Backup:
+        """A policy in plant units, from one period after `command` on."""
+        inputs = policy.inputs + self.plant.u_e - policy.gain @ self.plant.x_e
+        return m.Backup(
+            run_id=self.run_id,
+            seq=command.seq,
+            period=self.period,
+            gain=policy.gain.tolist(),
+            inputs=inputs.tolist(),
+        )
+
+    def _command(self, tick: m.Tick, result: StepResult) -> m.Command:
+        plan = result.plan + self.plant.u_e
+        return m.Command(
+            run_id=self.run_id,
+            seq=tick.seq,
+            state_run_id=tick.state.run_id if tick.state else "",
+            state_seq=tick.state.seq if tick.state and tick.state_verdict == "fresh" else -1,
+            period=self.period,
+            mode=result.mode,
+            u=plan[0].tolist(),
+            plan=plan.tolist(),
+        )
+
+    def _result(
+        self,
+        tick: m.Tick,
+        command: m.Command,
+        result: StepResult,
+        network: LearnedNetwork | None,
+        hidden_sha256: str,
+    ) -> m.TickResult:
+        solution, label = result.solution, result.label
+        return m.TickResult(
+            run_id=self.run_id,
+            seq=tick.seq,
+            x=list(tick.state.x) if tick.state else [],
+            u=command.u,
+            mode=result.mode,
+            status=str(solution.status) if solution else f"no solve: state {tick.state_verdict}",
+            iterations=solution.iterations if solution else 0,
+            slack=solution.slack if solution else 0.0,
+            slack_row=solution.slack_row if solution else "",
+            h=label.h.tolist() if label else None,
+            h_hat=label.h_hat.tolist() if label else None,
+            prediction_error=_norm(label.h_hat - label.h) if label else None,
+            oracle_norms=[] if network is None else [_norm(column) for column in network.K.T],
+            hidden_version=-1 if network is None else network.version,
+            hidden_sha256=hidden_sha256,
+            tick_crc32=zlib.crc32(encode(tick)),
+            input_delay=result.delay,
+            weights_verdict=m.weights_verdict(*result.verdict),
+            set_margin=result.first.margin if result.first else None,
+            set_piece=result.first.piece if result.first else -1,
+            weights_rolled_back=result.rolled_back,
+        )
+
+    def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:
+        label = result.label
+        if label is None:
+            return None
+        # The label of tick t is complete at tick t + 1.
+        x, u, h, past = label.x.tolist(), label.u.tolist(), label.h.tolist(), label.past.tolist()
+        return m.Sample(tick.seq - 1, x, u, h, past)
+
+    def _weights(
+        self, tick: m.Tick, network: LearnedNetwork, hidden_sha256: str
+    ) -> Callable[[], m.OutputWeights]:
+        return lambda: m.OutputWeights(
+            run_id=self.run_id,
+            seq=tick.seq,
+            hidden_version=network.newest,
+            hidden_sha256=hidden_sha256,
+            K=m.Array.of(network.K),
+        )
+
+
+@lru_cache(maxsize=16)
+def _source(run_id: str) -> int:
+    """A number for a run id, the same in every process."""
+    return int.from_bytes(hashlib.sha256(run_id.encode()).digest()[:7], "little")
+
+
+def _norm(vector: np.ndarray) -> float:
+    """Euclidean; numpy's own takes ten times as long for so few numbers."""
+    return math.sqrt(vector.dot(vector))

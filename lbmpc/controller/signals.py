@@ -1,0 +1,67 @@
+"""What goes into a control step and what comes out of it, in deviation coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.model import Pieces
+from lbmpc.oracles.base import HiddenSet, Verdict
+from lbmpc.sets.guard import FirstInputs
+from lbmpc.solver.solution import Solution
+
+Mode = Literal["solver", "shifted_plan", "feedback"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What a step may depend on. x (d,) and applied (m,) are deviations; None where there was none."""
+
+    x: np.ndarray | None
+    applied: np.ndarray | None
+    """Mean input over the period that ended with x."""
+    source: int
+    """Which incarnation of the plant sent x; labels never span two."""
+    sequence: int
+    """Its sample number; a label needs two consecutive ones."""
+    hidden: HiddenSet | None
+    pieces: Pieces = ()
+    """The inputs of that period where there were several, deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """One labelled sample: x_t, the input applied until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
+
+    x: np.ndarray
+    u: np.ndarray
+    h: np.ndarray
+    h_hat: np.ndarray
+    """The oracle's estimate before it learned this sample."""
+    past: np.ndarray
+    """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """What a step decided and found, in deviation coordinates. plan is (N, m) with plan[0] the input for now."""
+
+    plan: np.ndarray
+    mode: Mode
+    solution: Solution | None
+    label: Label | None
+    verdict: Verdict
+    """About the hidden layers on offer."""
+    rolled_back: str
+    """Why the hidden weights and K from before came back; empty where they did not."""
+    delay: float
+    """Seconds for which the sample was predicted ahead, to when the command acts."""
+    first: FirstInputs | None
+    """What is certified of v_0; None where there are no certified sets, or no state."""
+
+    @property
+    def new_network(self) -> bool:
+        """Whether other hidden layers are in use from now on."""
+        return self.verdict.outcome == "adopted" or bool(self.rolled_back)

@@ -1,0 +1,65 @@
+"""The memory of a controller, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.controller.fallback import Plan
+from lbmpc.oracles.base import OracleState
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerState:
+    """All of the controller's memory. Flat, so that it can be frozen into a keyframe and thawed."""
+
+    plan: Plan
+    """Shifted solution: warm start of the next solve and fallback."""
+    pending_x: np.ndarray
+    """x_t whose label is still to come, (d,)."""
+    pending: tuple[int, int]
+    """Its (source, sequence); sequence -1 when none is pending."""
+    predicted: np.ndarray
+    """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
+    delay: float
+    """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
+    oracle: OracleState
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "plan.v": self.plan.v,
+            "plan.left": np.array([self.plan.left], dtype=np.int64),
+            "pending.x": self.pending_x,
+            "pending": np.array(self.pending, dtype=np.int64),
+            "predicted": self.predicted,
+            "delay": np.array([self.delay]),
+            **{f"oracle.{name}": array for name, array in self.oracle.items()},
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
+        """Raises KeyError when an array is missing."""
+        source, sequence = (int(value) for value in arrays["pending"])
+        prefix = "oracle."
+        oracle = {
+            name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
+        }
+        plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
+        return cls(
+            plan,
+            arrays["pending.x"],
+            (source, sequence),
+            arrays["predicted"],
+            float(arrays["delay"][0]),
+            oracle,
+        )
+
+
+def same_memory(a: ControllerState, b: ControllerState) -> str | None:
+    """Name of the first array that differs between two states, bit for bit, or None."""
+    left, right = a.to_arrays(), b.to_arrays()
+    for name in sorted(left.keys() | right.keys()):
+        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
+            return name
+    return None

@@ -1,0 +1,135 @@
+"""Adoption of hidden layers from a trainer: what refuses a set, what becomes of K, and what is rolled back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.oracles.base import HiddenSet, OracleState, Verdict
+from lbmpc.oracles.dnn import rollback
+from lbmpc.oracles.dnn.adaptation_law import refit
+from lbmpc.oracles.dnn.expressions import NetworkExpressions
+from lbmpc.oracles.dnn.trial import Finding, Trial, had, newest, tried
+from network_model.description import hash_layers, why_unacceptable
+
+IN_USE, NEWEST = 0, 1
+"""Entries of `version`: that of the hidden layers in use, and the highest that was ever adopted."""
+LEAP = 10**9
+"""By which a version may rise at once: after the largest number that there is nobody's weights would be newer."""
+Network = tuple[list[np.ndarray], np.ndarray]
+"""W_1..W_{L-1} and K."""
+
+
+@dataclass(frozen=True)
+class Refit:
+    """At an adoption K is fitted to the newest samples under the new features; see `adaptation_law.refit`."""
+
+    window: int
+    """Samples remembered for it."""
+    ridge: float
+
+
+@dataclass(frozen=True, eq=False)
+class Adoption:
+    """What hidden layers on offer must show, before and after they are adopted."""
+
+    net: NetworkExpressions
+    bounds: np.ndarray
+    """On the norm of each column of K, (d,), scaled."""
+    refit: Refit | None
+    """What happens to K when hidden layers are adopted; None: it is kept."""
+    trial: Trial | None
+    """What hidden layers must show before and after they are adopted; None: nothing."""
+
+    def adopt(self, state: OracleState, offered: HiddenSet) -> tuple[OracleState, Verdict]:
+        """Swap in a new set of hidden layers; K is kept, or refitted to the samples remembered.
+
+        Returns:
+            The state and "adopted", or the state as it was, but for the memory of trials, and why it was refused.
+        """
+        reason = self._why_not_of_this_network(state, offered)
+        if reason is not None:
+            return state, Verdict("refused", reason)
+        # What the hash is of.
+        hidden = [layer.astype(np.float32).astype(float) for layer in offered.layers]
+        K = self._K_under(hidden, state)
+        watched: OracleState = {}
+        if self.trial is not None:
+            samples = newest(self.trial, state)
+            if len(samples) < self.trial.least:
+                missing = f"trial: {len(samples)} samples so far, {self.trial.least} are needed"
+                return state, Verdict("refused", missing)
+            if tried(state, offered.sha256):
+                return state, Verdict("refused", "stale: these layers were in use or on trial before")
+            state = {**state, **had(state, offered.sha256)}
+            in_use = self.net.hidden(state)
+            found = self._compare(samples, (hidden, K), (in_use, state["K"]))
+            if self.trial.refuses(found):
+                return state, Verdict("refused", f"trial: {found}")
+            watched = rollback.adopted(self.trial, state, in_use, K)
+        version = np.array([offered.version, offered.version], dtype=np.int64)
+        return {**state, **self.net.named(hidden), "version": version, **watched, "K": K}, Verdict("adopted")
+
+    def confirm(self, state: OracleState) -> tuple[OracleState, str]:
+        """After a sample was learned: whether the set that was adopted last holds what its trial promised.
+
+        Returns:
+            The state and "", or the state with the hidden layers and K from before, and a text that says why.
+        """
+        if self.trial is None or not rollback.due(self.trial, state):
+            return state, ""
+        samples = newest(self.trial, state, rollback.since(state))
+        before = rollback.before(state, len(self.net.shapes) - 1)
+        found = self._compare(samples, (self.net.hidden(state), rollback.K_adopted(state)), before)
+        if self.trial.regrets(found):
+            hidden, K = before
+            version = np.array([rollback.version(state), state["version"][NEWEST]], dtype=np.int64)
+            text = f"version {int(state['version'][IN_USE])} back to version {int(version[IN_USE])}: {found}"
+            return {
+                **state,
+                **self.net.named(hidden),
+                "K": K,
+                "version": version,
+                **rollback.over(state),
+            }, text
+        return (state if not rollback.ends(state) else {**state, **rollback.over(state)}), ""
+
+    def _why_not_of_this_network(self, state: OracleState, offered: HiddenSet) -> str | None:
+        """What is wrong with a set before anybody asks how well it predicts, or None."""
+        known, version = int(state["version"][NEWEST]), offered.version
+        if version <= known:
+            return f"version {version} is not newer than {known}"
+        if version > known + LEAP:
+            return f"version {version} leaps too far ahead of {known}"
+        if offered.network_sha256 != self.net.description.sha256():
+            return "trained for another network description"
+        reason = why_unacceptable(self.net.description, offered.layers)
+        if reason is None and hash_layers(offered.layers) != offered.sha256:
+            return "sha256 does not match the layers"
+        return reason
+
+    def _compare(self, samples: np.ndarray, new: Network, old: Network) -> Finding:
+        """Two networks, each hidden layers and K, on the same samples, (n, row)."""
+        windows, h = self._taken_apart(samples)
+
+        def error(hidden: list[np.ndarray], K: np.ndarray) -> float:
+            missed = self.net.features_of(hidden, windows) @ K - h
+            return float((missed * missed).sum() / max(1, len(samples)))
+
+        return Finding(error(*new), error(*old), len(samples))
+
+    def _K_under(self, hidden: list[np.ndarray], state: OracleState) -> np.ndarray:
+        """K for new hidden layers, scaled, (1 + n_L, d)."""
+        if self.refit is None:
+            return state["K"]
+        known = state["samples"][: int(state["sampled"][0])]
+        if not len(known):
+            return state["K"]
+        windows, h = self._taken_apart(known)
+        return refit(state["K"], self.net.features_of(hidden, windows), h, self.refit.ridge, self.bounds)
+
+    def _taken_apart(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Windows of pairs, (n, k, d + m), and labels, (n, d), of remembered samples, (n, row)."""
+        d, m = self.net.d, self.net.m
+        return samples[:, :-d].reshape(len(samples), self.net.pairs, d + m), samples[:, -d:]

@@ -1,0 +1,86 @@
+"""The Gauss-Newton subproblem: the cost's quadratic model about an iterate, and the best step that the rows allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from lbmpc.casadi_buffers import Bound
+from lbmpc.solver.rows import Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Where one Gauss-Newton step leads."""
+
+    v: np.ndarray
+    """Inputs, (N, m)."""
+    values: np.ndarray
+    """Row values there, (rows,)."""
+    feasible: bool
+    """Whether the hard state rows can be met."""
+    seen: np.ndarray
+    """Rows that the QP was shown."""
+
+
+class Subproblem:
+    """Linearised at one iterate after another.
+
+    Args:
+        sweep: `riccati.build_sweep`, with the states that the rows look at.
+        move: `riccati.build_rows` for the same states; the sweeps of two oracles may share it.
+    """
+
+    def __init__(self, sweep: Bound, move: Bound):
+        self.sweep, self._move = sweep, move
+
+    @property
+    def free(self) -> np.ndarray:
+        """The unconstrained minimiser's inputs, (N, m), valid until the next linearisation."""
+        return self.sweep.outputs["vs"].T
+
+    def load(
+        self, x: np.ndarray, theta: np.ndarray, xr: np.ndarray | None = None, ur: np.ndarray | None = None
+    ) -> None:
+        """From which state, (D,), with which oracle's parameters and towards which references, from now on."""
+        inputs = self.sweep.inputs
+        inputs["x"][:, 0], inputs["theta"][:, 0] = x, theta
+        inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
+        inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
+
+    def linearise(self, v: np.ndarray) -> float:
+        """Linearise at v, (N, m), and return its true cost, soft constraints left out."""
+        self.sweep.inputs["v"][:] = v.T
+        self.sweep()
+        return float(self.sweep.outputs["cost"][0, 0])
+
+    def values(self, rows: Rows) -> np.ndarray:
+        """Row values, (rows,), at w = 0: the unconstrained minimiser."""
+        return rows.values(self.sweep.outputs["vs"], self.sweep.outputs["zs"])
+
+    def propagate(self, function: Bound) -> dict[str, np.ndarray]:
+        """What `riccati.build_rows` or `build_tangent` says about this linearisation."""
+        for name in "ABKL":
+            function.inputs[name][:] = self.sweep.outputs[name]
+        function()
+        return function.outputs
+
+    def constrained(self, rows: Rows, values: np.ndarray, hint: np.ndarray) -> Target | None:
+        """The minimiser that keeps the rows, from their `values` at w = 0; None when the numbers are unusable.
+
+        `hint` as for `least_distance`.
+        """
+        slopes, free = self.propagate(self._move)["M"].T, self.free
+        nearest, feasible = rows.nearest(values, rows.apply(slopes), hint)
+        if nearest is None:
+            return None
+        v = free + (slopes[: free.size] @ nearest.w).reshape(free.shape)
+        return Target(rows.clip(v), nearest.values, feasible, nearest.shown.seen)
+
+
+def finite(values: np.ndarray) -> bool:
+    """Whether all are numbers, none of them beyond 1e150; then, and only then, their sum of squares is one."""
+    flat = values.ravel(order="K")
+    return isfinite(flat.dot(flat))

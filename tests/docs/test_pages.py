@@ -1,0 +1,142 @@
+"""Every path, command, option and module that the pages and the sources name exists."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tandem.cli import main
+from tests.helpers.paths import ROOT
+
+PACKAGES = (
+    "network_model",
+    "lbmpc",
+    "protocol",
+    "node_runtime",
+    "controller_node",
+    "trainer_node",
+    "plant_sim",
+    "run_log",
+    "tandem",
+    "benchmarks",
+    "verification",
+    "tests",
+)
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+NAME = "|".join(PACKAGES)
+PATH = re.compile(rf"(?<![\w/.<-])((?:{NAME}|configs|docs|docker)/[\w./-]*\w/?)(?![\w*<])")
+FILE = re.compile(r"`([\w-]+\.py)`")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)[^)]*\)")
+MODULE = re.compile(rf"`((?:{NAME})(?:\.\w+)+)")
+RUN = re.compile(r"python -m ([\w.]+)")
+MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
+TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+ ?){1,2})([^`\n|]*)", re.MULTILINE)
+# What a page may name that is made when something runs, or is an example of the reader's own.
+MADE = ("network_model/architectures/gru.py", "tandem/jet")
+
+
+def code(text: str) -> str:
+    """Inline code and code blocks of a page, one a line."""
+    blocks = re.findall(r"^```.*?^```", text, re.DOTALL | re.MULTILINE)
+    return "\n".join([*blocks, *re.findall(r"`[^`\n]+`", text)])
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@cache
+def source(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def is_a_module(dotted: str) -> bool:
+    """Whether a dotted name is a package, a module, or something that stands in one."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        place = ROOT.joinpath(*parts[:length])
+        rest = parts[length:]
+        for file in (place.with_suffix(".py"), place / "__init__.py"):
+            if file.is_file():
+                return not rest or re.search(rf"\b{rest[0]}\b", source(file)) is not None
+    return False
+
+
+@cache
+def help_of(*words: str) -> str | None:
+    """What `tandem WORDS --help` prints; None where there is no such command."""
+    import contextlib
+    import io
+
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            main([*words, "--help"])
+        except SystemExit as end:
+            return said.getvalue() if not end.code else None
+    return None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_paths_and_links_of_a_page_exist(page: Path) -> None:
+    text = source(page)
+    named = {path for path in PATH.findall(code(text)) if not path.startswith(MADE)}
+    missing = {path for path in named if not (ROOT / path).exists()}
+    missing |= {link for link in LINK.findall(text) if not (page.parent / link).exists()}
+    names = {path.name for path in SOURCES}
+    missing |= {name for name in FILE.findall(text) if name not in names and name != "gru.py"}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_modules_and_targets_of_a_page_exist(page: Path) -> None:
+    text = code(source(page))
+    wrong = {name for name in MODULE.findall(text) if not is_a_module(name)}
+    wrong |= {name for name in RUN.findall(text) if name.startswith(PACKAGES) and not is_a_module(name)}
+    targets = re.findall(r"^([a-z-]+):", source(ROOT / "Makefile"), re.MULTILINE)
+    wrong |= {f"make {name}" for name in MAKE.findall(text) if name not in targets}
+    assert wrong == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_commands_and_options_of_a_page_exist(page: Path) -> None:
+    wrong = set()
+    for words, rest in TANDEM.findall(code(source(page))):
+        chosen = words.split()
+        told = help_of(*chosen)
+        if told is None:
+            # The second word is an argument, or a sentence goes on.
+            chosen = chosen[:1]
+            told = help_of(*chosen)
+        if told is None:
+            wrong.add(f"tandem {words}")
+            continue
+        for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", rest):
+            if option not in told:
+                wrong.add(f"tandem {' '.join(chosen)} {option}")
+    assert wrong == set()
+
+
+def test_modules_that_the_sources_name_exist() -> None:
+    wrong = {
+        f"{relative(path)}: {name}"
+        for path in SOURCES
+        for name in MODULE.findall(source(path))
+        if not is_a_module(name)
+    }
+    assert wrong == set()
+
+
+def test_paths_that_the_sources_name_exist() -> None:
+    inside = re.compile(rf"`((?:{NAME}|configs|docs)/[\w./-]*\w)")
+    wrong = {
+        f"{relative(path)}: {name}"
+        for path in SOURCES
+        for name in inside.findall(source(path))
+        if not name.startswith(MADE) and not (ROOT / name).exists()
+    }
+    assert wrong == set()
