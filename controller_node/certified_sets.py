@@ -11,7 +11,6 @@ import gzip
 import hashlib
 import io
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, MutableMapping
@@ -29,6 +28,7 @@ from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
+from node_runtime.whole_file import write_whole
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
@@ -127,20 +127,7 @@ def write_sets(sets: CertifiedSets, path: Path) -> None:
     """Whole or not at all. Raises `OSError`."""
     data = sets.to_bytes()
     # Without a time of writing in it, so that the same sets are the same file.
-    _write(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 
 
 # -- the cache ----------------------------------------------------------------------------------
@@ -196,11 +183,9 @@ class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
             raise KeyError(name) from error
 
     def __setitem__(self, name: str, arrays: dict[str, np.ndarray]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}.")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(temporary, self._path(name))
+        content = io.BytesIO()
+        np.savez(content, **arrays)  # type: ignore[arg-type]
+        write_whole(self._path(name), content.getvalue())
 
     def __delitem__(self, name: str) -> None:
         try:
@@ -230,10 +215,9 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     named = config.controller.sets
     if named is not None:
         try:
-            sets = read_sets(Path(named))
-            require_model(sets.certificate, model)
+            sets = _sets_for(model, Path(named))
         except CertificateError as error:
-            raise ConfigError(f"controller.sets: {_with_name(named, str(error))}") from error
+            raise ConfigError(f"controller.sets: {error}") from error
         _require_claim(sets, named)
         return sets
     cache = default_cache() if cache is None else cache
@@ -256,12 +240,21 @@ def start_of(config: Config, model: Model) -> np.ndarray:
     return np.asarray(initial_state(config, model.plant) - model.plant.x_e)
 
 
+def _sets_for(model: Model, path: Path) -> CertifiedSets:
+    """Raises `CertificateError`, naming the file: it cannot be read, or is about another model."""
+    sets = read_sets(path)
+    try:
+        require_model(sets.certificate, model)
+    except CertificateError as error:
+        raise CertificateError(f"{path}: {error}") from error
+    return sets
+
+
 def _usable(path: Path, model: Model) -> CertifiedSets | None:
     if not path.exists():
         return None
     try:
-        sets = read_sets(path)
-        require_model(sets.certificate, model)
+        sets = _sets_for(model, path)
     except CertificateError:
         return None  # of another model, or a damaged cache: as if it were not there
     return sets if sets.certificate.certified else None
@@ -273,7 +266,3 @@ def _require_claim(sets: CertifiedSets, name: str) -> None:
             f"controller.sets: {name}: is a {sets.certificate.kind} and claims nothing; the tightening `invariant` "
             "needs certified sets"
         )
-
-
-def _with_name(name: str, text: str) -> str:
-    return text if name in text else f"{name}: {text}"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ import msgspec
 import numpy as np
 
 from controller_node.outbox import Outbox
+from node_runtime.whole_file import write_whole
 from protocol import codec, topics
 from protocol import messages as m
 
@@ -239,7 +239,9 @@ class CheckpointWriter:
         )
         content = msgspec.msgpack.encode(checkpoint)
         try:
-            replace_file(self._path, MAGIC + hashlib.sha256(content).digest() + content)
+            # For its owner alone, like everything that a process will believe when it starts.
+            content = MAGIC + hashlib.sha256(content).digest() + content
+            write_whole(self._path, content, mode=0o600, durable=True)
         except OSError as error:
             self._counts["checkpoints failed"] += 1
             self._warn(f"the checkpoint cannot be written ({error.strerror}); the loop goes on without")
@@ -263,25 +265,3 @@ class CheckpointWriter:
         elif self._said and not text:
             log.info("%s: the checkpoint is written again", self._path)
         self._said = text
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file so that a crash at any moment leaves the old one or the new one, whole. Raises `OSError`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.new")
-    try:
-        # For its owner alone, like everything that a process will believe when it starts.
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with open(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -7,7 +7,6 @@ live node, the lock-step simulation and the replay all call `step` and differ on
 from __future__ import annotations
 
 import platform
-from importlib import metadata
 
 from controller_node.build import build_backup, build_controller, build_model
 from controller_node.certified_sets import CertifiedSets, find_sets
@@ -15,10 +14,9 @@ from controller_node.codegen.compiler import Compiler
 from controller_node.memory import Memory
 from controller_node.translation import Outputs, Translation
 from lbmpc.controller.backup_policy import BackupPlanner
-from node_runtime.config.sections import Config, to_json
+from node_runtime import provenance
+from node_runtime.config.sections import Config
 from protocol import messages as m
-
-PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh")
 
 
 class ControllerCore:
@@ -99,18 +97,15 @@ class ControllerCore:
 
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
-        versions = {"python": platform.python_version(), "machine": platform.machine()}
-        versions |= {"kernels": self.kernels}
+        facts = {"machine": platform.machine(), "kernels": self.kernels}
         if self.sets is not None:
-            versions |= {"certified sets": self.sets.sha256}
-        versions |= {name: metadata.version(name) for name in PACKAGES}
-        return m.RunInfo(
-            run_id=self.run_id,
-            seq=0,
-            process="controller",
-            config=to_json(self.config),
-            versions=versions,
-            seed=self.config.seed,
-            units=dict(self.plant.units),
+            facts |= {"certified sets": self.sets.sha256}
+        return provenance.run_info(
+            self.config,
+            "controller",
+            self.run_id,
+            self.plant.units,
+            packages=provenance.CONTROLLER,
+            facts=facts,
             unix_time=unix_time,
         )

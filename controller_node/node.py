@@ -15,11 +15,11 @@ from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
-from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
-from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.lifecycle import new_run_id, run_process
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime.scheduling import (
@@ -315,42 +315,35 @@ class ControllerNode:
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """`tandem controller`. 0 when told to stop, 2 for a configuration that admits no controller."""
+    with one_blas_thread():
+        return run_process(lambda stopping: _live(config, stopping), stop)
+
+
+def _live(config: Config, stopping: threading.Event) -> int:
     run_id = new_run_id("controller")
     counts = dict.fromkeys(COUNTS, 0)
-    with stopped_by_signals(stop) as stopping, one_blas_thread():
-        try:
-            _check_phase(config)
-            place = core_for(config, "controller", os.sched_getaffinity(0))
-            core = ControllerCore(config, run_id)
-            log.info("%s", guarantee(config, core.controller.model, core.sets))
-            path = Path(config.controller.checkpoint) if config.controller.checkpoint else None
-            before = None if path is None else resume(core.memory, path)
-            if before is not None:
-                counts |= {name: before.counters.get(name, 0) for name in counts}
-            outbox = Outbox(run_id, earlier=() if before is None else before.batches())
-            with (
-                punctual(config.realtime.priority, keep_awake=config.awake) as note,
-                Bus(config, "controller", run_id, stopping) as bus,
-                HealthPublisher(
-                    bus,
-                    core.run_info(time.time()),
-                    lambda: counts,
-                    "; ".join(filter(None, (note, core_note(place)))),
-                ) as health,
-            ):
-                saving = None
-                if path is not None:
-                    saving = CheckpointWriter(
-                        path, core.memory.belongs(), outbox, config.trainer.capacity, counts
-                    )
-                node = ControllerNode(core, bus, health, counts, outbox, saving)
-                with saving or nullcontext(), on_core(place):
-                    node.run(stopping)
-        except ConfigError as error:
-            log.error("%s", error)
-            return 2
-        except OpenInterrupted:
-            log.info("stopped before there was a router")
+    _check_phase(config)
+    place = core_for(config, "controller", os.sched_getaffinity(0))
+    core = ControllerCore(config, run_id)
+    log.info("%s", guarantee(config, core.controller.model, core.sets))
+    path = Path(config.controller.checkpoint) if config.controller.checkpoint else None
+    before = None if path is None else resume(core.memory, path)
+    if before is not None:
+        counts |= {name: before.counters.get(name, 0) for name in counts}
+    outbox = Outbox(run_id, earlier=() if before is None else before.batches())
+    with punctual(config.realtime.priority, keep_awake=config.awake) as note:
+        info, standing = core.run_info(time.time()), "; ".join(filter(None, (note, core_note(place))))
+        with (
+            Bus(config, "controller", run_id, stopping) as bus,
+            HealthPublisher(bus, info, lambda: counts, standing) as health,
+        ):
+            saving = None
+            if path is not None:
+                belongs = core.memory.belongs()
+                saving = CheckpointWriter(path, belongs, outbox, config.trainer.capacity, counts)
+            node = ControllerNode(core, bus, health, counts, outbox, saving)
+            with saving or nullcontext(), on_core(place):
+                node.run(stopping)
     return 0
 
 

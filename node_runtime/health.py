@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 import threading
-import time
 from collections.abc import Callable
-from functools import cache
-from importlib import metadata
 from types import TracebackType
 
 import msgspec
 
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config import sections as configuration
-from node_runtime.config.sections import Config
 from protocol import topics
 from protocol.messages import Health, ProcessStatus, RunInfo
 
@@ -23,38 +17,6 @@ RUN_INFO_EVERY = 10
 MAX_RATE = 600.0
 """Publishers a second, at most, of one `HealthThread`: a thousand then speak within the two seconds after which a view
 calls one silent."""
-PACKAGES = ("tandem-control", "numpy", "scipy", "casadi", "daqp", "msgspec", "eclipse-zenoh", "torch", "mcap")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of those of our packages that are installed here."""
-    return dict(_versions())
-
-
-@cache
-def _versions() -> dict[str, str]:
-    # Each takes milliseconds to read, and a trainer of many plants has one `RunInfo` for each.
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def run_info(config: Config, process: str, run_id: str, units: dict[str, str] | None = None) -> RunInfo:
-    """What a log needs to know about this process. `units`: of its signals, by name."""
-    return RunInfo(
-        run_id=run_id,
-        seq=0,
-        process=process,
-        config=configuration.to_json(config),
-        versions=versions(),
-        seed=config.seed,
-        units=units or {},
-        unix_time=time.time(),
-    )
 
 
 class HealthThread:

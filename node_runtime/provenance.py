@@ -1,13 +1,65 @@
-"""What the figures were measured on and with."""
+"""What a process runs on and with: of a log's messages, and of figures that were measured."""
 
 from __future__ import annotations
 
 import os
 import platform
+import time
+from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = ("tandem-control", "casadi", "daqp", "numpy")
+from node_runtime.config.sections import Config, to_json
+from protocol.messages import RunInfo
+
+SCIENCE = ("tandem-control", "numpy", "scipy", "casadi", "daqp")
+"""What a controller's numbers depend on."""
+CONTROLLER = (*SCIENCE, "msgspec", "eclipse-zenoh")
+"""What a controller process consists of."""
+PACKAGES = (*CONTROLLER, "torch", "mcap")
+
+
+def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
+    """Of Python, and of those of `packages` that are installed here."""
+    return {"python": platform.python_version(), **{p: _version(p) for p in packages if _version(p)}}
+
+
+@cache
+def _version(package: str) -> str:
+    # Takes milliseconds to read, and a trainer of many plants has one `RunInfo` for each.
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def run_info(
+    config: Config,
+    process: str,
+    run_id: str,
+    units: Mapping[str, str] | None = None,
+    *,
+    packages: tuple[str, ...] = PACKAGES,
+    facts: Mapping[str, str] | None = None,
+    unix_time: float | None = None,
+) -> RunInfo:
+    """What a log needs to know about a process.
+
+    units: of its signals, by name. packages: whose versions it says. facts: what it runs with besides, said before
+    the versions. unix_time: when it began; None: now.
+    """
+    found = versions(packages)
+    return RunInfo(
+        run_id=run_id,
+        seq=0,
+        process=process,
+        config=to_json(config),
+        versions={"python": found.pop("python"), **(facts or {}), **found},
+        seed=config.seed,
+        units=dict(units or {}),
+        unix_time=time.time() if unix_time is None else unix_time,
+    )
 
 
 def describe() -> dict[str, str]:
@@ -17,14 +69,6 @@ def describe() -> dict[str, str]:
         "processor": _processor(),
         "cores": str(cores),
         "system": f"{platform.system()} {platform.machine()}",
-    }
-
-
-def versions() -> dict[str, str]:
-    """Python's and the packages'."""
-    return {
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in PACKAGES},
     }
 
 

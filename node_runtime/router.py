@@ -18,8 +18,9 @@ from node_runtime.bus.session import lease_ms, secure, session_config
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
+from node_runtime.provenance import run_info
 from node_runtime.realtime.scheduling import punctual
 from node_runtime.rejected import RejectedMessages
 from node_runtime.tls import zenoh_log

@@ -11,8 +11,9 @@ from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.plant import initial_state, plant_of
 from node_runtime.config.sections import Config
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer
 from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual

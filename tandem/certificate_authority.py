@@ -7,7 +7,6 @@ keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      all that the
 from __future__ import annotations
 
 import ipaddress
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -20,6 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from node_runtime.config.strict import ConfigError
 from node_runtime.tls.credentials import AUTHORITY, CERTIFICATE, KEY, load_certificate, name_of, read_bytes
+from node_runtime.whole_file import write_whole
 from protocol.rights import ROLES, common_name
 from tandem.terminal import Refused
 
@@ -275,12 +275,5 @@ def _folder(path: Path) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Readable by the owner alone from the first byte, and whole or not at all."""
-    new = path.with_name(path.name + ".new")
-    new.unlink(missing_ok=True)
-    handle = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
+    """Readable by the owner alone from the first byte."""
+    write_whole(path, content, mode=0o600, durable=True)

@@ -100,8 +100,7 @@ def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> l
     if len(problems) == 1:
         return [descend(problems[0], steps, learning_rate)]
     stack = _Stack(problems)
-    dense = problems[0].network.description.architecture == "mlp"
-    loss: _Loss = _Dense(stack) if dense else _Mapped(stack)
+    loss: _Loss = _Dense(stack) if stack.network.dense else _Mapped(stack)
     before = loss.values().tolist()
     _adam(stack.flat, loss.gradient, steps, learning_rate)
     after = loss.values().tolist()

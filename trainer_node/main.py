@@ -11,7 +11,7 @@ from node_runtime.bus.session import OpenInterrupted
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import stopped_by_signals
 from node_runtime.realtime.scheduling import quick_handover
-from trainer_node.fleet.discovery import OneRouter, OwnRouters
+from trainer_node.fleet.discovery import RouterPerPlant, SharedRouter
 from trainer_node.fleet.fleet import Fleet
 from trainer_node.training import TrainerError, pick_device, use_one_thread
 
@@ -46,10 +46,10 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
                     names = ", ".join(place.name for place in config.trainer.fleet)
                     log.error("no plant of trainer.fleet matches %r; it has %s", plants, names)
                     return 2
-                Fleet(OwnRouters(config, places, stopping)).run(stopping)
+                Fleet(RouterPerPlant(config, places, stopping)).run(stopping)
             else:
                 with Lanes(config, "trainer", stopping) as lanes:
-                    Fleet(OneRouter(config, plants or config.name, lanes)).run(stopping)
+                    Fleet(SharedRouter(config, plants or config.name, lanes)).run(stopping)
         except OpenInterrupted:
             log.info("stopped before there was a router")
     return 0

@@ -77,6 +77,11 @@ class Network(torch.nn.Module):
         self._input_scale = self.tensor(description.input_scale * description.window)
         self._output_scale = self.tensor(description.output_scale)
 
+    @property
+    def dense(self) -> bool:
+        """Whether its gradient is written out by hand."""
+        return self.description.architecture == "mlp"
+
     def tensor(self, values: np.ndarray | list[float] | list[list[float]]) -> torch.Tensor:
         """A copy of `values` in this network's dtype, on its device."""
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
@@ -147,7 +152,7 @@ def build_loss(network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarra
         h: (M, d), units of h.
         K: (1 + n_L, d), fixed; a copy is kept.
     """
-    kind = DenseLoss if network.description.architecture == "mlp" else AutogradLoss
+    kind = DenseLoss if network.dense else AutogradLoss
     return kind(network, window, h, K)
 
 

@@ -7,10 +7,8 @@ controller gives the hidden layers in force, another one the samples that were m
 from __future__ import annotations
 
 import logging
-import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Iterator
+from concurrent.futures import Executor
 
 import msgspec
 
@@ -23,14 +21,14 @@ from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from trainer_node.descent import Descent, descend_together, shape_of
+from trainer_node.descent import Descent
+from trainer_node.questions import SAMPLES_ANSWER, Questions
 from trainer_node.training import Draw, Trainer
 
 log = logging.getLogger(__name__)
 
 POLL = 0.02
 """Seconds between two looks at what has arrived."""
-ASK_TIMEOUT = 2.0
 JOIN_EVERY = 0.5
 """Seconds between two questions for the hidden layers, at least."""
 REFILL_EVERY = 1.0
@@ -42,17 +40,10 @@ SHARE = 0.5
 """Of the time, at most, is spent training: a network that takes long to train is trained less often."""
 ADOPTION_PATIENCE = 2.0
 """Seconds that a controller may go on with other hidden layers than those it was sent."""
-ROUND = 16
-"""Plants trained in one round, at most: the others' samples wait for as long as it takes."""
 OUTBOX = 20_000
 """Samples to ask for when the buffer can make use of more than it holds."""
 
-# An answer is checked like a message of a topic.
-HIDDEN_ANSWER = Topic(topics.HIDDEN_QUERY, m.HiddenSnapshot, "bulk", "controller", topics.WEIGHTS_LIMIT)
-OUTBOX_ANSWER = Topic(topics.OUTBOX_QUERY, m.Samples, "bulk", "controller", topics.SAMPLES.max_bytes)
-
-_Answer = TypeVar("_Answer", m.HiddenSnapshot, m.Samples)
-NAMES = (
+COUNTERS = (
     "samples",
     "buffer",
     "trainings",
@@ -63,29 +54,28 @@ NAMES = (
     "joined",
     "samples of other runs",
 )
+"""Of a node, beside those of its `Trainer`."""
 WAITING = "waiting for a controller with a network"
 DISABLED = "trainer.enabled is false: hidden layers are not trained"
 
 
 class TrainerNode:
-    """One plant's trainer on the bus. All but waiting for answers happens in the thread that calls."""
+    """One plant's trainer on the bus. All but waiting for answers happens in the thread that calls.
+
+    Args:
+        config: with the plant's name.
+        bus: the plant's.
+        health: what is said of this trainer.
+        counts: this node's own figures, kept up to date here; other threads may copy it.
+        askers: who waits for answers.
+    """
 
     def __init__(
-        self,
-        config: Config,
-        bus: Bus,
-        health: HealthPublisher,
-        counts: dict[str, int],
-        askers: Executor | None = None,
+        self, config: Config, bus: Bus, health: HealthPublisher, counts: dict[str, int], askers: Executor
     ):
-        """`counts`: this node's own figures, kept up to date here; other threads may copy it.
-
-        askers: who waits for answers, so that a controller that gives none holds up nobody else.
-        """
-        self._askers = askers or ThreadPoolExecutor(1, "ask")
-        self._asked: tuple[Future[list[bytes]], Callable[[list[bytes]], None]] | None = None
         self._config = config
         self._bus = bus
+        self._questions = Questions(bus, askers)
         self._health = health
         self._counts = counts
         self._patience = max(ADOPTION_PATIENCE, 5 * config.period)
@@ -116,15 +106,6 @@ class TrainerNode:
         """Say that it is here."""
         self._health.set("ready", WAITING if self._config.trainer.enabled else DISABLED)
 
-    def run(self, stop: threading.Event) -> None:
-        """This plant alone, until `stop` is set."""
-        self.start()
-        while not stop.wait(POLL):
-            now = clock.now()
-            self.listen(now)
-            train_round([self], now)
-            self.tell()
-
     def listen(self, now: float) -> None:
         """Look at all that has arrived, and ask for what is missing; `now` in seconds on the monotonic clock.
 
@@ -132,19 +113,16 @@ class TrainerNode:
         """
         if not self._config.trainer.enabled:
             return
-        answered = False
-        if self._asked is not None:
-            future, then = self._asked
-            if not future.done():
-                return
-            self._asked, answered = None, True
-            then(future.result())
+        answered = self._questions.settle()
+        if self._questions.open:
+            return
         received = self._outputs.take()
         if received is not None:
             self._follow(received.message, now)
         if self._must_join() and now >= self._join_at and not answered:
             self._join_at = now + JOIN_EVERY
-            self._join()
+            # Of the controller that sends K; before that, of any that answers.
+            self._questions.ask_hidden(self._joined)
             return
         for batch in self._samples.take_all():
             self._merge(batch.message)
@@ -154,19 +132,15 @@ class TrainerNode:
         if self._waits_since is None and self._may_train():
             self._waits_since = now
 
-    def tell(self) -> None:
+    def update_counters(self) -> None:
         """Bring the figures up to date."""
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))
 
     def waits_since(self, now: float) -> float | None:
         """Since when this plant could be trained, None when it cannot be now."""
-        return (
-            self._waits_since if now >= self._train_at and self._asked is None and self._may_train() else None
-        )
-
-    def _ask(self, name: str, parameters: dict[str, str], then: Callable[[list[bytes]], None]) -> None:
-        self._asked = self._askers.submit(self._bus.ask, name, parameters, ASK_TIMEOUT), then
+        ready = now >= self._train_at and not self._questions.open and self._may_train()
+        return self._waits_since if ready else None
 
     # -- which controller, which hidden layers ---------------------------------------------------------------
 
@@ -201,39 +175,16 @@ class TrainerNode:
             return True
         return self._output is not None and self._output.run_id != self._run
 
-    def _join(self) -> None:
-        """Take over the hidden layers of the controller that sends K; before that, of any that answers."""
-        self._ask(topics.HIDDEN_QUERY, {}, self._joined)
-
-    def _joined(self, answers: list[bytes]) -> None:
+    def _joined(self, snapshots: Iterator[m.HiddenSnapshot]) -> None:
         sender = None if self._output is None else self._output.run_id
-        for payload in answers:
-            snapshot = self._decode(HIDDEN_ANSWER, payload, m.HiddenSnapshot)
-            if snapshot is not None and sender in (None, snapshot.run_id) and self._take_over(snapshot):
+        for snapshot in snapshots:
+            if sender in (None, snapshot.run_id) and self._take_over(snapshot):
                 return
 
     def _take_over(self, snapshot: m.HiddenSnapshot) -> bool:
-        trainer, version = self._trainer, max(0, snapshot.hidden_version)
-        layers = [layer.numpy().astype(float) for layer in snapshot.layers]
+        """Follow the controller that holds these hidden layers; whether they can be used."""
         try:
-            if hash_layers(layers) != snapshot.hidden_sha256:
-                raise ValueError("sha256 does not match the layers")
-            description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
-            # Before any memory is taken for it.
-            if (reason := why_unacceptable(description, layers)) is not None:
-                raise ValueError(reason)
-            if trainer is not None and trainer.description == description:
-                trainer.resume(layers, version)
-            else:
-                config, run_id = self._config, self._bus.run_id
-                before, trainer = (
-                    trainer,
-                    Trainer(description, config.trainer, config.seed, run_id, layers, version),
-                )
-                if before is not None:
-                    # Samples of another network's plant are of no use, but versions go on rising.
-                    trainer.version = max(trainer.version, before.version)
-                    trainer.counters.update(before.counters)
+            trainer = self._trainer_from(snapshot)
         except ValueError as error:
             self._bus.bad.count(topics.HIDDEN_QUERY, "unusable", str(error))
             return False
@@ -246,6 +197,31 @@ class TrainerNode:
         log.info("following %s, hidden weights version %d", self._run, snapshot.hidden_version)
         self._health.set("ready", f"following {self._run}")
         return True
+
+    def _trainer_from(self, snapshot: m.HiddenSnapshot) -> Trainer:
+        """One that goes on from these hidden layers: the present one where the network is the same.
+
+        Raises:
+            ValueError: they are damaged, or not acceptable for their network.
+        """
+        before, version = self._trainer, max(0, snapshot.hidden_version)
+        layers = [layer.numpy().astype(float) for layer in snapshot.layers]
+        if hash_layers(layers) != snapshot.hidden_sha256:
+            raise ValueError("sha256 does not match the layers")
+        description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
+        # Before any memory is taken for it.
+        if (reason := why_unacceptable(description, layers)) is not None:
+            raise ValueError(reason)
+        if before is not None and before.description == description:
+            before.resume(layers, version)
+            return before
+        config = self._config
+        trainer = Trainer(description, config.trainer, config.seed, self._bus.run_id, layers, version)
+        if before is not None:
+            # Samples of another network's plant are of no use, but versions go on rising.
+            trainer.version = max(trainer.version, before.version)
+            trainer.counters.update(before.counters)
+        return trainer
 
     # -- samples ---------------------------------------------------------------------------------------------
 
@@ -266,20 +242,17 @@ class TrainerNode:
         if self._trainer is None:
             return
         settings = self._config.trainer
-        last = settings.capacity if settings.strategy == "fifo" else OUTBOX
-        parameters = {"run": self._run, "since": str(since), "last": str(last)}
-        self._ask(topics.OUTBOX_QUERY, parameters, lambda answers: self._refilled(answers, since))
+        most = settings.capacity if settings.strategy == "fifo" else OUTBOX
+        self._questions.ask_samples(self._run, since, most, lambda batches: self._refilled(batches, since))
 
-    def _refilled(self, answers: list[bytes], since: int) -> None:
+    def _refilled(self, batches: Iterator[m.Samples], since: int) -> None:
         assert self._trainer is not None
         new = 0
-        for payload in answers:
-            batch = self._decode(OUTBOX_ANSWER, payload, m.Samples)
-            if batch is not None:
-                if batch.run_id == self._run:
-                    self._gap = None
-                # A controller that was started again keeps samples of its earlier runs.
-                new += self._add(OUTBOX_ANSWER, batch)
+        for batch in batches:
+            if batch.run_id == self._run:
+                self._gap = None
+            # A controller that was started again keeps samples of its earlier runs.
+            new += self._add(SAMPLES_ANSWER, batch)
         if new:
             self._count("gaps filled")
         if self._trainer.buffer.last(self._run) <= since:
@@ -332,47 +305,5 @@ class TrainerNode:
         self._count("published")
         self._health.set("running", f"following {self._run}")
 
-    def _decode(self, topic: Topic, payload: bytes, kind: type[_Answer]) -> _Answer | None:
-        try:
-            answer = codec.decode(topic, payload)
-        except codec.BadMessage as error:
-            self._bus.bad.count(error.topic, error.reason, error.detail)
-            return None
-        assert isinstance(answer, kind)
-        return answer
-
     def _count(self, name: str) -> None:
         self._counts[name] += 1
-
-
-def train_round(nodes: Sequence[TrainerNode], now: float) -> float:
-    """Train the plants that have waited longest, up to `ROUND` of one shape, in one descent.
-
-    Returns:
-        Seconds that it took.
-    """
-    waiting = sorted(
-        ((since, k) for k, node in enumerate(nodes) if (since := node.waits_since(now)) is not None)
-    )
-    began, shape = clock.now(), None
-    chosen: list[tuple[TrainerNode, Draw]] = []
-    for _, k in waiting:
-        trainer = nodes[k].trainer
-        assert trainer is not None
-        found = shape_of(trainer.description)
-        if len(chosen) == ROUND or (shape is not None and found != shape):
-            continue
-        draw = nodes[k].begin()
-        if draw is not None:
-            # Whoever has waited longest says which shape is trained.
-            shape = found
-            chosen.append((nodes[k], draw))
-    if not chosen:
-        return 0.0
-    settings = nodes[0].settings
-    descents = descend_together([draw.problem for _, draw in chosen], settings.steps, settings.learning_rate)
-    took = clock.now() - began
-    for (node, draw), descent in zip(chosen, descents, strict=True):
-        node.rest(now, took)
-        node.finish(draw, descent)
-    return clock.now() - began

@@ -89,7 +89,8 @@ class ReplayBuffer:
         self._rng = np.random.default_rng([seed, 0x5EED])
         self._seen = Seen()
         self._length = 0
-        self._offered = 0
+        self.offered = 0
+        """Different samples ever offered."""
         self._next = 0
         self._xu = np.empty((0, len(self._scale)))
         self._h = np.empty((0, 0))
@@ -98,37 +99,12 @@ class ReplayBuffer:
     def __len__(self) -> int:
         return self._length
 
-    @property
-    def offered(self) -> int:
-        """Different samples ever offered."""
-        return self._offered
-
     def last(self, run_id: str) -> int:
         """The newest sequence number met of a run, -1 when there is none."""
         return self._seen.last(run_id)
 
-    def add(
-        self,
-        run_id: str,
-        seq: int,
-        x: np.ndarray,
-        u: np.ndarray,
-        h: np.ndarray,
-        past: np.ndarray | None = None,
-    ) -> bool:
-        """Offer a sample: x (d,), u (m,), h (d,), all finite. Returns whether it was not met before.
-
-        past: the pairs of the window before (x, u), (k - 1, d + m), oldest first.
-
-        Raises:
-            ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
-        """
-        before = np.zeros(0) if past is None else np.ravel(past)
-        window = np.concatenate([before, x, u]).astype(np.float64)
-        return self.add_batch(run_id, [seq], window[None], np.asarray(h, dtype=np.float64)[None]) == 1
-
-    def add_batch(self, run_id: str, seqs: Sequence[int], windows: np.ndarray, h: np.ndarray) -> int:
-        """`add` for one sample after the other: windows (n, k (d + m)), h (n, d). Returns how many were not met before.
+    def add(self, run_id: str, seqs: Sequence[int], windows: np.ndarray, h: np.ndarray) -> int:
+        """Offer samples, one after the other: windows (n, k (d + m)), h (n, d). Returns how many were not met before.
 
         Raises:
             ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
@@ -145,7 +121,7 @@ class ReplayBuffer:
             self._store_in_turn(windows[new], h[new])
             return len(new)
         for k in new:
-            self._offered += 1
+            self.offered += 1
             slot = self._slot(windows[k] / self._scale)
             if slot is not None:
                 self._store(slot, windows[k], h[k])
@@ -168,7 +144,7 @@ class ReplayBuffer:
             return self._pairs.insert(scaled)
         if self._length < self.capacity:
             return self._length
-        drawn = int(self._rng.integers(self._offered))
+        drawn = int(self._rng.integers(self.offered))
         return drawn if drawn < self.capacity else None
 
     def _store(self, slot: int, xu: np.ndarray, h: np.ndarray) -> None:
@@ -188,7 +164,7 @@ class ReplayBuffer:
         self._xu[slots[kept]], self._h[slots[kept]] = xu[kept], h[kept]
         self._length = min(self.capacity, self._length + n)
         self._next = (self._next + n) % self.capacity
-        self._offered += n
+        self.offered += n
 
     def _make_room(self, length: int, columns: int, labels: int) -> None:
         if length > len(self._xu):

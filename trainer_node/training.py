@@ -165,7 +165,7 @@ class Trainer:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
         windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
-        return self.buffer.add_batch(run_id, [sample.seq for sample in samples], windows, labels)
+        return self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
 
     def due(self) -> bool:
         """Whether enough new samples came since the last training began."""
@@ -229,9 +229,11 @@ class Trainer:
 
     def _judge(self, draw: Draw, descent: Descent) -> HiddenWeights:
         output, trained = draw.output, descent.hidden
-        why = why_unacceptable(self.description, trained)
-        if why is not None:
-            raise _Kept("norm bound" if "norm" in why else "not finite")
+        if not all(np.isfinite(layer).all() for layer in trained):
+            raise _Kept("not finite")
+        if why_unacceptable(self.description, trained) is not None:
+            # Their shapes are those of the network that was trained.
+            raise _Kept("norm bound")
         if not math.isfinite(descent.after):
             raise _Kept("not finite")
         if not descent.after < descent.before:

@@ -12,16 +12,14 @@ from network_model.description import hash_layers
 from node_runtime.config.sections import Config
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import messages as m
-from run_log.reading.reader import Run
+from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import CONTROLLER, _LockStep
+from trainer_node.node import ADOPTION_PATIENCE
 
 Layers = list[np.ndarray]
 KNOWN = 80
 """Newest samples that the attacker has heard."""
-
-PATIENCE = 2.0
-"""Seconds, as in `trainer_node.node`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +82,7 @@ class _Attacked(_LockStep):
             self.strange = 0
             return
         self.strange += 1
-        if self.strange * self.config.period > PATIENCE:
+        if self.strange * self.config.period > ADOPTION_PATIENCE:
             snapshot = self.core.memory.hidden_snapshot(output.seq)
             assert snapshot is not None
             self.trainer.resume(_numbers(snapshot.layers), snapshot.hidden_version)

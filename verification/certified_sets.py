@@ -24,7 +24,7 @@ from lbmpc.plants import get_plant
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.construct import points_in
 from lbmpc.sets.geometry.operations import body
-from lbmpc.sets.guard import HAIR
+from lbmpc.sets.guard import ROW_ROUNDING
 from lbmpc.sets.invariance.approach import one_period
 from node_runtime.realtime.scheduling import one_blas_thread
 
@@ -100,7 +100,7 @@ class Rows:
         reach = self.T @ self.W.T
         self.pushing = np.argmax(reach, axis=1)
         slope, P = (self.T @ self.B)[:, 0], self.T @ self.A
-        room = self.t - reach.max(axis=1) - HAIR
+        room = self.t - reach.max(axis=1) - ROW_ROUNDING
         up, down = slope > 0, slope < 0
         self.high, self.per_high = room[up] / slope[up], P[up] / slope[up, None]
         self.low, self.per_low = room[down] / slope[down], P[down] / slope[down, None]

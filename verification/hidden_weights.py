@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from node_runtime.config.sections import load
-from run_log.reading.reader import Run
 from run_log.reporting.summary import summarise
+from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
 from verification.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise, random, reversed_sign

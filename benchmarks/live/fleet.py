@@ -10,7 +10,6 @@ it is sent.
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import tempfile
@@ -25,6 +24,8 @@ import zenoh
 from rich.console import Console
 
 from benchmarks.document_block import DocumentError, Marks
+from benchmarks.live import process_usage
+from benchmarks.live.ports import free_port
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
 from node_runtime import provenance
 from node_runtime.bus.session import session_config
@@ -174,9 +175,7 @@ def _command(settings: Fleet) -> str:
 
 
 def _measure(plants: int, batch: int, settings: Fleet) -> Row:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = override(Config(), [f'bus.endpoint="{endpoint}"', f"trainer.batch={batch}"])
     controllers = {f"plant{k}": Simulated(f"plant{k}", k) for k in range(plants)}
     with tempfile.TemporaryDirectory() as folder, Router(config):
@@ -190,9 +189,9 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
             trainer = subprocess.Popen(command, stderr=subprocess.DEVNULL)
             try:
                 begin = _let_speak(session, controllers, arrived, settings.warm, None)
-                cpu = _cpu(trainer.pid)
+                cpu = process_usage.processor_seconds(trainer.pid)
                 end = _let_speak(session, controllers, arrived, settings.seconds, begin)
-                cpu = (_cpu(trainer.pid) - cpu) / (end - begin)
+                cpu = (process_usage.processor_seconds(trainer.pid) - cpu) / (end - begin)
             finally:
                 # One that is overwhelmed takes long to leave its plants.
                 trainer.kill()
@@ -264,12 +263,6 @@ def _let_speak(
     return time.monotonic()
 
 
-def _cpu(pid: int) -> float:
-    """Processor seconds of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / 100.0
-
-
 # -- a stack against one by one ----------------------------------------------------------------------------
 
 
@@ -277,7 +270,7 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
     """The descent alone, in a process of its own, in turns."""
     plants = [count for count in settings.plants if count > 1]
     ran = subprocess.run(
-        [sys.executable, "-c", _DESCENT, json.dumps([settings.batch, plants])],
+        [sys.executable, "-m", "benchmarks.live.stacked_descent", json.dumps([settings.batch, plants])],
         capture_output=True,
         text=True,
         check=True,
@@ -291,46 +284,6 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
         lines.append(f"| {batch} | {count} | {alone:.1f} | {stacked:.1f} | {alone / stacked:.2f} |")
     console.print("\n".join(lines))
     return lines
-
-
-_DESCENT = """
-import json, sys, time
-import numpy as np
-from benchmarks.live.fleet import NETWORK
-from node_runtime.config.sections import TrainerConfig
-from network_model.description import initial_hidden
-from trainer_node.descent import Problem, descend, descend_together
-from trainer_node.network import Network
-from trainer_node.training import use_one_thread
-
-use_one_thread()
-settings, found = TrainerConfig(), []
-
-def problem(k, batch):
-    rng = np.random.default_rng(k)
-    network = Network(NETWORK)
-    network.load(initial_hidden(NETWORK, rng))
-    xu = rng.uniform(-1, 1, (batch, 5)) * NETWORK.input_scale
-    return Problem(network, xu, rng.normal(size=(batch, 4)) * 0.01, rng.normal(size=(NETWORK.features, 4)) * 0.1)
-
-for batch, counts in ((batch, counts) for batches, counts in [json.loads(sys.argv[1])] for batch in batches):
-    for count in counts:
-        times = [], []
-        for turn in range(5):
-            for kind in (0, 1):
-                problems = [problem(k, batch) for k in range(min(count, 16))]
-                began = time.perf_counter()
-                if kind:
-                    descend_together(problems, settings.steps, settings.learning_rate)
-                else:
-                    for one in problems:
-                        descend(one, settings.steps, settings.learning_rate)
-                times[kind].append((time.perf_counter() - began) / len(problems) * 1e3)
-        found.append([batch, min(count, 16), *(float(np.median(each[1:])) for each in times)])
-        if count >= 16:
-            break
-print(json.dumps(found))
-"""
 
 
 # -- what a person reads -----------------------------------------------------------------------------------

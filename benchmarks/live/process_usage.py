@@ -44,10 +44,19 @@ def busy(supervisor: int) -> dict[str, float]:
     found = {}
     for name, entry in of(supervisor):
         try:
-            found[name] = sum(map(int, _fields(entry)[11:13])) * TICK_S
+            found[name] = _processor_seconds(entry)
         except (OSError, IndexError):
             continue
     return found
+
+
+def processor_seconds(pid: int) -> float:
+    """Seconds of a core that a process has taken so far."""
+    return _processor_seconds(Path(f"/proc/{pid}"))
+
+
+def _processor_seconds(entry: Path) -> float:
+    return sum(map(int, _fields(entry)[11:13])) * TICK_S
 
 
 def _fields(entry: Path) -> list[str]:

@@ -32,8 +32,9 @@ from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from protocol import topics
 from run_log.errors import LogError
-from run_log.reading.reader import Run, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting.summary import Spread, summarise
+from run_log.run import Run
 
 MARKS = Marks.of("rates", "python -m benchmarks.live.rates")
 COLUMNS = (

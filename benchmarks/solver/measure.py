@@ -144,7 +144,9 @@ def measure(
     ]
     if compiler is not None:
         notes.append(compiler.note)
-    return Report(rows, used, provenance.describe(), provenance.versions(), notes, provenance.load())
+    return Report(
+        rows, used, provenance.describe(), provenance.versions(provenance.SCIENCE), notes, provenance.load()
+    )
 
 
 def _build(

@@ -22,6 +22,8 @@ from lbmpc.sets.geometry.polytope import SetError
 
 Kind = Literal["box", "hull", "regions", "given", "extension"]
 FORMAT = 1
+ROUNDING = 1e-12
+"""Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
 class CertificateError(SetError):
@@ -73,8 +75,7 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """False: an approximation that claims nothing, kept for comparison."""
     model: ModelOf
     pieces: list[Piece]
-    source_of_W: str
-    """How W was found: "interval arithmetic", or "given"."""
+    source_of_W: Literal["interval arithmetic", "given"]
     slack: float
     """eps of the construction, as a share of X's half-widths."""
     steps: int
@@ -110,12 +111,12 @@ def hashes(model: ModelOf) -> dict[str, str]:
 
 def require_match(certificate: Certificate, model: Model) -> None:
     """Raise `CertificateError`, naming what differs, unless the certificate is about this model, to rounding."""
-    mine, its = hashes(model_of(model)), hashes(certificate.model)
+    here, there = model_of(model), certificate.model
+    mine, its = hashes(here), hashes(there)
     different = [
         name
         for name in mine
-        if mine[name] != its[name]
-        and not _rounding(getattr(model_of(model), name), getattr(certificate.model, name))
+        if mine[name] != its[name] and not _rounding(getattr(here, name), getattr(there, name))
     ]
     if different:
         parts = "; ".join(
@@ -125,10 +126,6 @@ def require_match(certificate: Certificate, model: Model) -> None:
             f"the certificate is about another model ({parts}). Compute the sets again with this configuration: "
             "tandem sets compute"
         )
-
-
-ROUNDING = 1e-12
-"""Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
 def _rounding(mine: object, its: object) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, MutableMapping, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -12,10 +11,9 @@ from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
 from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
 from lbmpc.sets.geometry.operations import Body, body, body_of
-from lbmpc.sets.invariance.regions import Link, chain
-from lbmpc.sets.invariance.robust_control import Stage, Uncertain, iterate, predecessor
+from lbmpc.sets.invariance.regions import ControllableSet, controllable_sets
+from lbmpc.sets.invariance.robust_control import Stage, UncertainSystem, predecessor, predecessor_iteration
 
-Wanted = Literal["given", "box", "hull", "regions", "extension"]
 Saved = MutableMapping[str, dict[str, np.ndarray]]
 """Where work is kept, so that an interrupted construction goes on: arrays by name."""
 Report = Callable[[str, float], None]
@@ -29,7 +27,7 @@ def silent(_what: str, _done: float) -> None:
 
 def construct(
     model: Model,
-    kind: Wanted,
+    kind: Kind,
     start: np.ndarray,
     W: np.ndarray | None = None,
     slack: float = 3e-4,
@@ -46,7 +44,7 @@ def construct(
             the paper follows (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X: it claims nothing.
         start: a state that should be in the sets, (d,), deviation.
         W: half-widths (d,) for `given`; the plant's own by default.
-        slack, patience: as for `control_invariant.iterate`.
+        slack, patience: as for `predecessor_iteration`.
         saved: of an earlier call with the same arguments; filled as the work goes on.
 
     Raises:
@@ -59,18 +57,29 @@ def construct(
         return _extension(model, bound)
     stage = _invariant(model, bound, slack, patience, saved, report)
     base = stage.set
-    links: list[Link] = []
+    around: list[ControllableSet] = []
     if kind == "regions" and not base.contains(start).all():
-        links = chain(model, start, base, lambda done: report("sets around the way from x0", done))
-    return _certificate(model, kind, bound, stage, links, slack)
+        around = controllable_sets(
+            model, start, base, lambda done: report("sets around the way from x0", done)
+        )
+    return _certificate(model, kind, bound, stage, around, slack)
 
 
 def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
     X = body_of(state_set(model), "X")
-    G, g = predecessor(X, Uncertain(model.A, model.B, bound, input_set(model)))
+    G, g = predecessor(X, UncertainSystem(model.A, model.B, bound, input_set(model)))
     once = body(np.vstack([X.G, G]), np.concatenate([X.g, g]), "X with its predecessor", X.scale).reduced()
     pieces = [_piece("X with Pre(X)", once, bound, 0)]
-    return Certificate(FORMAT, "extension", False, model_of(model), pieces, "interval arithmetic", 0.0, 1)
+    return Certificate(
+        format=FORMAT,
+        kind="extension",
+        certified=False,
+        model=model_of(model),
+        pieces=pieces,
+        source_of_W="interval arithmetic",
+        slack=0.0,
+        steps=1,
+    )
 
 
 def whole(model: Model) -> Region:
@@ -79,9 +88,7 @@ def whole(model: Model) -> Region:
     return Region(X.lower, X.upper, U.lower, U.upper)
 
 
-def _bound(
-    model: Model, kind: Wanted, W: np.ndarray | None, saved: Saved, report: Report
-) -> DisturbanceBound:
+def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report: Report) -> DisturbanceBound:
     region = whole(model)
     if kind == "given":
         return given_box(model, model.plant.W * model.period if W is None else W, region)
@@ -89,21 +96,18 @@ def _bound(
     if "W" not in saved:
         find = bound_box if kind == "box" else bound_hull
         saved["W"] = {"vertices": find(model, region, progress=lambda done: report(name, done)).vertices}
-    d, m = model.d, model.m
-    return DisturbanceBound(
-        region, np.zeros((d, d)), np.zeros((d, m)), saved["W"]["vertices"], "box" if kind == "box" else "hull"
-    )
+    return DisturbanceBound.plain(region, saved["W"]["vertices"])
 
 
 def _invariant(
     model: Model, bound: DisturbanceBound, slack: float, patience: int, saved: Saved, report: Report
 ) -> Stage:
     X = body_of(state_set(model), "X")
-    plant = Uncertain(model.A, model.B, bound, input_set(model))
+    plant = UncertainSystem(model.A, model.B, bound, input_set(model))
     stage = _thaw(saved["stage"], X) if "stage" in saved else None
     first = None
     if stage is None or not stage.invariant:
-        for found in iterate(X, plant, slack, patience, stage):
+        for found in predecessor_iteration(X, plant, slack, patience, stage):
             stage = found
             if stage.invariant or stage.step % SAVE_EVERY == 0:
                 saved["stage"] = _freeze(stage)
@@ -135,12 +139,25 @@ def _thaw(arrays: dict[str, np.ndarray], X: Body) -> Stage:
 
 
 def _certificate(
-    model: Model, kind: Kind, bound: DisturbanceBound, stage: Stage, links: Sequence[Link], slack: float
+    model: Model,
+    kind: Kind,
+    bound: DisturbanceBound,
+    stage: Stage,
+    around: Sequence[ControllableSet],
+    slack: float,
 ) -> Certificate:
     pieces = [_piece("C", stage.set, bound, 0)]
-    pieces += [_piece(f"S{i + 1}", link.set, link.bound, i) for i, link in enumerate(links)]
-    source = "given" if kind == "given" else "interval arithmetic"
-    return Certificate(FORMAT, kind, True, model_of(model), pieces, source, slack, stage.step)
+    pieces += [_piece(f"S{i + 1}", one.set, one.bound, i) for i, one in enumerate(around)]
+    return Certificate(
+        format=FORMAT,
+        kind=kind,
+        certified=True,
+        model=model_of(model),
+        pieces=pieces,
+        source_of_W="given" if kind == "given" else "interval arithmetic",
+        slack=slack,
+        steps=stage.step,
+    )
 
 
 def _piece(name: str, set_: Body, bound: DisturbanceBound, target: int) -> Piece:

@@ -17,8 +17,8 @@ import numpy as np
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.geometry.linear_program import linprog, load
 
-# Rounding of a row's value must not put a state outside that was steered onto its facet. Scaled lengths.
-HAIR = 1e-10
+ROW_ROUNDING = 1e-10
+"""In scaled lengths: rounding of a row's value must not put a state outside that was steered onto its facet."""
 RESERVES = (0.02, 0.005, 0.001)
 """Distances from the target's boundary, as shares of X's half-widths, that are kept where some input keeps them: the
 claim does not need them, but a command that acts late, or a measurement that is off, is not part of W."""
@@ -39,7 +39,7 @@ class FirstInputs:
     piece: int
 
 
-class _Step:
+class _InputRows:
     """Rows of one piece's target over (x, v_0): P x + Q v_0 <= r."""
 
     def __init__(self, certificate: Certificate, index: int, scale: np.ndarray):
@@ -51,7 +51,7 @@ class _Step:
         T, t = T / lengths[:, None], t / lengths
         self.P = T @ (np.array(model.A) + np.array(piece.slope_x))
         self.Q = T @ (np.array(model.B) + np.array(piece.slope_u))
-        self.r = t - (T @ np.array(piece.W).T).max(axis=1) - HAIR
+        self.r = t - (T @ np.array(piece.W).T).max(axis=1) - ROW_ROUNDING
         self.low, self.high = np.array(piece.u_lower), np.array(piece.u_upper)
         if self.Q.shape[1] == 1:
             slope = self.Q[:, 0]
@@ -112,7 +112,7 @@ class Guard:
             [np.array(p.g) / n for p, n in zip(certificate.pieces, lengths, strict=True)]
         )
         self._starts = np.cumsum([0] + [len(n) for n in lengths[:-1]])
-        self._steps = [_Step(certificate, i, self.scale) for i in range(len(certificate.pieces))]
+        self._steps = [_InputRows(certificate, i, self.scale) for i in range(len(certificate.pieces))]
 
     def margins(self, x: np.ndarray) -> np.ndarray:
         """Distance of x (d,) to the nearest facet of each piece, as a share of X's half-widths; (pieces,)."""
@@ -126,4 +126,4 @@ class Guard:
             found = self._steps[index].bounds(x, self._reserves)
             if found is not None:
                 return FirstInputs(*found, best, int(index))
-        return FirstInputs(None, None, min(best, -HAIR), -1)
+        return FirstInputs(None, None, min(best, -ROW_ROUNDING), -1)

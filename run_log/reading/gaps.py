@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from protocol import topics
-from run_log.reading.reader import Run
+from run_log.run import Run
 
 EACH_TICK = (topics.TICK, topics.COMMAND, topics.RESULT)
 """Every tick has one of each, so a number that is missing is a message that was lost."""

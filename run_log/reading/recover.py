@@ -6,12 +6,11 @@ from pathlib import Path
 
 import msgspec
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.writer import CompressionType, Writer
 
 from run_log.errors import LogError
+from run_log.file_format import RAW, RECOVERED, check_header
 from run_log.reading.mcap_scan import Scan
-from run_log.reading.reader import RAW, check_ours
-from run_log.writing.durable_file import Sink
+from run_log.writing.durable_file import Sink, mcap_writer
 
 CHUNK_BYTES = 256 * 1024
 
@@ -52,7 +51,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
         match record:
             case Header():
                 header = header or record
-                check_ours(path, record)
+                check_header(path, record)
             case Attachment():
                 attachments += 1
             case Schema():
@@ -85,17 +84,20 @@ def _copy(
     probe: Scan, out: Path, header: Header, schemas: dict[int, Schema], channels: dict[int, Channel]
 ) -> None:
     sink = Sink(out)
-    writer = Writer(
-        sink,  # write, tell and flush are all it uses
-        chunk_size=CHUNK_BYTES,
-        compression=CompressionType.ZSTD,
-        enable_data_crcs=True,
-    )
+    writer = mcap_writer(sink, CHUNK_BYTES)
     writer.start(header.profile, header.library)
     reason = "whole" if probe.cut_at is None else f"cut at byte {probe.cut_at}"
-    writer.add_metadata("recovered", {"from": probe.path.name, "because": "; ".join([reason, *probe.damage])})
-    new_schemas = {0: 0}
-    new_channels: dict[int, int] = {}
+    writer.add_metadata(RECOVERED, {"from": probe.path.name, "because": "; ".join([reason, *probe.damage])})
+    new_schemas = {
+        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for schema in schemas.values()
+    }
+    new_channels = {
+        channel.id: writer.register_channel(
+            channel.topic, channel.message_encoding, new_schemas.get(channel.schema_id, 0), channel.metadata
+        )
+        for channel in channels.values()
+    }
     for record in Scan(probe.path, keep_going=True):
         match record:
             case Attachment():
@@ -105,19 +107,6 @@ def _copy(
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)
             case Message() if record.channel_id in channels:
-                if record.channel_id not in new_channels:
-                    channel = channels[record.channel_id]
-                    schema = schemas.get(channel.schema_id)
-                    if schema is not None and schema.id not in new_schemas:
-                        new_schemas[schema.id] = writer.register_schema(
-                            schema.name, schema.encoding, schema.data
-                        )
-                    new_channels[channel.id] = writer.register_channel(
-                        channel.topic,
-                        channel.message_encoding,
-                        new_schemas.get(channel.schema_id, 0),
-                        channel.metadata,
-                    )
                 writer.add_message(
                     new_channels[record.channel_id],
                     record.log_time,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from run_log.errors import LogError
-from run_log.reading.reader import Run, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting import plots
 from run_log.reporting.traces import traces
+from run_log.run import Run
 
 
 def report(path: str | Path, out_dir: str | Path) -> list[Path]:
@@ -21,10 +22,7 @@ def report(path: str | Path, out_dir: str | Path) -> list[Path]:
     data = traces(run)
     figures = {f"{path.stem}.png": plots.overview(data, title(run))}
     figures |= {f"{path.stem}-{name}.png": figure for name, figure in plots.pictures(data).items()}
-    files = []
-    for name, figure in figures.items():
-        files.append(_save(figure, out_dir / name))
-    return files
+    return [_save(figure, out_dir / name) for name, figure in figures.items()]
 
 
 def picture(run: Run, path: str | Path) -> Path:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from lbmpc.plants import Plant, get_plant
+from lbmpc.plants import Plant
 from protocol import messages as m
 from run_log.errors import LogError
 from run_log.reading.gaps import lost_ticks
-from run_log.reading.reader import Run
+from run_log.run import Run, plant_of
 
 TOLERANCE = 1e-6
 SETTLED = 0.02
@@ -79,16 +79,6 @@ class Trajectory(msgspec.Struct, frozen=True):
     """(n, d) plant units."""
     applied: np.ndarray
     """(n, m) mean input over the period before the sample; NaN where none was reported."""
-
-
-def plant_of(run: Run) -> Plant:
-    """The plant that the log is about. Raises `LogError` when this Tandem does not have it."""
-    try:
-        return get_plant(run.config.plant.model)
-    except KeyError as error:
-        raise LogError(
-            f"{run.path}: {error.args[0]} The log needs the plant that it was made with."
-        ) from error
 
 
 def trajectory(run: Run, plant: Plant) -> Trajectory:

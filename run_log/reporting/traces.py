@@ -9,8 +9,8 @@ import numpy as np
 from lbmpc.plants import Plant
 from protocol import topics
 from run_log.errors import LogError
-from run_log.reading.reader import Run
-from run_log.reporting.summary import Trajectory, plant_of, trajectory
+from run_log.reporting.summary import Trajectory, trajectory
+from run_log.run import Run, plant_of
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ import os
 from collections import deque
 from pathlib import Path
 
+from mcap.writer import CompressionType, Writer
+
 from run_log.errors import LogError, LogExistsError
 
 PENDING_LIMIT = 64 * 1024 * 1024
@@ -113,3 +115,9 @@ class Sink:
     def _failed(self, text: str) -> None:
         self.error = text
         self.errors += 1
+
+
+def mcap_writer(sink: Sink, chunk_bytes: int) -> Writer:
+    """Every log is written so: compressed chunks of about this size, and a checksum over everything."""
+    # Of a file it uses write, tell and flush only.
+    return Writer(sink, chunk_size=chunk_bytes, compression=CompressionType.ZSTD, enable_data_crcs=True)

@@ -12,8 +12,9 @@ from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
 from protocol import topics

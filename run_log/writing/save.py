@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from protocol import topics
-from run_log.reading.reader import Run
-from run_log.reporting.summary import plant_of
+from run_log.run import Run, plant_of
 from run_log.writing.writer import LogWriter
 
 

@@ -14,27 +14,19 @@ from pathlib import Path
 from types import TracebackType
 
 import msgspec
-from mcap.writer import LIBRARY_IDENTIFIER, CompressionType, Writer
 
 from lbmpc.plants import Plant
+from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
 from node_runtime.config.sections import Config, to_toml
-from node_runtime.health import versions as installed
 from protocol import codec, topics
 from protocol.codec import Head
 from protocol.messages import Message
-from protocol.topics import Topic
 from run_log.errors import LogError
-from run_log.writing.durable_file import Sink
+from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PROFILE, RAW, VIEW
+from run_log.writing.durable_file import Sink, mcap_writer
 from run_log.writing.views import View, views
 
-PROFILE = "tandem"
-FORMAT = "1"
-"""Of the log: which channels and attachments there are. Rises when an older reader would be misled."""
-IDENTITY = "tandem"
-"""Metadata that says what a log is of."""
-CONTINUED = "continued"
-"""Metadata of a log that goes on in another file."""
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 COUNTED = ("controller/tick", "controller/result")
 """Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
@@ -76,7 +68,7 @@ class LogWriter:
         self.last_bad: str | None = None
         self.lost: dict[str, int] = {}
         """By topic, messages that are missing between others: they never arrived here."""
-        self._sink = Sink(path, patient=patient)
+        self.sink = Sink(path, patient=patient)
         self._views = views(plant)
         self._raw: dict[str, int] = {}
         self._shown: dict[str, int] = {}
@@ -86,42 +78,24 @@ class LogWriter:
         self._counted: dict[tuple[str, str], int] = {}
         """The last number of each run on each of the topics `COUNTED`."""
         self._strangers = 0
-        self._mcap = Writer(
-            self._sink,  # write, tell and flush are all it uses
-            chunk_size=config.log.chunk_bytes,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-        )
-        self._mcap.start(profile=PROFILE, library=f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}")
-        identity = {"format": FORMAT, "name": config.name, "plant": plant.name, "part": str(part)}
+        self._mcap = mcap_writer(self.sink, config.log.chunk_bytes)
+        self._mcap.start(profile=PROFILE, library=LIBRARY)
+        identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, identity)
         for name, kind, text in _attachments(
-            config, plant, versions if versions is not None else installed()
+            config, plant, versions if versions is not None else provenance.versions()
         ):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
 
     @property
     def path(self) -> Path:
-        return self._sink.path
+        return self.sink.path
 
     @property
     def error(self) -> str | None:
         """Why the file does not grow at the moment; None when it does."""
-        return self._sink.error
-
-    @property
-    def write_errors(self) -> int:
-        return self._sink.errors
-
-    @property
-    def written(self) -> int:
-        """Bytes in the file."""
-        return self._sink.written
-
-    def write_message(self, topic: Topic, message: Message, log_time: int) -> None:
-        """Log one message of ours; `log_time` in ns."""
-        self._log(topic.name, codec.encode(message), log_time, message)
+        return self.sink.error
 
     def write(self, name: str, payload: bytes, log_time: int) -> None:
         """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
@@ -129,29 +103,25 @@ class LogWriter:
         A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
         raises for bad input or a full disk: see `counters`, `bad` and `error`.
         """
-        self._log(name, payload, log_time, None)
-
-    def _log(self, name: str, payload: bytes, log_time: int, message: Message | None) -> None:
-        if len(payload) > MAX_MESSAGE or self._sink.pending > self._sink.limit:
+        if len(payload) > MAX_MESSAGE or self.sink.pending > self.sink.limit:
             self.counters["dropped"] += 1
             return
         channel = self._raw.get(name) or self._register_raw(name)
         if channel is None:
             self.counters["dropped"] += 1
             return
-        topic = topics.BY_NAME.get(name)
         view = self._views.get(name)
         shown: bytes | None = None
         # Of a message between two views only who wrote it and its number are looked at.
         head: Message | Head | None = None
         if log_time < self._next_view.get(name, 0):
             head = codec.head_of(payload)
-        if head is None and topic is not None and view is not None:
+        if head is None and view is not None:
             try:
-                head = message = message or codec.decode(topic, payload)
+                head = message = codec.decode(view.topic, payload)
                 shown = view.render(message)
-                if math.isfinite(topic.view_hz):
-                    self._next_view[name] = log_time + int(1e9 / topic.view_hz)
+                if math.isfinite(view.topic.view_hz):
+                    self._next_view[name] = log_time + int(1e9 / view.topic.view_hz)
             except codec.BadMessage as error:
                 self._count_bad(error)
         if head is not None and name in COUNTED:
@@ -166,7 +136,7 @@ class LogWriter:
     def flush(self) -> bool:
         """End the chunk and hand all to the operating system; False when it does not take all of it."""
         self._mcap.flush()
-        return self._sink.error is None
+        return self.sink.error is None
 
     def close(self, continued: Path | None = None) -> None:
         """Write the index and close.
@@ -179,8 +149,8 @@ class LogWriter:
         if continued is not None:
             self._mcap.add_metadata(CONTINUED, {"in": continued.name})
         self._mcap.finish()
-        if not self._sink.close():
-            raise LogError(f"{self._sink.error}; the log is cut short: `tandem recover` saves what there is")
+        if not self.sink.close():
+            raise LogError(f"{self.sink.error}; the log is cut short: `tandem recover` saves what there is")
 
     def __enter__(self) -> LogWriter:
         return self
@@ -200,16 +170,16 @@ class LogWriter:
         encoding, kind = (
             ("msgpack", topic.type.__name__) if topic else ("application/octet-stream", "unknown")
         )
-        self._raw[name] = self._mcap.register_channel(f"raw/{name}", encoding, 0, {"type": kind})
+        self._raw[name] = self._mcap.register_channel(RAW + name, encoding, 0, {"type": kind})
         return self._raw[name]
 
     def _view_channel(self, view: View) -> int:
         name = view.topic.name
         if name not in self._shown:
             schema = self._mcap.register_schema(
-                f"tandem.live.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
+                f"tandem.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
             )
-            self._shown[name] = self._mcap.register_channel(f"view/{name}", "json", schema)
+            self._shown[name] = self._mcap.register_channel(VIEW + name, "json", schema)
         return self._shown[name]
 
     def _count_lost(self, name: str, message: Message | Head, log_time: int) -> None:
@@ -238,10 +208,10 @@ class LogWriter:
 
 def _attachments(config: Config, plant: Plant, versions: dict[str, str]) -> list[tuple[str, str, str]]:
     _, schemas = msgspec.json.schema_components([topic.type for topic in topics.ALL])
-    channels = {f"raw/{topic.name}": topic.type.__name__ for topic in topics.ALL}
+    channels = {RAW + topic.name: topic.type.__name__ for topic in topics.ALL}
     as_json = "application/json"
     return [
-        ("config.json", as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
+        (CONFIG, as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
         ("config.toml", "application/toml", to_toml(config)),
         ("versions.json", as_json, json.dumps(versions, indent=2)),
         ("seeds.json", as_json, json.dumps({"seed": config.seed})),

@@ -57,7 +57,7 @@ class Run(Configured):
         from tandem.live.monitor import Monitor
         from tandem.live.supervisor import Impatient, StartError, trains, wishes
 
-        require("matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
+        require("zstandard", "matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
         plant = build_plant(config)
         said = guarantee(config, build_model(config))
         with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:

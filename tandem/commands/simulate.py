@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from node_runtime.config.literals import OracleName, TighteningName
 from tandem import terminal
-from tandem.commands.base import FROM_CONFIG, Configured
+from tandem.commands.base import FROM_CONFIG, Configured, require
 from tandem.terminal import Refused
 
 
@@ -63,6 +63,7 @@ class Simulate(Configured):
         from tandem import summary_table
         from tandem.experiments.simulation.lockstep import simulate
 
+        require("zstandard")
         if self.adapt_only:
             config = override(config, ["trainer.enabled=false"])
         self.say(guarantee(config, build_model(config)))

@@ -11,12 +11,12 @@ import msgspec
 from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, from_tree
 from node_runtime.config.strict import ConfigError
+from node_runtime.whole_file import write_whole
 from tandem.experiments.reporting.page import header, page
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Declaration, Resolved, resolve
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, time_all, wanted
-from tandem.experiments.study.work import write_whole
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""

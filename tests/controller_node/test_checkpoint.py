@@ -31,8 +31,8 @@ from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol import messages as m
-from run_log.reading.reader import gather
 from run_log.replaying.replay import replay
+from run_log.run import gather
 from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, wait_for
 

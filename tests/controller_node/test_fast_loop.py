@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from typing import cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from trainer_node.node import NAMES, TRAIN_EVERY, TrainerNode
+from trainer_node.node import COUNTERS, TRAIN_EVERY, TrainerNode
 
 
 class BusThatWritesDown:
@@ -145,8 +146,8 @@ def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = override(Config(), ["rate=1000"])
-    bus, counts = cast(Bus, BusThatWritesDown(config)), dict.fromkeys(NAMES, 0)
-    node = TrainerNode(config, bus, cast(HealthPublisher, None), counts)
+    bus, counts = cast(Bus, BusThatWritesDown(config)), dict.fromkeys(COUNTERS, 0)
+    node = TrainerNode(config, bus, cast(HealthPublisher, None), counts, cast(Executor, None))
     began: list[float] = []
     monkeypatch.setattr(node, "_may_train", lambda: True)
     monkeypatch.setattr(node, "_must_join", lambda: False)

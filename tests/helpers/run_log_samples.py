@@ -8,8 +8,8 @@ import numpy as np
 
 from lbmpc.plants import Plant, Truth, get_plant
 from node_runtime.config.sections import Config
+from protocol import codec, topics
 from protocol import messages as m
-from protocol import topics
 from protocol.topics import Topic
 from run_log.writing.writer import LogWriter
 
@@ -161,7 +161,7 @@ def write(path: Path, config: Config, messages: list[Logged], flush_every: int =
     """A finished log of these messages."""
     with LogWriter(path, config, get_plant(config.plant.model), versions={"python": "3.11"}) as writer:
         for i, (topic, message, log_time) in enumerate(messages):
-            writer.write_message(topic, message, log_time)
+            writer.write(topic.name, codec.encode(message), log_time)
             if i % flush_every == flush_every - 1:
                 writer.flush()
     return path

@@ -16,8 +16,9 @@ import pytest
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import REPEATED_SIGNAL_S, new_run_id, run_process, stopped_by_signals
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import (
     GarbageCollection,

@@ -14,11 +14,12 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import override
 from node_runtime.realtime import clock
 from node_runtime.router import Router
+from protocol import codec, topics
 from protocol import messages as m
-from protocol import topics
 from run_log.reading.gaps import lost_ticks, stretches
-from run_log.reading.reader import gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting.summary import summarise
+from run_log.run import gather
 from run_log.writing.writer import LogWriter
 from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
 from tests.helpers.run_log_samples import RUN, synthetic
@@ -71,7 +72,7 @@ def test_what_never_arrived_is_counted_by_the_recorder_and_said_in_the_figures(t
     kept = [one for one in kept if not (one[0] is topics.RESULT and one[1].seq == 40)]
     with LogWriter(tmp_path / "run.mcap", config, get_plant(config.plant.model)) as writer:
         for topic, message, log_time in kept:
-            writer.write_message(topic, message, log_time)
+            writer.write(topic.name, codec.encode(message), log_time)
         assert writer.lost == {"controller/tick": 7, "controller/result": 8}
         assert writer.counters["lost ticks"] == 8
     run = read_run(tmp_path / "run.mcap")
@@ -84,14 +85,14 @@ def test_what_is_sent_again_or_by_a_stranger_is_no_gap(tmp_path: Path) -> None:
     config, messages = synthetic(steps=60)
     with LogWriter(tmp_path / "run.mcap", config, get_plant(config.plant.model)) as writer:
         for topic, message, log_time in messages:
-            writer.write_message(topic, message, log_time)
+            writer.write(topic.name, codec.encode(message), log_time)
             if topic is topics.RESULT and message.seq == 30:
                 old = next(one for of, one, _ in messages if of is topics.RESULT and one.seq == 10)
-                writer.write_message(topic, old, log_time + 1)
+                writer.write(topic.name, codec.encode(old), log_time + 1)
                 strange = msgspec.structs.replace(message, run_id="stranger", seq=500)
                 for seq in (500, 900):
                     again = msgspec.structs.replace(strange, seq=seq)
-                    writer.write_message(topic, again, log_time + 2)
+                    writer.write(topic.name, codec.encode(again), log_time + 2)
         assert writer.lost == {}
 
 

@@ -22,8 +22,9 @@ from node_runtime.config.sections import Config, from_json, override
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
-from run_log.reading.reader import gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
+from run_log.run import gather
 from run_log.writing.durable_file import Sink
 from run_log.writing.save import save
 from run_log.writing.writer import LogWriter
@@ -253,14 +254,14 @@ def test_after_a_full_disk_the_log_goes_on_where_it_stopped(
     limit = path.stat().st_size + 500
     with file_size_limit(limit):
         for topic, message, log_time in messages[: 2 * third]:
-            writer.write_message(topic, message, log_time)
+            writer.write(topic.name, codec.encode(message), log_time)
         assert not writer.flush()
         assert writer.error is not None
         assert "cannot be written" in writer.error
         assert path.stat().st_size == limit
         assert read_run(path).truncated
     for topic, message, log_time in messages[2 * third :]:
-        writer.write_message(topic, message, log_time)
+        writer.write(topic.name, codec.encode(message), log_time)
     assert writer.flush()
     writer.close()
     assert logged(path) == payloads(messages)
@@ -271,7 +272,7 @@ def test_a_disk_that_stays_full_costs_messages_not_memory(tmp_path: Path, config
     path = tmp_path / "run.mcap"
     noise = np.random.default_rng(0).bytes(10_000)
     writer = LogWriter(path, config, PLANT)
-    writer._sink.limit = 200_000
+    writer.sink.limit = 200_000
     with file_size_limit(20_000):
         for i in range(100):
             writer.write("controller/keyframe", noise, i)

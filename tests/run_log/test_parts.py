@@ -13,9 +13,10 @@ from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogExistsError
 from run_log.reading.gaps import lost_ticks
-from run_log.reading.reader import Run, gather, read_run
+from run_log.reading.reader import read_run
 from run_log.replaying.replay import ReplayResult, replay
 from run_log.reporting.summary import summarise
+from run_log.run import Run, gather
 from run_log.writing.parts import WITHOUT_KEYFRAME_S, PartedLog, existing_parts, part_path
 from tandem.experiments.simulation.lockstep import simulate
 

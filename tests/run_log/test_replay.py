@@ -20,10 +20,11 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
 from run_log.errors import LogError
-from run_log.reading.reader import Entry, Run, gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
-from run_log.replaying.difference import first_difference
+from run_log.replaying.comparison import first_difference
 from run_log.replaying.replay import replay
+from run_log.run import Entry, Run, gather
 from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import simulate
 

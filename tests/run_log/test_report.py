@@ -17,11 +17,12 @@ from lbmpc.plants import get_plant
 from node_runtime.config.sections import Config, override
 from protocol import topics
 from run_log.errors import LogError
-from run_log.reading.reader import gather, read_run
+from run_log.reading.reader import read_run
 from run_log.reporting import plots
 from run_log.reporting.report import picture, report
 from run_log.reporting.summary import summarise
 from run_log.reporting.traces import traces
+from run_log.run import gather
 from tests.helpers.run_log_samples import Logged, synthetic, write
 
 STEPS = 60

@@ -282,6 +282,8 @@ sys.exit(main(sys.argv[2:]))
         ("mcap", "simulate --steps 2", "trainer,log"),
         ("mcap", "replay x.mcap", "log"),
         ("mcap", "recover x.mcap", "log"),
+        ("zstandard", "run --seconds 1", "trainer,log"),
+        ("zstandard", "simulate --steps 2 --log x.mcap", "trainer,log"),
         ("zstandard", "record --log x.mcap", "log"),
         ("zstandard", "replay x.mcap", "log"),
         ("matplotlib", "run --seconds 1", "trainer,log"),

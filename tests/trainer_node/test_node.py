@@ -11,6 +11,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import msgspec
@@ -22,15 +23,18 @@ from controller_node.outbox import Outbox
 from network_model.description import LAYERS, NetworkDescription, hash_layers, initial_hidden
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus, session_config
-from node_runtime.config import sections as configuration
-from node_runtime.config.sections import BusConfig, Config, TrainerConfig
-from node_runtime.health import HealthPublisher, run_info
+from node_runtime.config.sections import BusConfig, Config, TrainerConfig, to_json
+from node_runtime.health import HealthPublisher
+from node_runtime.provenance import run_info
+from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import codec, topics
 from protocol.messages import Array, Health, HiddenSnapshot, HiddenWeights, OutputWeights, Sample, Samples
+from tests.helpers.live import PROGRAM
 from trainer_node import node as trainer_module
 from trainer_node.main import main
-from trainer_node.node import NAMES, TrainerNode
+from trainer_node.node import COUNTERS, TrainerNode
+from trainer_node.training_round import train_round
 
 pytestmark = pytest.mark.live
 
@@ -154,12 +158,13 @@ class RunningTrainer:
         self.stop = threading.Event()
         self._stack = ExitStack()
         bus = self._stack.enter_context(Bus(config, "trainer", run_id))
-        counts = dict.fromkeys(NAMES, 0)
+        counts = dict.fromkeys(COUNTERS, 0)
         health = self._stack.enter_context(
             HealthPublisher(bus, run_info(config, "trainer", run_id), counts.copy)
         )
-        self.node = TrainerNode(config, bus, health, counts)
-        self._thread = threading.Thread(target=self.node.run, args=[self.stop])
+        askers = self._stack.enter_context(ThreadPoolExecutor(1))
+        self.node = TrainerNode(config, bus, health, counts, askers)
+        self._thread = threading.Thread(target=self._run)
 
     def __enter__(self) -> RunningTrainer:
         self._thread.start()
@@ -169,6 +174,14 @@ class RunningTrainer:
         self.stop.set()
         self._thread.join(PATIENCE)
         self._stack.close()
+
+    def _run(self) -> None:
+        self.node.start()
+        while not self.stop.wait(trainer_module.POLL):
+            now = clock.now()
+            self.node.listen(now)
+            train_round([self.node], now)
+            self.node.update_counters()
 
     def labels(self) -> list[int]:
         """Sequence numbers of all that is in the buffer, ascending."""
@@ -419,13 +432,8 @@ def test_a_network_that_nobody_could_hold_takes_no_memory(config: Config) -> Non
 
 
 def process(config: Config) -> subprocess.Popen[bytes]:
-    code = (
-        "import sys\n"
-        "from node_runtime.config.sections import from_json\n"
-        "from trainer_node.main import main\n"
-        "sys.exit(main(from_json(sys.argv[1])))"
-    )
-    return subprocess.Popen([sys.executable, "-c", code, configuration.to_json(config)])
+    program = PROGRAM.format(module="trainer_node.main")
+    return subprocess.Popen([sys.executable, "-c", program, to_json(config)])
 
 
 def test_a_killed_process_is_replaced_and_its_successor_ends_when_asked(config: Config) -> None:

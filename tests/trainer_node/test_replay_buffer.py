@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from node_runtime.config.literals import Strategy
 from trainer_node.replay_buffer import ReplayBuffer, Seen
@@ -18,10 +19,15 @@ STRATEGIES: list[Strategy] = ["fifo", "reservoir", "novelty"]
 SCALE = [0.5, 2.0, 1.0]
 
 
+def add(buffer: ReplayBuffer, run: str, seq: int, xu: ArrayLike, h: ArrayLike) -> bool:
+    """One sample; whether it is new."""
+    return buffer.add(run, [seq], np.array([xu], dtype=float), np.array([h], dtype=float)) == 1
+
+
 def offer(buffer: ReplayBuffer, points: np.ndarray, run: str = "run-1", first: int = 0) -> None:
     """Points (n, 3) as (x, u) with 2 states; h tells which one it is."""
     for i, point in enumerate(points, start=first):
-        assert buffer.add(run, i, point[:2], point[2:], np.array([float(i), -float(i)]))
+        assert add(buffer, run, i, point, [float(i), -float(i)])
 
 
 def kept(buffer: ReplayBuffer) -> list[int]:
@@ -51,8 +57,7 @@ def test_whatever_arrives_nothing_is_stored_twice_or_mixed_up_or_beyond_capacity
     met: dict[tuple[str, int], tuple[int, int, int]] = {}
     for run, seq, point in offers:
         for buffer in buffers:
-            label = np.array([float(seq), 1000.0 * (run == "b")])
-            new = buffer.add(run, seq, np.array(point[:2]), np.array(point[2:]), label)
+            new = add(buffer, run, seq, point, [float(seq), 1000.0 * (run == "b")])
             assert new == ((run, seq) not in met)
         met.setdefault((run, seq), point)
     assert len(buffers[0]) == min(capacity, len(met))
@@ -79,7 +84,7 @@ def test_a_restarted_controller_counts_from_zero_and_its_predecessors_samples_st
     offer(buffer, points, "run-2")
     assert len(buffer) == 8
     assert buffer.last("run-1") == buffer.last("run-2") == 3
-    assert not buffer.add("run-1", 3, points[3, :2], points[3, 2:], np.zeros(2))
+    assert not add(buffer, "run-1", 3, points[3], np.zeros(2))
 
 
 def test_the_reservoir_keeps_every_sample_with_the_same_probability() -> None:
@@ -205,9 +210,9 @@ def test_what_is_not_finite_or_of_another_size_is_refused_and_may_be_sent_again(
     buffer = ReplayBuffer(5, "fifo", 0, SCALE)
     offer(buffer, np.zeros((1, 3)))
     with pytest.raises(ValueError, match=r"not finite|entries"):
-        buffer.add("run-1", 1, np.array(x), np.array(u), np.array(h))
+        add(buffer, "run-1", 1, [*x, *u], h)
     assert len(buffer) == 1
-    assert buffer.add("run-1", 1, np.zeros(2), np.zeros(1), np.zeros(2))
+    assert add(buffer, "run-1", 1, np.zeros(3), np.zeros(2))
 
 
 def test_a_sample_is_new_once_in_whatever_order_they_come() -> None:
@@ -258,8 +263,8 @@ def test_batches_leave_what_one_sample_after_the_other_leaves(strategy: Strategy
         seqs = [max(0, seq + k - 2) for k in range(size)]
         seq += size
         windows, h = rng.normal(size=(size, 3)), rng.normal(size=(size, 2))
-        new = sum(one.add("a", s, w[:2], w[2:], label) for s, w, label in zip(seqs, windows, h, strict=True))
-        assert many.add_batch("a", seqs, windows, h) == new
+        new = sum(add(one, "a", s, w, label) for s, w, label in zip(seqs, windows, h, strict=True))
+        assert many.add("a", seqs, windows, h) == new
         for left, right in zip(one.contents(), many.contents(), strict=True):
             assert left.tobytes() == right.tobytes()
         assert (one.offered, one.last("a")) == (many.offered, many.last("a"))
@@ -270,7 +275,7 @@ def test_first_in_first_out_by_the_batch_is_a_bounded_queue() -> None:
     buffer, queue, seq = ReplayBuffer(20, "fifo", 3, [1.0, 2.0, 0.5]), deque[bytes](maxlen=20), 0
     for size in (1, 7, 11, 4, 30, 45, 20, 3, 20, 40):
         windows, h = rng.normal(size=(size, 3)), rng.normal(size=(size, 2))
-        buffer.add_batch("a", range(seq, seq + size), windows, h)
+        buffer.add("a", range(seq, seq + size), windows, h)
         seq += size
         queue.extend(np.concatenate(pair).tobytes() for pair in zip(windows, h, strict=True))
         held = [np.concatenate(pair).tobytes() for pair in zip(*buffer.contents(), strict=True)]
@@ -282,7 +287,7 @@ def test_a_bad_sample_keeps_its_whole_batch_out() -> None:
     windows, h = np.zeros((3, 3)), np.zeros((3, 2))
     windows[1, 1] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        buffer.add_batch("a", [0, 1, 2], windows, h)
+        buffer.add("a", [0, 1, 2], windows, h)
     with pytest.raises(ValueError, match="expected 3"):
-        buffer.add_batch("a", [0, 1, 2], windows[:, :2], h)
+        buffer.add("a", [0, 1, 2], windows[:, :2], h)
     assert (len(buffer), buffer.last("a")) == (0, -1)

@@ -26,13 +26,14 @@ from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
 from tests.helpers.paths import ROOT
-from verification.faults import facts as measured
-from verification.faults import holds, link, suite, table
+from verification.faults import evaluation as measured
+from verification.faults import holds, suite, table
 from verification.faults.catalogue import ALL, BY_NAME, Fault, Stage
-from verification.faults.facts import Facts
-from verification.faults.rig import Rig
+from verification.faults.facts import Facts, Replayed
+from verification.faults.processes import link
+from verification.faults.processes.rig import Rig
+from verification.faults.processes.traced_plant import Sampled
 from verification.faults.suite import Outcome, Results
-from verification.faults.traced_plant import Sampled
 
 CALM = Facts(
     violations=0,
@@ -55,7 +56,7 @@ CALM = Facts(
     samples_held=199,
     readable_gap=None,
     log_missing=0,
-    replay="exact",
+    replay=Replayed("exact"),
     forged_adopted=0,
     rolled_back=0,
     errors=[1e-3] * 20 + [1e-4] * 20,
@@ -87,10 +88,10 @@ def seen(**changes: Any) -> Facts:
         (holds.merged, {"samples_held": 200}),
         (holds.merged, {"samples_held": None}),
         (holds.readable, {"readable_gap": 0.7}),
-        (holds.readable, {"readable_gap": 0.1, "replay": "DIFFERS: x"}),
+        (holds.readable, {"readable_gap": 0.1, "replay": Replayed("DIFFERS", "DIFFERS: x")}),
         (holds.readable, {"readable_gap": 0.1, "log_missing": 1}),
-        (holds.replays, {"replay": "no replay: it is empty"}),
-        (holds.whole, {"replay": "exact, but 3 ticks are not in the log"}),
+        (holds.replays, {"replay": Replayed("no replay", "no replay: it is empty")}),
+        (holds.whole, {"replay": Replayed("exact, with gaps", "exact, but 3 ticks are not in the log")}),
         (holds.none_obeyed, {"foreign_commands": 1}),
         (holds.none_obeyed, {"foreign_states": 1}),
         (
@@ -411,7 +412,7 @@ def test_a_client_that_vanishes_does_not_stop_the_router() -> None:
 
 WALL_CLOCK = {"time", "time_ns", "localtime", "gmtime", "ctime", "now", "today", "utcnow"}
 MAY_READ_IT = {
-    "node_runtime/health.py run_info": "for people: when this process began",
+    "node_runtime/provenance.py run_info": "for people: when this process began",
     "controller_node/node.py main": "the same",
     "run_log/writing/recorder.py main": "the log's beginning",
     "run_log/writing/recorder.py _record": "once, the offset of all times in the log",

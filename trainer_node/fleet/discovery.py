@@ -23,13 +23,13 @@ from protocol.topics import Topic
 
 log = logging.getLogger(__name__)
 
-SILENT = 10.0
+SILENT_S = 10.0
 """Seconds without a word of its controller after which a plant is dropped; it may come back at any time."""
-MOST = 1024
+MOST_PLANTS = 1024
 """Plants followed at once: a stranger who invents names must not fill the memory."""
-TRY_AGAIN = 10.0
+TRY_AGAIN_S = 10.0
 """Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
-LET_GO = 1.0
+LET_GO_S = 1.0
 """Seconds from the end of a certificate until its lanes are closed."""
 NAME = re.compile(PLANT_NAME)
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
@@ -37,7 +37,7 @@ READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
 """Of these, what a trainer's certificate may read."""
 
 
-class Finder(Protocol):
+class PlantFinder(Protocol):
     """Which plants are there, and how they are reached. Entered before it is asked."""
 
     many: bool
@@ -62,7 +62,7 @@ class Finder(Protocol):
         ...
 
 
-class Heard:
+class LastHeard:
     """Which plants were heard of last when; any thread may write."""
 
     def __init__(self, plants: str):
@@ -71,18 +71,20 @@ class Heard:
         self._lock = threading.Lock()
 
     def note(self, key: str, now: float) -> None:
-        """A message arrived at this key. Names that do not match, and those beyond `MOST`, are ignored."""
+        """A message arrived at this key. Names that do not match, and those beyond `MOST_PLANTS`, are ignored."""
         name = key.split("/", 2)[1]
         with self._lock:
             if name in self._at or (
-                len(self._at) < MOST and NAME.fullmatch(name) and fnmatch.fnmatchcase(name, self._plants)
+                len(self._at) < MOST_PLANTS
+                and NAME.fullmatch(name)
+                and fnmatch.fnmatchcase(name, self._plants)
             ):
                 self._at[name] = now
 
     def present(self, now: float) -> list[str]:
-        """Names heard of within `SILENT`, sorted; the others are forgotten."""
+        """Names heard of within `SILENT_S`, sorted; the others are forgotten."""
         with self._lock:
-            self._at = {name: at for name, at in self._at.items() if now - at <= SILENT}
+            self._at = {name: at for name, at in self._at.items() if now - at <= SILENT_S}
             return sorted(self._at)
 
     def listen(self, session: zenoh.Session, plant: str, to: Iterable[Topic]) -> list[zenoh.Subscriber[None]]:
@@ -95,7 +97,7 @@ class Heard:
         return [session.declare_subscriber(topic.key(plant), callback) for topic in to]
 
 
-class OneRouter:
+class SharedRouter:
     """Plants behind the router of the configuration: one, followed from the start, or all that match a pattern."""
 
     def __init__(self, config: Config, plants: str, lanes: Lanes):
@@ -103,10 +105,10 @@ class OneRouter:
         self._config, self._lanes = config, lanes
         self._named = [plants] if NAME.fullmatch(plants) else []
         self.many, self.looks_for = not self._named, f"a plant that matches {plants!r}"
-        self._heard = Heard(plants)
+        self._heard = LastHeard(plants)
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
-    def __enter__(self) -> OneRouter:
+    def __enter__(self) -> SharedRouter:
         if not self._named:
             self._subscribers = self._heard.listen(self._lanes.session("bulk"), "*", FOUND_BY)
         return self
@@ -124,7 +126,7 @@ class OneRouter:
         return self._lanes
 
 
-class OwnRouters:
+class RouterPerPlant:
     """Plants with a router each, by the list `trainer.fleet`; one that cannot be reached holds up no other.
 
     Each link has its plant's own certificate, so who takes one of them has one plant's trainer and nothing else.
@@ -136,7 +138,7 @@ class OwnRouters:
         self._config, self._stop = config, stop
         self._places = {place.name: place for place in places}
         self.looks_for = f"the controller of {', '.join(self._places)}"
-        self._heard = Heard("*")
+        self._heard = LastHeard("*")
         self._lock = threading.Lock()
         self._reached: dict[str, Lanes] = {}
         """The latest of each plant, whether they are open still or not."""
@@ -147,7 +149,7 @@ class OwnRouters:
             for name in self._places
         ]
 
-    def __enter__(self) -> OwnRouters:
+    def __enter__(self) -> RouterPerPlant:
         for thread in self._threads:
             thread.start()
         return self
@@ -189,15 +191,15 @@ class OwnRouters:
                         self._open.discard(name)
                     _undeclare(subscribers)
                     # The fleet lets go of the plant first, and says a last word for it.
-                    self._leaving.wait(LET_GO)
+                    self._leaving.wait(LET_GO_S)
             except OpenInterrupted:
                 return
             except (ConfigError, zenoh.ZError) as error:
-                log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN)
-                self._leaving.wait(TRY_AGAIN)
+                log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN_S)
+                self._leaving.wait(TRY_AGAIN_S)
             except Exception:
-                log.exception("%s: trying again every %g s", name, TRY_AGAIN)
-                self._leaving.wait(TRY_AGAIN)
+                log.exception("%s: trying again every %g s", name, TRY_AGAIN_S)
+                self._leaving.wait(TRY_AGAIN_S)
 
 
 def _valid_s(config: Config) -> float | None:

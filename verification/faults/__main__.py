@@ -1,4 +1,7 @@
-"""`make faults`: run every fault many times, print what held, and put the table into the document."""
+"""`make faults`: run every fault many times, print what held, and put the table into the document.
+
+python -m verification.faults --runs 20 --document docs/faults.md
+"""
 
 from __future__ import annotations
 
@@ -25,12 +28,12 @@ from rich.progress import (
 
 from benchmarks.document_block import DocumentError
 from node_runtime import provenance
-
-from . import link, table
-from .catalogue import ALL, Fault, Stage
-from .suite import Outcome, Results, ResultsError, judged
-from .table import Pair
-from .workers import Task, workers
+from verification.faults import table
+from verification.faults.catalogue import ALL, Fault, Stage
+from verification.faults.processes import link
+from verification.faults.suite import Outcome, Results, ResultsError, judged
+from verification.faults.table import Pair
+from verification.faults.workers import Task, workers
 
 START_AND_STOP_S = 8.0
 """Of a run, beside its seconds: processes start and stop, the log is replayed."""

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
-from . import holds, scenes, stranger
-from .attacker import KINDS, WEIGHTS
-from .holds import Held
-from .link import Shape
-from .rig import Place, Rig
-from .scenes import Scene
+from verification.faults import holds
+from verification.faults.holds import Held
+from verification.faults.processes import scenes
+from verification.faults.processes.link import Shape
+from verification.faults.processes.rig import Place, Rig
+from verification.faults.processes.scenes import Scene
+from verification.faults.strangers import stranger
+from verification.faults.strangers.attacker import KINDS, WEIGHTS
 
 ATTACK_RATE, WEIGHTS_RATE = 1000.0, 4.0
 """Messages a second."""
@@ -120,7 +122,7 @@ def _link_row(what: str, shape: Shape, seconds: float) -> Fault:
 def _full_disk_row() -> Fault:
     def inflict(rig: Rig, _seed: int) -> None:
         scenes.fill(rig.folder)
-        rig.note("the disk is full")
+        rig.note("the disk is full", "disk")
 
     checks = (holds.constraints, holds.control_kept, holds.punctual, holds.readable, holds.view_says)
     return Fault("disk full", "disk", inflict, checks, scene=scenes.memory_disk)
@@ -129,10 +131,10 @@ def _full_disk_row() -> Fault:
 def _room_again_row() -> Fault:
     def inflict(rig: Rig, _seed: int) -> None:
         scenes.fill(rig.folder)
-        rig.note("the disk is full")
+        rig.note("the disk is full", "disk")
         rig.run_for(2.0)
         scenes.empty(rig.folder)
-        rig.note("that is over")
+        rig.note("that is over", whole_again=True)
 
     checks = (holds.constraints, holds.control_kept, holds.punctual, holds.whole, holds.view_said)
     return Fault("disk full for 2 s", "disk", inflict, checks, scene=scenes.memory_disk, span=2.0)
@@ -141,7 +143,7 @@ def _room_again_row() -> Fault:
 def _read_only_row() -> Fault:
     def inflict(rig: Rig, _seed: int) -> None:
         scenes.write_protect(rig.folder)
-        rig.note("the disk is read-only")
+        rig.note("the disk is read-only", "disk")
 
     checks = (holds.constraints, holds.control_kept, holds.punctual, holds.readable, holds.view_says)
     return Fault("disk read-only", "disk", inflict, checks, scene=scenes.real_disk)

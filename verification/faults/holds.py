@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable
 
-from .facts import EMPTY, Facts
+from verification.faults.facts import Facts
 
 Held = Callable[[Facts, Facts], str | None]
 """(the run, the run with the same seed and no fault) -> why it does not hold."""
@@ -18,6 +18,8 @@ COST_SHARE = 0.05
 PREDICTS_SHARE, PREDICTS_FLOOR = 1.5, 3e-5
 """Two runs without an attack differ too. The floor is that of the trial: 0.003 of the output scale."""
 SAYS_SO = re.compile("NOT LOGGED|silent|ended")
+EXACT = ("exact", "exact, with gaps")
+"""Replays in which no command differs."""
 OBEYED = {
     "plant/state": "controller",
     "controller/command": "plant",
@@ -87,12 +89,12 @@ def readable(run: Facts, calm: Facts) -> str | None:
         return f"the last {run.readable_gap:.2f} s before the kill cannot be read"
     if run.log_missing:
         return f"{run.log_missing} ticks before the last second are not in the log"
-    return None if run.replay.startswith(("exact", EMPTY)) else run.replay
+    return None if run.replay.verdict in (*EXACT, "nothing in it") else run.replay.reason
 
 
 def replays(run: Facts, calm: Facts) -> str | None:
     """The log gives back every command, byte for byte."""
-    return None if run.replay.startswith("exact") else run.replay
+    return None if run.replay.verdict in EXACT else run.replay.reason
 
 
 def none_obeyed(run: Facts, calm: Facts) -> str | None:
@@ -165,7 +167,7 @@ def whole(run: Facts, calm: Facts) -> str | None:
     """The log has everything, and replays byte for byte."""
     if run.log_missing:
         return f"{run.log_missing} ticks are not in the log"
-    return None if run.replay == "exact" else run.replay
+    return None if run.replay.verdict == "exact" else run.replay.reason
 
 
 def view_says(run: Facts, calm: Facts) -> str | None:

@@ -13,11 +13,11 @@ from node_runtime.config.sections import Config, override
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
 from run_log.errors import LogError
-
-from .catalogue import Fault, Stage
-from .facts import Facts, gather
-from .rig import Place, Rig, RigError
-from .scenes import nothing
+from verification.faults.catalogue import Fault, Stage
+from verification.faults.evaluation import evaluate
+from verification.faults.facts import Facts
+from verification.faults.processes.rig import Place, Rig, RigError
+from verification.faults.processes.scenes import nothing
 
 EARLIEST_S = 0.3
 """After the first command; what comes before concerns no run."""
@@ -90,7 +90,7 @@ def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: 
         with punctual(min(READER_PRIORITY, config.realtime.priority), silent=True):
             extra = _hurt(rig, stage, fault, at)
         # While the log's disk is still there.
-        return gather(rig, stage.seconds, extra)
+        return evaluate(rig, stage.seconds, extra)
 
 
 def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, float]:

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 import msgspec
 
 from benchmarks.document_block import Marks
-
-from . import holds
-from .catalogue import Fault
-from .facts import Facts
-from .suite import Outcome
+from verification.faults import holds
+from verification.faults.catalogue import Fault
+from verification.faults.facts import Facts, Replayed
+from verification.faults.suite import Outcome
 
 MARKS = Marks.of("faults", "make faults")
 COLUMNS = (
@@ -82,11 +81,8 @@ def _median(values: list[float]) -> float:
     return sorted(values)[len(values) // 2]
 
 
-def _replays(verdicts: list[str]) -> str:
-    kinds = Counter(
-        "exact" if text == "exact" else "exact, with gaps" if text.startswith("exact") else text.split(":")[0]
-        for text in verdicts
-    )
+def _replays(replays: list[Replayed]) -> str:
+    kinds = Counter(replay.verdict for replay in replays)
     return ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
 
 

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from .catalogue import BY_NAME, Stage
-from .suite import Outcome, run
+from verification.faults.catalogue import BY_NAME, Stage
+from verification.faults.suite import Outcome, run
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from benchmarks.document_block import DocumentError, Marks
 from node_runtime import provenance
+from verification.fuzz.targets import ACCEPTED
 from verification.fuzz.work import Finding, Report, Work, merge
 
 MARKS = Marks.of("fuzz", "make fuzz")
@@ -116,9 +117,7 @@ def table(reports: list[Report], settings: Fuzz) -> list[str]:
         "| --- | ---: | ---: | --- | ---: | ---: |",
     ]
     for name, one in found.items():
-        refused = Counter(
-            {kind: count for kind, count in one.kinds.items() if not kind.startswith("accepted")}
-        )
+        refused = Counter({kind: count for kind, count in one.kinds.items() if kind not in ACCEPTED})
         accepted = sum(one.kinds.values()) - sum(refused.values())
         why = ", ".join(f"{kind} {count:,}" for kind, count in refused.most_common(6))
         total = sum(one.kinds.values()) + one.crashed

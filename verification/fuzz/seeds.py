@@ -6,11 +6,12 @@ from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.sections import Config, override
-from node_runtime.health import run_info
+from node_runtime.provenance import run_info
 from plant_sim.node import build
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
+from trainer_node.questions import HIDDEN_ANSWER, SAMPLES_ANSWER
 
 SETTINGS = [
     "controller.solver.compile=never",
@@ -20,11 +21,7 @@ SETTINGS = [
 ]
 STEPS = 6
 
-ANSWERS = (
-    Topic(topics.HIDDEN_QUERY, m.HiddenSnapshot, "bulk", "controller", topics.WEIGHTS_LIMIT),
-    Topic(topics.OUTBOX_QUERY, m.Samples, "bulk", "controller", topics.SAMPLES.max_bytes),
-)
-"""What comes back to a trainer's questions is read like messages of a topic."""
+ANSWERS = (HIDDEN_ANSWER, SAMPLES_ANSWER)
 
 
 def config() -> Config:
@@ -80,11 +77,11 @@ def seeds() -> dict[str, list[bytes]]:
             said(topics.HIDDEN_WEIGHTS, weights)
     for batch in outbox.batches(outbox.since(-1)):
         said(topics.SAMPLES, batch)
-        said(ANSWERS[1], batch)
+        said(SAMPLES_ANSWER, batch)
     said(topics.KEYFRAME, core.memory.keyframe(STEPS - 1))
     snapshot = core.memory.hidden_snapshot(STEPS - 1)
     assert snapshot is not None
-    said(ANSWERS[0], snapshot)
+    said(HIDDEN_ANSWER, snapshot)
     said(
         topics.SETS, m.CertifiedSets(run_id="controller-1", seq=0, kind="box", sha256="0" * 64, content=b"{}")
     )

@@ -36,8 +36,9 @@ from verification.fuzz.seeds import ANSWERS, config, seeds
 SHARE_OF_SLOW = 0.01
 """Of the payloads, for readers of whole files: a thousand times slower than a message."""
 
+ACCEPTED = ("accepted", "accepted, cut short")
 Read = Callable[[bytes], str]
-"""Reads; what became of it, "accepted" or why not, in a few words that can be counted."""
+"""Reads; what became of it, one of `ACCEPTED` or why not, in a few words that can be counted."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def _adopting(core: ControllerCore) -> Read:
         seen = core.translation.observation(msgspec.structs.replace(tick, weights=weights))
         assert seen.hidden is not None
         _, verdict = core.controller.oracle.adopt(before.oracle, seen.hidden)
-        return "accepted" if verdict.outcome == "adopted" else _kind(verdict.reason)
+        return ACCEPTED[0] if verdict.outcome == "adopted" else _kind(verdict.reason)
 
     return read
 

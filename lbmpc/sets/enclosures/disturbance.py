@@ -16,18 +16,9 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from lbmpc.model import Model
-from lbmpc.sets.enclosures.interval import Interval
-from lbmpc.sets.enclosures.interval import product as interval_product
-from lbmpc.sets.enclosures.search import (
-    BATCH,
-    Disturbance,
-    DisturbanceError,
-    Forms,
-    Progress,
-    Region,
-    Search,
-    nowhere,
-)
+from lbmpc.sets.enclosures.affine_forms import AffineForms, Disturbance, DisturbanceError, Region, nowhere
+from lbmpc.sets.enclosures.branch_and_bound import BATCH, BranchAndBound, Progress
+from lbmpc.sets.enclosures.interval import Interval, matrix_product
 
 __all__ = [
     "DisturbanceBound",
@@ -56,13 +47,17 @@ class DisturbanceBound:
     """(d, m), zeros for a plain W."""
     vertices: np.ndarray
     """(k, d), offset included, rounded outwards, in the plant's units."""
-    kind: str
-    """"box", "hull", "affine" (bounded here) or "given" (the user's claim)."""
+
+    @classmethod
+    def plain(cls, region: Region, vertices: np.ndarray) -> DisturbanceBound:
+        """A plain W of vertices (k, d)."""
+        d, m = len(region.x_lower), len(region.u_lower)
+        return cls(region, np.zeros((d, d)), np.zeros((d, m)), vertices)
 
     def support(self, directions: np.ndarray) -> np.ndarray:
         """max of f'w over w in conv(vertices) for every row f of `directions` (r, d), rounded up, (r,)."""
         rows = Interval.of(np.atleast_2d(np.asarray(directions, dtype=float)))
-        return interval_product(rows, Interval.of(self.vertices.T)).upper.max(axis=1)
+        return matrix_product(rows, Interval.of(self.vertices.T)).upper.max(axis=1)
 
 
 def bound_box(
@@ -79,9 +74,10 @@ def bound_box(
     Raises:
         DisturbanceError: the region is no region of this plant, or reaches where its equations do not hold.
     """
-    disturbance = _prepare(model, region)
+    _check(model, region)
+    disturbance = Disturbance(model)
     low, high = _extent(disturbance, region, tolerance, progress, budget)
-    return _plain(model, region, _corners(low, high), "box")
+    return DisturbanceBound.plain(region, _corners(low, high))
 
 
 def bound_hull(
@@ -100,7 +96,8 @@ def bound_hull(
     Raises:
         DisturbanceError: as `bound_box`.
     """
-    disturbance = _prepare(model, region)
+    _check(model, region)
+    disturbance = Disturbance(model)
     low, high = _extent(disturbance, region, tolerance, _part(progress, 0.0, 0.3), budget)
     half = 0.5 * (high - low)
     live = np.flatnonzero(high - low > NEGLIGIBLE * _width_of_x(region))
@@ -114,19 +111,19 @@ def bound_hull(
     template = template[:, live] if live.size else np.zeros((0, 0))
     template = template[np.count_nonzero(template, axis=1) > 1]
     if live.size < 2 or not len(template):
-        return _plain(model, region, _corners(low, high), "hull")
+        return DisturbanceBound.plain(region, _corners(low, high))
     scale = half[live]
     rows = np.zeros((len(template), model.d))
     rows[:, live] = template / scale
     floor = tolerance * 1e-3 * np.linalg.norm(template, axis=1)
-    search = Search(disturbance, region, rows, tolerance, floor)
+    search = BranchAndBound(disturbance, region, rows, tolerance, floor)
     support = search.run(budget, _part(progress, 0.3, 1.0))
     flat = _vertices(rows[:, live], support, low[live], high[live])
     rest = np.setdiff1d(np.arange(model.d), live)
     tiny = _corners(low[rest], high[rest])
     vertices = np.zeros((len(flat) * len(tiny), model.d))
     vertices[:, live], vertices[:, rest] = np.repeat(flat, len(tiny), axis=0), np.tile(tiny, (len(flat), 1))
-    return _plain(model, region, vertices, "hull")
+    return DisturbanceBound.plain(region, vertices)
 
 
 def bound_affine(model: Model, regions: Sequence[Region], cuts: int = 2) -> list[DisturbanceBound]:
@@ -139,9 +136,9 @@ def bound_affine(model: Model, regions: Sequence[Region], cuts: int = 2) -> list
     """
     if not regions:
         return []
-    disturbance = _prepare(model, regions[0])
-    for region in regions[1:]:
+    for region in regions:
         _check(model, region)
+    disturbance = Disturbance(model)
     lower, upper = np.array([r.lower for r in regions]), np.array([r.upper for r in regions])
     owner = np.arange(len(regions))
     for cut in range(cuts + 1):
@@ -164,7 +161,7 @@ def given_box(model: Model, half_widths: np.ndarray, region: Region) -> Disturba
             f"{model.plant.name}: W is {half.tolist()}; give {model.d} half-widths, one per state "
             f"({', '.join(model.plant.states)}), finite and not negative"
         )
-    return _plain(model, region, _corners(-half, half), "given")
+    return DisturbanceBound.plain(region, _corners(-half, half))
 
 
 def _extent(
@@ -173,25 +170,25 @@ def _extent(
     """Least and greatest value of every component of h, (d,) each, rounded outwards."""
     d = disturbance.model.d
     floor = np.tile(NEGLIGIBLE * _width_of_x(region), 2)
-    search = Search(disturbance, region, np.vstack([np.eye(d), -np.eye(d)]), tolerance, floor)
+    search = BranchAndBound(disturbance, region, np.vstack([np.eye(d), -np.eye(d)]), tolerance, floor)
     bounds = search.run(budget, progress)
     return -bounds[d:], bounds[:d]
 
 
-def _affine(model: Model, region: Region, forms: Forms) -> DisturbanceBound:
+def _affine(model: Model, region: Region, forms: AffineForms) -> DisturbanceBound:
     d = model.d
     whole = Interval(forms.G.lower.min(axis=0), forms.G.upper.max(axis=0))
     slope = whole.middle()
     # h - H p in g - H c + (G - H)(p - c)
-    linear = interval_product(Interval.of(slope), Interval.of(forms.c)[..., None])[..., 0]
-    spread = interval_product(forms.G - slope, Interval(-forms.r, forms.r)[..., None])[..., 0]
+    linear = matrix_product(Interval.of(slope), Interval.of(forms.c)[..., None])[..., 0]
+    spread = matrix_product(forms.G - slope, Interval(-forms.r, forms.r)[..., None])[..., 0]
     left = forms.g - linear + spread
     corners = _corners(left.lower.min(axis=0), left.upper.max(axis=0))
-    return DisturbanceBound(region, slope[:, :d], slope[:, d:], corners, "affine")
+    return DisturbanceBound(region, slope[:, :d], slope[:, d:], corners)
 
 
 def _halve(
-    forms: Forms, lower: np.ndarray, upper: np.ndarray, owner: np.ndarray
+    forms: AffineForms, lower: np.ndarray, upper: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each box in two, across the coordinate that widens h's enclosure most (components relative to their own)."""
     cost = (forms.G.upper - forms.G.lower) * forms.r[:, None, :]
@@ -205,11 +202,11 @@ def _halve(
     return np.vstack([lower, second]), np.vstack([first, upper]), np.concatenate([owner, owner])
 
 
-def _all_proved(disturbance: Disturbance, lower: np.ndarray, upper: np.ndarray) -> Forms:
+def _all_proved(disturbance: Disturbance, lower: np.ndarray, upper: np.ndarray) -> AffineForms:
     parts = [
         disturbance.forms(lower[i : i + BATCH], upper[i : i + BATCH]) for i in range(0, len(lower), BATCH)
     ]
-    forms = Forms(
+    forms = AffineForms(
         np.vstack([p.c for p in parts]),
         np.vstack([p.r for p in parts]),
         Interval(np.vstack([p.g.lower for p in parts]), np.vstack([p.g.upper for p in parts])),
@@ -220,12 +217,6 @@ def _all_proved(disturbance: Disturbance, lower: np.ndarray, upper: np.ndarray) 
         if trouble:
             raise DisturbanceError(nowhere(disturbance.model, lower[i], upper[i], trouble))
     return forms
-
-
-def _plain(model: Model, region: Region, vertices: np.ndarray, kind: str) -> DisturbanceBound:
-    return DisturbanceBound(
-        region, np.zeros((model.d, model.d)), np.zeros((model.d, model.m)), vertices, kind
-    )
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -287,11 +278,6 @@ def _part(progress: Progress | None, start: float, end: float) -> Progress | Non
     if progress is None:
         return None
     return lambda fraction: progress(start + (end - start) * fraction)
-
-
-def _prepare(model: Model, region: Region) -> Disturbance:
-    _check(model, region)
-    return Disturbance(model)
 
 
 def _check(model: Model, region: Region) -> None:

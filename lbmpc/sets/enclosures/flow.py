@@ -18,8 +18,9 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.base import Plant
-from lbmpc.sets.enclosures.interval import DomainError, Interval, product
-from lbmpc.sets.enclosures.series import Graph, Tape
+from lbmpc.sets.enclosures.expression_graph import Graph
+from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product
+from lbmpc.sets.enclosures.series import Tape
 
 ORDERS = 16
 # Norm of f_x times a step: 1.5^16 / 16! = 3e-11, and E shrinks what is left to rounding.
@@ -39,7 +40,7 @@ class NoEnclosure(ArithmeticError):
 
 
 @dataclass(frozen=True, eq=False)
-class Flight:
+class FlowEnclosure:
     """Where boxes go in one period; n boxes, d states, q = d + m coordinates of p = (x, u)."""
 
     end: Interval
@@ -112,7 +113,7 @@ class Flow:
 
     def enclose(
         self, x: Interval, u: Interval, x_centre: Interval, u_centre: Interval, radii: np.ndarray
-    ) -> Flight:
+    ) -> FlowEnclosure:
         """The flow of n boxes x (n, d) and u (n, m), about points inside, given as intervals of no or tiny width.
 
         radii (n, q): |p - c| of every p of the box, rounded up.
@@ -148,7 +149,7 @@ class Flow:
                 left.extend(waiting[_rough(result[0], result[1])])
                 break
             waiting = np.array(sorted(left), dtype=int)
-        return Flight(end, centre, slope, tuple(trouble))
+        return FlowEnclosure(end, centre, slope, tuple(trouble))
 
     def _integrate(
         self, x: Interval, u: Interval, xc: Interval, uc: Interval, radii: np.ndarray, steps: int
@@ -166,7 +167,7 @@ class Flow:
                 x_next, local, remainder = self._step(x, us, width)
                 xc = self._advance_centre(xc, ucs, width, remainder)
                 slope = _chain(local, slope, d)
-                spread = product(slope, ball)[..., 0]
+                spread = matrix_product(slope, ball)[..., 0]
                 x = x_next.meet(xc + spread)
         return x, xc, slope
 
@@ -175,17 +176,17 @@ class Flow:
         n, d, q = x.shape[0], self.d, self.q
         one, zero = Interval.of(np.ones(n)), Interval.of(np.zeros(n))
         start = [x[:, i] for i in range(d)] + [one if i == j else zero for i, j in self._pattern]
-        run = self._whole.series(start, us, width, self.orders - 1)
-        total = run.coefficients(0)
+        series = self._whole.series(start, us, width, self.orders - 1)
+        total = series.coefficient(0)
         path = total
         for k in range(1, self.orders):
-            term = run.coefficients(k)
+            term = series.coefficient(k)
             path = path + Interval(np.minimum(term.lower, 0.0), np.maximum(term.upper, 0.0))
         guess = 2.0 * term.magnitude() + 1e-13 * path.magnitude() + 1e-30
         for _ in range(ATTEMPTS):
             box = path + Interval(-guess, guess)
             last = self._whole.series([box[i] for i in range(len(start))], us, width, self.orders)
-            remainder = last.coefficients(self.orders)
+            remainder = last.coefficient(self.orders)
             reached = path + Interval(np.minimum(remainder.lower, 0.0), np.maximum(remainder.upper, 0.0))
             # Strictly inside: were there a first time at which a trajectory is on the border of the box, it would have
             # been in the box until then, so Taylor's formula would put it into `reached`, off the border.
@@ -195,9 +196,7 @@ class Flow:
             guess = np.where(inside, guess, 4.0 * remainder.magnitude() + 1e-12 * path.magnitude())
         else:
             raise NoEnclosure(np.asarray(~inside.all(axis=0)))
-        end = remainder
-        for k in range(self.orders - 1, -1, -1):
-            end = end + run.coefficients(k)
+        end = series.total(remainder)
         local = np.zeros((2, n, d, q))
         for row, (i, j) in enumerate(self._pattern):
             local[0, :, i, j], local[1, :, i, j] = end.lower[d + row], end.upper[d + row]
@@ -206,10 +205,8 @@ class Flow:
     def _advance_centre(
         self, xc: Interval, ucs: list[Interval], width: Interval, remainder: Interval
     ) -> Interval:
-        run = self._plain.series([xc[:, i] for i in range(self.d)], ucs, width, self.orders - 1)
-        end = remainder
-        for k in range(self.orders - 1, -1, -1):
-            end = end + run.coefficients(k)
+        series = self._plain.series([xc[:, i] for i in range(self.d)], ucs, width, self.orders - 1)
+        end = series.total(remainder)
         return Interval(end.lower.T, end.upper.T)
 
 
@@ -223,7 +220,7 @@ def _rough(end: Interval, centre: Interval) -> np.ndarray:
 def _chain(local: Interval, slope: Interval, d: int) -> Interval:
     """d(after)/dp from the step's own derivative (n, d, q) and d(before)/dp (n, d, q)."""
     q = slope.shape[-1]
-    result = product(local[:, :, :d], slope)
+    result = matrix_product(local[:, :, :d], slope)
     return Interval(
         np.concatenate([result.lower[..., :d], (result + local).lower[..., d:]], axis=-1)[..., :q],
         np.concatenate([result.upper[..., :d], (result + local).upper[..., d:]], axis=-1)[..., :q],

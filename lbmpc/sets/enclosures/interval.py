@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 LIBRARY_ULPS = 8
-SMALLEST = 5e-324
 # Beyond this the reduction of an angle by multiples of pi is not worth the trouble: sin is then in [-1, 1].
 LARGEST_ANGLE = 1e5
 
@@ -73,14 +72,6 @@ class Interval:
         """max |x| over the interval; exact."""
         return np.maximum(np.abs(self.lower), np.abs(self.upper))
 
-    def contains(self, other: Any) -> np.ndarray:
-        """Elementwise: `other` lies within."""
-        inner = Interval.of(other)
-        return (self.lower <= inner.lower) & (inner.upper <= self.upper)
-
-    def hull(self, other: Interval) -> Interval:
-        return Interval(np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper))
-
     def meet(self, other: Interval) -> Interval:
         """The intersection of two enclosures of the same quantity, which therefore is not empty."""
         return Interval(np.maximum(self.lower, other.lower), np.minimum(self.upper, other.upper))
@@ -132,9 +123,6 @@ class Interval:
     def __rtruediv__(self, other: Any) -> Interval:
         return Interval.of(other) / self
 
-    def square(self) -> Interval:
-        return self.power(2)
-
     def power(self, exponent: int) -> Interval:
         """x^n for an integer n >= 0, tight for both signs of x."""
         if exponent == 0:
@@ -185,7 +173,7 @@ class Interval:
         return Interval(low, high)
 
 
-def product(a: Interval, b: Interval) -> Interval:
+def matrix_product(a: Interval, b: Interval) -> Interval:
     """Matrix product (..., i, j) @ (..., j, k), each entry an enclosure of the exact sum."""
     terms = Interval(a.lower[..., :, :, None], a.upper[..., :, :, None]) * Interval(
         b.lower[..., None, :, :], b.upper[..., None, :, :]

@@ -40,23 +40,12 @@ class BadlyScaledError(SetError):
     """A set's widths are too far apart for floating-point numbers."""
 
 
-class Supported(Protocol):
-    """Anything convex that can say how far it reaches."""
+class ConvexSet(Protocol):
+    """Whatever has a support function."""
 
     def support(self, directions: np.ndarray) -> np.ndarray:
         """max f' w over the set for each row f of directions (r, d); (r,)."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class Hull:
-    """The convex hull of points (k, d)."""
-
-    points: np.ndarray
-
-    def support(self, directions: np.ndarray) -> np.ndarray:
-        """max f' x over the points for each row f of directions (r, d); (r,)."""
-        return np.asarray((directions @ self.points.T).max(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,27 +102,6 @@ class Body:
         """max f' x over the set for each row f of directions (r, d); (r,)."""
         return np.asarray((np.asarray(directions) @ self.vertices.T).max(axis=-1))
 
-    def margin(self, x: np.ndarray) -> np.ndarray:
-        """Scaled distance of points (..., d) to the nearest facet, negative outside; (...)."""
-        lengths = np.linalg.norm(self.G * self.scale, axis=1)
-        return np.asarray(((self.g - np.asarray(x) @ self.G.T) / lengths).min(axis=-1))
-
-    def minus(self, W: Supported) -> Polytope:
-        """The Minkowski difference {x : x + w in the set for all w in W}, by support functions."""
-        return halfspaces(self.G, self.g - W.support(self.G))
-
-    def preimage(self, A: np.ndarray, b: np.ndarray | None = None) -> Polytope:
-        """{x : A x + b in the set}, A (d, n)."""
-        return halfspaces(self.G @ A, self.g - (0.0 if b is None else self.G @ b))
-
-    def image(self, A: np.ndarray, b: np.ndarray | None = None) -> Polytope:
-        """{A x + b : x in the set}, A (p, d), of full row rank."""
-        shift = np.zeros(len(A)) if b is None else b
-        if A.shape[0] == A.shape[1] and np.linalg.cond(A) < 1 / FLAT:
-            inverse = np.linalg.inv(A)
-            return halfspaces(self.G @ inverse, self.g + self.G @ inverse @ shift)
-        return hull(self.vertices @ A.T + shift)
-
     def includes(self, other: Body, tolerance: float = 1e-11) -> bool:
         """Whether `other` lies inside, each row moved outwards by `tolerance` of its scaled length.
 
@@ -156,21 +124,11 @@ class Body:
         keep = np.sort(np.array(found))
         return Body(self.G[keep], self.g[keep], self.scale, self.centre, self.radius)
 
-    def polytope(self) -> Polytope:
-        return halfspaces(self.G, self.g)
-
     def _scaled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unit rows, bounds and centre in scaled coordinates."""
         G = self.G * self.scale
         lengths = np.linalg.norm(G, axis=1)
         return G / lengths[:, None], self.g / lengths, self.centre / self.scale
-
-
-def halfspaces(G: np.ndarray, g: np.ndarray) -> Polytope:
-    """{x : G x <= g} as a `Polytope`."""
-    return Polytope(
-        G, np.full(len(G), -np.inf), np.asarray(g, dtype=float), tuple(f"row {i}" for i in range(len(G)))
-    )
 
 
 def body(
@@ -223,37 +181,12 @@ def body_of(polytope: Polytope, what: str = "the set", scale: np.ndarray | None 
     return body(*polytope.one_sided(), what, scale)
 
 
-def intersection(*sets: Body, what: str = "the intersection", scale: np.ndarray | None = None) -> Body:
-    """All of them together. Raises as `body`."""
-    return body(
-        np.vstack([s.G for s in sets]),
-        np.concatenate([s.g for s in sets]),
-        what,
-        sets[0].scale if scale is None else scale,
-    )
-
-
 def convex_hull(points: np.ndarray) -> ConvexHull:
     """Qhull, with points moved by a hair where rounding leaves it no consistent answer."""
     try:
         return ConvexHull(points)
     except QhullError:
         return ConvexHull(points, qhull_options=JOGGLED)
-
-
-def hull(points: np.ndarray) -> Polytope:
-    """The convex hull of points (k, d) in half-space form. Raises `FlatSetError`."""
-    points = np.asarray(points, dtype=float)
-    centre = points.mean(axis=0)
-    scale = np.abs(points - centre).max(axis=0)
-    if scale.min() <= FLAT * scale.max():
-        raise FlatSetError("the hull of the points is flat: they all lie in one plane")
-    if points.shape[1] == 1:
-        return Polytope.box(points.min(axis=0), points.max(axis=0), ("row 0",))
-    equations = convex_hull((points - centre) / scale).equations
-    equations = np.unique(np.round(equations, 13), axis=0)
-    G = equations[:, :-1] / scale
-    return halfspaces(G, G @ centre - equations[:, -1])
 
 
 def eliminate(G: np.ndarray, g: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:

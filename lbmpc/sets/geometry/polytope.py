@@ -49,7 +49,7 @@ class Polytope:
             # 0 * inf is not a number; a direction that does not look at a variable does not see its bound.
             terms = np.where(direction > 0, self.upper, np.where(direction < 0, self.lower, 0.0))
             return float(terms @ (positive + negative))
-        solution = linprog(-np.asarray(direction), *self._inequalities(), bounds=(None, None), method="highs")
+        solution = linprog(-np.asarray(direction), *self.one_sided(), bounds=(None, None), method="highs")
         if solution.status == 3:
             return float("inf")
         if solution.status != 0:
@@ -81,16 +81,10 @@ class Polytope:
 
     def interior_point(self) -> np.ndarray | None:
         """Some point of the set, or None when it is empty."""
-        solution = linprog(
-            np.zeros(self.dimension), *self._inequalities(), bounds=(None, None), method="highs"
-        )
+        solution = linprog(np.zeros(self.dimension), *self.one_sided(), bounds=(None, None), method="highs")
         return solution.x if solution.status == 0 else None
 
     def one_sided(self) -> tuple[np.ndarray, np.ndarray]:
         """The same set as G x <= g, finite rows only."""
-        rows, bounds = self._inequalities()
-        return rows, bounds
-
-    def _inequalities(self) -> tuple[np.ndarray, np.ndarray]:
         high, low = np.isfinite(self.upper), np.isfinite(self.lower)
         return np.vstack([self.F[high], -self.F[low]]), np.concatenate([self.upper[high], -self.lower[low]])

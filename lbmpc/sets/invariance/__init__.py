@@ -1,1 +1,1 @@
-"""Invariant sets: terminal, tube, minimal, robust control invariant, and regions around them."""
+"""Invariant sets of the plant, and of the plant under linear feedback."""

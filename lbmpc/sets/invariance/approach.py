@@ -1,4 +1,4 @@
-"""A way for the true plant from a state into a set, with as much room to X's bounds as there is.
+"""A trajectory of the true plant from a state into a set, with as much room to X's bounds as there is.
 
 Only a proposal: nothing is claimed of it. `lbmpc.sets.invariance.regions` builds certified sets around it, or fails to.
 """
@@ -13,19 +13,20 @@ import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.plants.base import dop853
+from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.geometry.operations import Body
 
 STEP_NORM = 0.4
 """|a| dt of one integration step at most."""
 ENOUGH_ROOM = 0.04
-"""Share of X's half-widths; a longer way is not looked for once one has it."""
+"""Share of X's half-widths; a longer one is not looked for once one has it."""
 LENGTHS = (10, 20, 40, 60, 90, 140)
 DEPTH = 0.01
-"""How deep inside the set the way ends, as a share of X's half-widths."""
+"""How deep inside the set it ends, as a share of X's half-widths."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class Trajectory:
     """x (n + 1, d) and u (n, m) in deviation coordinates; `room` is to X's bounds, as a share of its half-widths."""
 
     x: np.ndarray
@@ -33,48 +34,47 @@ class Way:
     room: float
 
 
-def find_way(model: Model, start: np.ndarray, goal: Body) -> Way | None:
+def find_trajectory(model: Model, start: np.ndarray, goal: Body) -> Trajectory | None:
     """From `start`, (d,), into `goal`: the shortest of `LENGTHS` with enough room, else the roomiest, or None."""
     best = None
     for steps in LENGTHS:
-        way = _of_length(model, start, goal, steps)
-        if way is not None and (best is None or way.room > best.room):
-            best = way
+        found = _of_length(model, start, goal, steps)
+        if found is not None and (best is None or found.room > best.room):
+            best = found
         if best is not None and best.room >= ENOUGH_ROOM:
             break
     return best
 
 
-def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Way | None:
+def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Trajectory | None:
     plant = model.plant
     half = (plant.x_max - plant.x_min) / 2
-    low, high = plant.x_min - plant.x_e, plant.x_max - plant.x_e
-    u_low, u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
-    spare = 0.02 * (u_high - u_low)
+    X, U = state_set(model), input_set(model)
+    spare = 0.02 * (U.upper - U.lower)
     move = one_period(model)
     opti = ca.Opti()
     x, u, room = opti.variable(model.d, steps + 1), opti.variable(model.m, steps), opti.variable()
     opti.subject_to(x[:, 0] == start)
     for k in range(steps):
         opti.subject_to(x[:, k + 1] == move(x[:, k], u[:, k]))
-        opti.subject_to(opti.bounded(u_low + spare, u[:, k], u_high - spare))
-        opti.subject_to(x[:, k + 1] >= low + room * half)
-        opti.subject_to(x[:, k + 1] <= high - room * half)
+        opti.subject_to(opti.bounded(U.lower + spare, u[:, k], U.upper - spare))
+        opti.subject_to(x[:, k + 1] >= X.lower + room * half)
+        opti.subject_to(x[:, k + 1] <= X.upper - room * half)
     opti.subject_to(opti.bounded(0.0, room, 2 * ENOUGH_ROOM))
     lengths = np.linalg.norm(goal.G * half, axis=1)
     opti.subject_to(ca.DM(goal.G) @ x[:, steps] <= goal.g - DEPTH * lengths)
-    # Room first; among ways of equal room the one that moves the inputs least.
-    unit = u_high - u_low
+    # Room first; among those of equal room the one that moves the inputs least.
+    unit = U.upper - U.lower
     effort = sum(ca.sumsqr((u[:, k + 1] - u[:, k]) / unit) for k in range(steps - 1))
     opti.minimize(-100.0 * room + 0.1 * effort)
     opti.set_initial(x, np.linspace(start, goal.centre, steps + 1).T)
     opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "max_iter": 200})
     try:
         found = opti.solve()
-    except RuntimeError:  # infeasible, or not converged: there is no way of this length
+    except RuntimeError:  # infeasible, or not converged: there is none of this length
         return None
     xs = np.asarray(found.value(x)).reshape(model.d, -1).T
-    return Way(xs, np.asarray(found.value(u)).reshape(model.m, -1).T, float(found.value(room)))
+    return Trajectory(xs, np.asarray(found.value(u)).reshape(model.m, -1).T, float(found.value(room)))
 
 
 def one_period(model: Model) -> ca.Function:

@@ -1,7 +1,7 @@
-"""Sets around a way into a control invariant set, with h bounded locally: what is certified reaches further.
+"""Robust controllable sets along a trajectory into a control invariant set, with h bounded locally.
 
 In a small cell of states and inputs h is nearly affine, h in slope_x x + slope_u u + W with W of second order in the
-cell's size. Backwards along a way from a state x_0 into the set C, with S_n = C,
+cell's size. Backwards along a trajectory from a state x_0 into the set C, with S_n = C,
 
     S_i = cell_i with X with {x : there is u in cell_i with (A + slope_x) x + (B + slope_u) u + W in S_{i+1}},
 
@@ -21,8 +21,8 @@ from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_affine
 from lbmpc.sets.geometry.operations import Body, body, body_of
 from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
-from lbmpc.sets.invariance.approach import Way, find_way
-from lbmpc.sets.invariance.robust_control import Uncertain, predecessor
+from lbmpc.sets.invariance.approach import Trajectory, find_trajectory
+from lbmpc.sets.invariance.robust_control import UncertainSystem, predecessor
 
 REMAINDERS = (1e-3, 5e-4)
 """What a cell's W may be, as a share of X's half-widths, tried in turn."""
@@ -33,30 +33,30 @@ LARGEST = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class ControllableSet:
     """S_i with the cell in which its bound of h holds."""
 
     set: Body
     bound: DisturbanceBound
 
 
-def chain(
+def controllable_sets(
     model: Model, start: np.ndarray, goal: Body, progress: Callable[[float], None] = lambda done: None
-) -> list[Link]:
+) -> list[ControllableSet]:
     """The sets S_{n-1}, ..., S_0 from next to `goal` back to `start`, (d,); S_0 holds `start`.
 
     Raises:
         SetError: none was found; the text says how far it came.
     """
-    way = find_way(model, start, goal)
-    if way is None:
+    trajectory = find_trajectory(model, start, goal)
+    if trajectory is None:
         raise SetError(
             "no way of the true plant from the given state into the invariant set was found that stays inside X"
         )
     trouble = ""
     for remainder in REMAINDERS:
         try:
-            return _along(model, way, goal, remainder, progress)
+            return _along(model, trajectory, goal, remainder, progress)
         except EmptySetError as error:
             trouble = str(error)
     raise SetError(
@@ -65,20 +65,22 @@ def chain(
 
 
 def _along(
-    model: Model, way: Way, goal: Body, remainder: float, progress: Callable[[float], None]
-) -> list[Link]:
-    size = cell_size(model, way.x[0], way.u[0], remainder)
-    regions = [_region(model, x, u, size) for x, u in zip(way.x[:-1], way.u, strict=True)]
+    model: Model, trajectory: Trajectory, goal: Body, remainder: float, progress: Callable[[float], None]
+) -> list[ControllableSet]:
+    size = cell_size(model, trajectory.x[0], trajectory.u[0], remainder)
+    regions = [_region(model, x, u, size) for x, u in zip(trajectory.x[:-1], trajectory.u, strict=True)]
     bounds = bound_affine(model, regions)
-    links: list[Link] = []
+    found: list[ControllableSet] = []
     target = goal
-    for i in reversed(range(len(way.u))):
-        target = _one_step_into(model, target, bounds[i], f"the set {len(way.u) - i} steps before the goal")
-        if not target.contains(way.x[i]).all():
-            raise EmptySetError(f"the set {len(way.u) - i} steps before the goal misses the way")
-        links.append(Link(target, bounds[i]))
-        progress(len(links) / len(way.u))
-    return links
+    for i in reversed(range(len(trajectory.u))):
+        target = _one_step_into(
+            model, target, bounds[i], f"the set {len(trajectory.u) - i} steps before the goal"
+        )
+        if not target.contains(trajectory.x[i]).all():
+            raise EmptySetError(f"the set {len(trajectory.u) - i} steps before the goal misses the way")
+        found.append(ControllableSet(target, bounds[i]))
+        progress(len(found) / len(trajectory.u))
+    return found
 
 
 def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: str) -> Body:
@@ -86,7 +88,7 @@ def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: st
     region = bound.region
     X = body_of(state_set(model), "X")
     inputs = Polytope.box(region.u_lower, region.u_upper, model.plant.inputs)
-    plant = Uncertain(model.A + bound.slope_x, model.B + bound.slope_u, bound, inputs)
+    plant = UncertainSystem(model.A + bound.slope_x, model.B + bound.slope_u, bound, inputs)
     G, g = predecessor(target, plant, SPARE, X.scale)
     cell = Polytope.box(region.x_lower, region.x_upper, model.plant.states)
     G_cell, g_cell = cell.one_sided()

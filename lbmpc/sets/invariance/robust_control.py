@@ -17,20 +17,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.sets.geometry.operations import Body, Supported, body, eliminate
+from lbmpc.sets.geometry.operations import Body, ConvexSet, body, eliminate
 from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
 
-LEFT = 0.05
-SHARES = tuple(np.arange(0.95, 0.0, -0.05).tolist())
+LEFT_TO_CHECKER = 0.05
+"""How much of the slack an invariant stage leaves, for the rounding of whoever checks it."""
+COPY_SHARES = tuple(np.arange(0.95, 0.0, -0.05).tolist())
+"""Sizes of the smaller copies that are tried, the largest first."""
 
 
 @dataclass(frozen=True, eq=False)
-class Uncertain:
+class UncertainSystem:
     """x+ = A x + B u + w, w in W, u in U; A (d, d), B (d, m)."""
 
     A: np.ndarray
     B: np.ndarray
-    W: Supported
+    W: ConvexSet
     U: Polytope
 
 
@@ -46,16 +48,15 @@ class Stage:
 
     @property
     def invariant(self) -> bool:
-        """With something left for the rounding of whoever checks it."""
-        return self.excess <= -LEFT * self.slack
+        return self.excess <= -LEFT_TO_CHECKER * self.slack
 
 
 def predecessor(
-    target: Body, plant: Uncertain, slack: float = 0.0, scale: np.ndarray | None = None
+    target: Body, plant: UncertainSystem, slack: float = 0.0, scale: np.ndarray | float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (G, g) of Pre(target), redundant ones among them; W is widened by slack times the scaled ball."""
+    """Rows (G, g) of Pre(target), redundant ones among them; W is widened by slack times the ball of `scale`, (d,)."""
     d = target.dimension
-    reach = plant.W.support(target.G) + slack * np.linalg.norm(target.G * _or_own(target, scale), axis=1)
+    reach = plant.W.support(target.G) + slack * np.linalg.norm(target.G * scale, axis=1)
     G_u, g_u = plant.U.one_sided()
     rows = np.vstack(
         [
@@ -66,8 +67,8 @@ def predecessor(
     return eliminate(rows, np.concatenate([target.g - reach, g_u]), plant.B.shape[1])
 
 
-def iterate(
-    X: Body, plant: Uncertain, slack: float = 3e-4, patience: int = 150, start: Stage | None = None
+def predecessor_iteration(
+    X: Body, plant: UncertainSystem, slack: float = 3e-4, patience: int = 150, start: Stage | None = None
 ) -> Iterator[Stage]:
     """The predecessor iteration, stage by stage, until one is invariant.
 
@@ -111,9 +112,11 @@ def iterate(
         current = new
 
 
-def _smaller_copy(current: Body, plant: Uncertain, eps: float, scale: np.ndarray, patience: int) -> Body:
+def _smaller_copy(
+    current: Body, plant: UncertainSystem, eps: float, scale: np.ndarray, patience: int
+) -> Body:
     """The largest of some copies of a set, shrunk about the equilibrium, that is invariant for W + eps S."""
-    for share in SHARES:
+    for share in COPY_SHARES:
         try:
             copy = body(current.G, share * current.g, "a smaller copy", scale)
             before = body(*predecessor(copy, plant, eps, scale), "its predecessor", scale)
@@ -136,21 +139,3 @@ def _excess(before: Body, after: Body, eps: float, scale: np.ndarray) -> float:
         return -np.inf
     reach = after.G @ shrunk.vertices.T
     return float(((reach.max(axis=1) - after.g) / np.linalg.norm(after.G * scale, axis=1)).max())
-
-
-def controllable_sets(target: Body, X: Body, plant: Uncertain, steps: int) -> list[Body]:
-    """K_0 = target, K_{i+1} = X with Pre(K_i): from K_i the target is reached in i steps, robustly, inside X.
-
-    Raises:
-        EmptySetError: from nowhere in X; names the step.
-    """
-    sets = [target]
-    for i in range(steps):
-        G, g = predecessor(sets[-1], plant)
-        both = np.vstack([X.G, G]), np.concatenate([X.g, g])
-        sets.append(body(*both, f"the {i + 1}-step robust controllable set", X.scale).reduced())
-    return sets
-
-
-def _or_own(target: Body, scale: np.ndarray | None) -> np.ndarray:
-    return target.scale if scale is None else scale

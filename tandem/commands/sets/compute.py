@@ -48,7 +48,7 @@ class SetsCompute(Configured):
 
         from controller_node.build import build_model
         from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
-        from lbmpc.sets.enclosures.search import DisturbanceError
+        from lbmpc.sets.enclosures.disturbance import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
 
         if not 0.0 < self.slack < 1.0:

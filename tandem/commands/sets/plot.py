@@ -39,7 +39,8 @@ class SetsPlot(Command):
         from lbmpc.sets.certificate import CertificateError, require_match
         from lbmpc.sets.geometry.polytope import SetError
         from run_log.reading.reader import read_run
-        from run_log.reporting.summary import plant_of, trajectory
+        from run_log.reporting.summary import trajectory
+        from run_log.run import plant_of
         from tandem.commands.sets.picture import Drawn, picture
 
         file, log = self.file, self.log

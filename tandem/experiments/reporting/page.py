@@ -83,7 +83,7 @@ def page(
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     found = {
         **provenance.describe(),
-        **provenance.versions(),
+        **provenance.versions(provenance.SCIENCE),
         "load": f"{provenance.load():.1f} processes at the end",
     }
     whole = Page(
@@ -206,7 +206,7 @@ def header(
         "command": command,
         "code": code,
         "machine": provenance.describe(),
-        "versions": provenance.versions(),
+        "versions": provenance.versions(provenance.SCIENCE),
         "processes": jobs,
         "cores": os.cpu_count(),
     }

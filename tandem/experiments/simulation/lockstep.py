@@ -25,7 +25,7 @@ from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from protocol import topics
 from protocol.topics import Topic
-from run_log.reading.reader import Run, gather
+from run_log.run import Run, gather
 from tandem.experiments.simulation.faults import Faults
 
 if TYPE_CHECKING:

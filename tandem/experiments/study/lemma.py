@@ -14,7 +14,7 @@ import numpy as np
 
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.dnn.adaptation_law import refit
-from run_log.reading.reader import Run
+from run_log.run import Run
 
 RIDGE = 1e-8
 

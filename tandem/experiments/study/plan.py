@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
+from node_runtime import provenance
 from node_runtime.config.sections import (
     AdaptationConfig,
     BusConfig,
@@ -33,7 +33,6 @@ CODE = (
     "plant_sim",
     "tandem/experiments/simulation/lockstep.py",
 )
-PACKAGES = ("numpy", "scipy", "casadi", "daqp", "torch")
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,6 +110,6 @@ def code_version() -> str:
         files = [one for one in sorted(path.rglob("*")) if one.suffix in (".py", ".c")]
         for file in files or [path]:
             digest.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
-    for package in PACKAGES:
-        digest.update(f"{package} {metadata.version(package)}\0".encode())
+    for package, version in provenance.versions((*provenance.SCIENCE, "torch")).items():
+        digest.update(f"{package} {version}\0".encode())
     return digest.hexdigest()

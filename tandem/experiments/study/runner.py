@@ -18,11 +18,12 @@ from typing import NamedTuple
 import msgspec
 
 from node_runtime.config.sections import AdaptationConfig, Config, PlantConfig
+from node_runtime.whole_file import write_whole
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
 from tandem.experiments.study.declaration import Resolved
 from tandem.experiments.study.plan import Job, RowPlan
-from tandem.experiments.study.work import Record, read, work, write_whole
+from tandem.experiments.study.work import Record, read, work
 
 Progress = Callable[[int, int], None]
 """Told what is done and of how many."""

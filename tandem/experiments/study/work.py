@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
 
 from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
-from run_log.reading.reader import Run
-from run_log.reporting.summary import SOFT, plant_of, summarise, trajectory
+from node_runtime.whole_file import write_whole
+from run_log.reporting.summary import SOFT, summarise, trajectory
+from run_log.run import Run, plant_of
 from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
@@ -106,13 +106,6 @@ def _lemma(run: Run, config: Config) -> Lemma | None:
     if config.controller.oracle != "dnn":
         return None
     return measure(run, build_network_oracle(config, build_plant(config)))
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Under its name only when all of it is there."""
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_bytes(data)
-    partial.replace(path)
 
 
 def read(path: Path, detail: bool) -> Record | None:

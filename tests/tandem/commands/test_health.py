@@ -14,7 +14,8 @@ import zenoh
 
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
-from node_runtime.health import HealthPublisher, HealthThread, run_info
+from node_runtime.health import HealthPublisher, HealthThread
+from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.router import Router
 from protocol import topics

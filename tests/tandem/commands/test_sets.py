@@ -101,18 +101,18 @@ def test_ctrl_c_loses_nothing_and_says_how_to_go_on(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(construction, "chain", interrupted)
+        patch.setattr(construction, "controllable_sets", interrupted)
         assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 130
     assert "the same command goes on from there" in capsys.readouterr().out
     assert not (cached / "again.json").exists()
 
-    iterate = construction.iterate
+    iterate = construction.predecessor_iteration
 
     def counted(*arguments: object, **named: object):
         began.append("iterate")
         return iterate(*arguments, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(construction, "iterate", counted)
+    monkeypatch.setattr(construction, "predecessor_iteration", counted)
     assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 0
     assert not began
     again, before = read_sets(Path("again.json")), read_sets(Path("sets.json"))

@@ -13,8 +13,8 @@ from lbmpc.oracles.dnn.adaptation_law import refit
 from lbmpc.plants import PlantError, Truth, get_plant
 from node_runtime.config.sections import Config, load
 from node_runtime.config.strict import ConfigError
-from run_log.reading.reader import Run
 from run_log.replaying.replay import replay
+from run_log.run import Run
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.simulation.lockstep import follow
 from tandem.experiments.study.lemma import measure

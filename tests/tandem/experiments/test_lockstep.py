@@ -10,8 +10,8 @@ import pytest
 
 from node_runtime.config.sections import load
 from protocol import topics
-from run_log.reading.reader import Run
 from run_log.reporting.summary import Summary, summarise
+from run_log.run import Run
 from tandem.experiments.simulation.lockstep import simulate
 
 STEPS = 200

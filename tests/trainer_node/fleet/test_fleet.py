@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from typing import Any, cast
 
@@ -21,10 +22,11 @@ from protocol.messages import Array, OutputWeights, Sample
 from protocol.topics import Topic
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import discovery
-from trainer_node.fleet.discovery import Heard, OneRouter
-from trainer_node.fleet.fleet import SAY_EVERY, Fleet, _Followed, seed_of
-from trainer_node.node import NAMES, ROUND, TrainerNode, train_round
+from trainer_node.fleet.discovery import LastHeard, SharedRouter
+from trainer_node.fleet.fleet import SAY_EVERY_S, Fleet, _Followed, seed_of
+from trainer_node.node import COUNTERS, TrainerNode
 from trainer_node.training import Draw, Trainer, use_one_thread
+from trainer_node.training_round import MOST_STACKED, train_round
 
 TRAINING = TrainerConfig(capacity=600, batch=128, steps=40, device="cpu")
 SAMPLES = (128, 40, 300, 77)
@@ -117,23 +119,23 @@ def test_a_plant_that_diverges_changes_no_bit_of_the_others() -> None:
 
 
 def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
-    heard = Heard("jet*")
+    heard = LastHeard("jet*")
     heard.note("tandem/jet1/controller/samples", 0.0)
     heard.note("tandem/pump/controller/samples", 0.0)
     assert heard.present(1.0) == ["jet1"]
-    assert heard.present(1.0 + discovery.SILENT) == []
+    assert heard.present(1.0 + discovery.SILENT_S) == []
     heard.note("tandem/jet1/controller/samples", 20.0)
     assert heard.present(20.0) == ["jet1"]
 
 
 def test_a_stranger_who_invents_names_fills_no_memory() -> None:
-    heard = Heard("*")
-    for k in range(discovery.MOST + 100):
+    heard = LastHeard("*")
+    for k in range(discovery.MOST_PLANTS + 100):
         heard.note(f"tandem/x{k}/controller/samples", 0.0)
-    assert len(heard.present(0.0)) == discovery.MOST
+    assert len(heard.present(0.0)) == discovery.MOST_PLANTS
 
 
-class Nobody(OneRouter):
+class Nobody(SharedRouter):
     """A router behind which there is no plant."""
 
     def __init__(self) -> None:
@@ -143,7 +145,7 @@ class Nobody(OneRouter):
 def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     fleet = Fleet(Nobody())
-    for now in (0.0, 1.0, SAY_EVERY - 1.0, SAY_EVERY + 1.0):
+    for now in (0.0, 1.0, SAY_EVERY_S - 1.0, SAY_EVERY_S + 1.0):
         fleet.turn(now)
     assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
 
@@ -161,7 +163,7 @@ def test_a_plant_that_was_away_between_two_looks_is_taken_in_anew(monkeypatch: p
     end.callback(ended.append, "jet1")
     fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Lanes, "those before"), end)
     monkeypatch.setattr(Fleet, "_take_in", lambda _fleet, name: taken.append(name))
-    fleet._gather(0.0)
+    fleet._update_plants(0.0)
     assert (ended, taken) == (["jet1"], ["jet1"])
 
 
@@ -188,7 +190,8 @@ class Silent:
 def waiting(network: NetworkDescription, number: int, since: float) -> tuple[TrainerNode, Silent]:
     """A plant that has waited for its training since then."""
     pupil, bus = Pupil(network, number, 40), Silent(Config(trainer=TRAINING))
-    node = TrainerNode(bus.config, cast(Bus, bus), cast(HealthPublisher, bus), dict.fromkeys(NAMES, 0))
+    health, askers = cast(HealthPublisher, bus), cast(Executor, None)
+    node = TrainerNode(bus.config, cast(Bus, bus), health, dict.fromkeys(COUNTERS, 0), askers)
     node._trainer, node._output, node._run = pupil.trainer, pupil.output, "c"
     node._waits_since = since
     return node, bus
@@ -205,7 +208,7 @@ def test_who_has_waited_longest_comes_first_and_nobody_is_left_behind() -> None:
         trained.append([k for k, (_, bus) in enumerate(fleet_of) if bus.published > before[k]])
     trained = [round_ for round_ in trained if round_]
     assert len(trained) == 3
-    assert all(len(round_) <= ROUND for round_ in trained)
+    assert all(len(round_) <= MOST_STACKED for round_ in trained)
     assert sorted(k for round_ in trained for k in round_) == list(range(40))
     for round_, later in itertools.pairwise(trained):
         # The first of a round has waited longer than everybody who comes later.

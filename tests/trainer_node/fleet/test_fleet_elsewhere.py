@@ -18,7 +18,7 @@ from protocol.messages import Health
 from tandem import certificate_authority
 from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
 from tests.trainer_node.test_node import TRAINING, Controller
-from trainer_node.fleet.discovery import OwnRouters
+from trainer_node.fleet.discovery import RouterPerPlant
 from trainer_node.main import main
 from trainer_node.node import TrainerNode
 
@@ -90,7 +90,7 @@ def test_plants_behind_routers_of_their_own_get_weights_from_one_trainer(tmp_pat
 def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_relent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN", 0.2)
+    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN_S", 0.2)
     good, other = site(tmp_path, "jet1"), site(tmp_path, "jet2")
     right = tmp_path / "jet2" / "trainer"
     kept = tmp_path / "kept"
@@ -111,7 +111,7 @@ def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_rele
 def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("trainer_node.fleet.fleet.SHUNNED_S", 0.5)
+    monkeypatch.setattr("trainer_node.fleet.fleet.LEFT_ALONE_S", 0.5)
     listen = TrainerNode.listen
     looks: list[float] = []
 
@@ -138,7 +138,7 @@ def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
 def test_no_plant_is_told_of_the_others(tmp_path: Path) -> None:
     sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
     config = fleet(tmp_path, *sites)
-    said = to_json(OwnRouters(config, config.trainer.fleet, threading.Event()).config("jet1"))
+    said = to_json(RouterPerPlant(config, config.trainer.fleet, threading.Event()).config("jet1"))
     assert sites[0].bus.remote in said
     assert sites[1].bus.remote not in said
 
@@ -173,7 +173,7 @@ def test_the_list_in_a_file(tmp_path: Path) -> None:
 def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN", 0.2)
+    monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN_S", 0.2)
     only = site(tmp_path, "jet1")
     folder = tmp_path / "jet1"
     authority = folder / "authority"

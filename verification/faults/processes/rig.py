@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 
 from benchmarks.live import stalls
+from benchmarks.live.ports import free_port
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
 from node_runtime.config.sections import Config, override, to_toml
 from node_runtime.lifecycle import new_run_id
@@ -24,12 +23,12 @@ from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
 from tandem.live.processes import command_line
-
-from . import link as links
-from .scenes import Surroundings
+from verification.faults.processes import link as links
+from verification.faults.processes.running import Event, Heard, Running
+from verification.faults.processes.scenes import Surroundings
 
 HERE = Path(__file__).parent
-ROOT = HERE.parent.parent
+ROOT = HERE.parent.parent.parent
 COMMANDS = {
     "router": "router",
     "recorder": "record",
@@ -54,53 +53,6 @@ class RigError(RuntimeError):
     """The run did not come about, whatever the fault: a process did not start, no command came."""
 
 
-@dataclass(frozen=True)
-class Heard:
-    """One message as the suite heard it on the bus."""
-
-    at: float
-    """Seconds on the monotonic clock."""
-    topic: str
-    payload: bytes
-
-
-@dataclass
-class Running:
-    """One process, and when it was started and killed; seconds on the monotonic clock."""
-
-    name: str
-    words: list[str]
-    environment: dict[str, str]
-    output: Path
-    popen: subprocess.Popen[bytes] | None = None
-    started: list[float] = field(default_factory=list)
-    killed: list[float] = field(default_factory=list)
-    restart_at: float | None = None
-
-    def start(self) -> None:
-        with self.output.open("ab") as output:
-            self.popen = subprocess.Popen(
-                self.words,
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=os.environ | self.environment,
-                process_group=0,
-            )
-        self.started.append(clock.now())
-
-    @property
-    def alive(self) -> bool:
-        return self.popen is not None and self.popen.poll() is None
-
-    def signal(self, number: signal.Signals) -> None:
-        if self.popen is not None and self.alive:
-            os.killpg(self.popen.pid, number)
-
-    def said(self) -> str:
-        return self.output.read_text(errors="replace") if self.output.exists() else ""
-
-
 class Rig:
     """A router, recorder, trainer, controller and plant, started on entry, all gone on exit.
 
@@ -123,10 +75,10 @@ class Rig:
     ):
         self.folder, self._places = folder, places or {}
         self._seed, self._around = seed, around or Surroundings()
-        port = _free_port()
+        port = free_port()
         while f":{port}" in str(self._around.settings):
             # The scene's door for other machines has it, though nobody listens there yet.
-            port = _free_port()
+            port = free_port()
         self.config = override(
             config,
             [
@@ -138,8 +90,7 @@ class Rig:
         self.log = folder / "disk" / "run.mcap"
         self.trace = folder / "trace.jsonl"
         self.heard: list[Heard] = []
-        self.events: list[tuple[float, str]] = []
-        """What was done to the run, and when; seconds on the monotonic clock."""
+        self.events: list[Event] = []
         self.first_command: float | None = None
         self.processes: dict[str, Running] = {}
         self.links: dict[str, links.Link] = {}
@@ -239,7 +190,7 @@ class Rig:
             while running.alive and clock.now() < deadline:
                 self.look()
             if running.alive:
-                self.note(f"{name} did not stop")
+                self.note(f"{name} did not stop", name)
                 running.signal(signal.SIGKILL)
 
     def _kill_all(self) -> None:
@@ -275,7 +226,7 @@ class Rig:
             elif clock.now() >= running.restart_at:
                 running.restart_at = None
                 running.start()
-                self.note(f"{running.name} started again")
+                self.note(f"{running.name} started again", running.name)
 
     def run_for(self, seconds: float) -> None:
         """Let the run go on."""
@@ -297,13 +248,13 @@ class Rig:
 
     # -- faults --------------------------------------------------------
 
-    def note(self, text: str) -> None:
+    def note(self, text: str, *concerns: str, whole_again: bool = False) -> None:
         """Remember that something was done now."""
-        self.events.append((clock.now(), text))
+        self.events.append(Event(clock.now(), text, concerns, whole_again))
 
     def kill(self, *names: str) -> None:
         """kill -9 of these at once."""
-        self.note(f"kill {' and '.join(names)}")
+        self.note(f"kill {' and '.join(names)}", *names)
         for name in names:
             self.processes[name].killed.append(clock.now())
             self.processes[name].signal(signal.SIGKILL)
@@ -327,11 +278,11 @@ class Rig:
 
     def freeze(self, name: str, seconds: float) -> None:
         """SIGSTOP, and SIGCONT after a while."""
-        self.note(f"stop {name}")
+        self.note(f"stop {name}", name)
         self.processes[name].signal(signal.SIGSTOP)
         self.run_for(seconds)
         self.processes[name].signal(signal.SIGCONT)
-        self.note(f"{name} goes on")
+        self.note(f"{name} goes on", name, whole_again=True)
 
     def shape(self, name: str, shape: links.Shape, seconds: float) -> None:
         """What happens to the packets of the plant's or the trainer's link for a while."""
@@ -339,7 +290,7 @@ class Rig:
         self.links[name].shape(shape)
         self.run_for(seconds)
         self.links[name].shape(links.Shape())
-        self.note(f"{name}'s link is back")
+        self.note(f"{name}'s link is back", whole_again=True)
 
     def attack(self, kind: str, rate: float, seconds: float, seed: int) -> dict[str, float]:
         """Let a stranger send bad messages for a while; how many it sent, by topic."""
@@ -356,10 +307,10 @@ class Rig:
     def _beside(
         self, program: str, config: Config, kind: str, *words: str, seconds: float
     ) -> dict[str, float]:
-        """Run a program of this folder beside the run until it ends; the counts that it prints."""
+        """Run one of `strangers` beside the run until it ends; the counts that it prints."""
         file = self.folder / f"{program}.toml"
         file.write_text(to_toml(config), encoding="utf-8")
-        command = [sys.executable, "-m", f"verification.faults.{program}", str(file), kind, *words]
+        command = [sys.executable, "-m", f"verification.faults.strangers.{program}", str(file), kind, *words]
         self.note(f"{program}: {kind}")
         out, err = self.folder / f"{program}.json", self.folder / f"{program}.txt"
         with out.open("wb") as stdout, err.open("wb") as stderr:
@@ -369,7 +320,7 @@ class Rig:
             self.wait(lambda: process.poll() is not None, seconds + 15.0, f"the {program}'s end")
         if process.returncode:
             raise RigError(f"the {program} failed: {err.read_text()[-800:]}")
-        self.note("that is over")
+        self.note("that is over", whole_again=True)
         return msgspec.json.decode(out.read_bytes(), type=dict[str, float])
 
     # -- what is known while it runs -------------------------------------
@@ -392,9 +343,3 @@ def _decoded(topic: topics.Topic, heard: Heard) -> m.Message | None:
         return codec.decode(topic, heard.payload)
     except codec.BadMessage:
         return None
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -1,6 +1,6 @@
 """A stranger on the bus: messages that must not be obeyed, many a second, on every topic.
 
-    python -m verification.faults.attacker CONFIG KIND RATE SECONDS SEED
+    python -m verification.faults.strangers.attacker CONFIG KIND RATE SECONDS SEED
 
 It listens, so that it can send again, cut short and change what the processes of the run said. What it sent is printed
 as one JSON object: topic -> how many. With a weights kind it is a stolen trainer: right run, next version, right hash

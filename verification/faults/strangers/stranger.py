@@ -1,6 +1,6 @@
 """Somebody at the router's door for other machines, with a certificate that should not open it, or not that far.
 
-    python -m verification.faults.stranger CONFIG KIND KEYS SECONDS
+    python -m verification.faults.strangers.stranger CONFIG KIND KEYS SECONDS
 
 CONFIG names the door (`bus.endpoint`), KEYS is the folder that `keys` filled. What it tried, what was refused and what
 it was told is printed as one JSON object.

@@ -1,21 +1,13 @@
-"""Affine forms of the disturbance over boxes, and branch and bound on them.
-
-Each box p = (x, u) in c +- r has the form h(p) in g + G (p - c) with intervals g and G from a validated integration
-(`flow.py`). It gives the maximum of f'h over a region to a tolerance, from above, whenever it is stopped.
-"""
+"""The maximum of f'h over a region to a tolerance, from above, by branch and bound on affine forms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.model import Model
-from lbmpc.sets.enclosures.flow import Flow
-from lbmpc.sets.enclosures.interval import Interval, up
-from lbmpc.sets.enclosures.interval import product as interval_product
-from lbmpc.sets.enclosures.series import UnsupportedOperation
+from lbmpc.sets.enclosures.affine_forms import Disturbance, DisturbanceError, Region, nowhere
+from lbmpc.sets.enclosures.interval import Interval, matrix_product, up
 
 Progress = Callable[[float], None]
 
@@ -24,81 +16,7 @@ BATCH = 256
 FINEST = 2.0**-12
 
 
-class DisturbanceError(ValueError):
-    """The disturbance cannot be bounded as asked; the text says what, where, and what to do."""
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """A box of states (d,) and inputs (m,), in deviation coordinates and the plant's units."""
-
-    x_lower: np.ndarray
-    x_upper: np.ndarray
-    u_lower: np.ndarray
-    u_upper: np.ndarray
-
-    @property
-    def lower(self) -> np.ndarray:
-        """(d + m,), of p = (x, u)."""
-        return np.concatenate([self.x_lower, self.u_lower]).astype(float)
-
-    @property
-    def upper(self) -> np.ndarray:
-        """(d + m,)."""
-        return np.concatenate([self.x_upper, self.u_upper]).astype(float)
-
-
-@dataclass(frozen=True, eq=False)
-class Forms:
-    """h(p) in g + G (p - c), |p - c| <= r, for n boxes: c, r (n, q), g (n, d), G (n, d, q)."""
-
-    c: np.ndarray
-    r: np.ndarray
-    g: Interval
-    G: Interval
-    trouble: tuple[str, ...]
-
-    @property
-    def proved(self) -> np.ndarray:
-        return np.array([not t for t in self.trouble], dtype=bool)
-
-    def __getitem__(self, index: np.ndarray) -> Forms:
-        return Forms(
-            self.c[index],
-            self.r[index],
-            self.g[index],
-            self.G[index],
-            tuple(self.trouble[i] for i in np.arange(len(self.trouble))[index]),
-        )
-
-
-class Disturbance:
-    """h of one model, over batches of boxes."""
-
-    def __init__(self, model: Model):
-        self.model = model
-        try:
-            self.flow = Flow.of_plant(model.plant, model.period)
-        except UnsupportedOperation as error:
-            raise DisturbanceError(f"{model.plant.name}: {error}") from error
-        self.e = Interval.of(np.concatenate([model.plant.x_e, model.plant.u_e]))
-        self.AB = Interval.of(np.hstack([model.A, model.B]))
-
-    def forms(self, lower: np.ndarray, upper: np.ndarray) -> Forms:
-        """The affine forms of boxes lower, upper (n, q), in deviation coordinates."""
-        d = self.model.d
-        c = np.clip(0.5 * lower + 0.5 * upper, lower, upper)
-        r = np.where(lower == upper, 0.0, np.maximum(up(upper - c), up(c - lower)))
-        box, centre = Interval(lower, upper) + self.e, Interval.of(c) + self.e
-        flight = self.flow.enclose(box[:, :d], box[:, d:], centre[:, :d], centre[:, d:], r)
-        linear = interval_product(Interval.of(c)[:, None, :], Interval(self.AB.lower.T, self.AB.upper.T))[
-            :, 0
-        ]
-        g = flight.centre - self.e[:d] - linear
-        return Forms(c, r, g, flight.derivative - self.AB, flight.trouble)
-
-
-class Search:
+class BranchAndBound:
     """Branch and bound for the maxima of f'h over a region, for all rows f of `directions` (k, d) at once.
 
     At any time `upper()` holds: every box ever set aside has left its upper bound in `settled`.
@@ -188,9 +106,9 @@ class Search:
         proved = forms.proved[place]
         mine = forms[place]
         f = self.directions[rows]
-        value = interval_product(Interval.of(f)[:, None, :], mine.g[..., None])[:, 0, 0]
-        slope = interval_product(Interval.of(f)[:, None, :], mine.G)[:, 0, :]
-        reach = interval_product(Interval.of(slope.magnitude())[:, None, :], Interval.of(mine.r)[..., None])
+        value = matrix_product(Interval.of(f)[:, None, :], mine.g[..., None])[:, 0, 0]
+        slope = matrix_product(Interval.of(f)[:, None, :], mine.G)[:, 0, :]
+        reach = matrix_product(Interval.of(slope.magnitude())[:, None, :], Interval.of(mine.r)[..., None])
         # A child lies in its parent, whose bound holds for it too.
         bound = np.where(proved, up(value.upper + reach.upper[:, 0, 0]), np.inf)
         bound = np.fmin(bound, parent)
@@ -257,17 +175,3 @@ def _faces(
     """The face of each box (n, q) that holds the maximum: where f'h is monotone, only an end counts."""
     rising, falling = (slope.lower >= 0) & proved[:, None], (slope.upper <= 0) & proved[:, None]
     return np.where(rising, upper, lower), np.where(falling & ~rising, lower, upper)
-
-
-def nowhere(model: Model, lower: np.ndarray, upper: np.ndarray, reason: str) -> str:
-    plant = model.plant
-    e = np.concatenate([plant.x_e, plant.u_e])
-    names = plant.states + plant.inputs
-    where = ", ".join(
-        f"{name} in [{low:.6g}, {high:.6g}]"
-        for name, low, high in zip(names, lower + e, upper + e, strict=True)
-    )
-    return (
-        f"{plant.name}: no bound of h for {where} over a period of {model.period:g} s: {reason}. Take a smaller "
-        "region of x and u, or a shorter period"
-    )

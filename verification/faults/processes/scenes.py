@@ -7,7 +7,6 @@ in their configurations.
 from __future__ import annotations
 
 import os
-import socket
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
@@ -15,7 +14,8 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import stranger
+from benchmarks.live.ports import free_port
+from verification.faults.strangers import stranger
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,9 @@ def step_clock(folder: Path, seconds: float) -> None:
 def door_with_certificates(folder: Path) -> Iterator[Surroundings]:
     """The router listens for other machines too, by TLS; `stranger` has keys that should not open, or not that far."""
     stranger.keys(_made(folder / KEYS))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     router = folder / KEYS / "good" / "router"
     yield Surroundings(
-        settings={"router": [f'bus.remote="tls/127.0.0.1:{port}"', f'bus.tls.keys="{router}"']},
+        settings={"router": [f'bus.remote="tls/127.0.0.1:{free_port()}"', f'bus.tls.keys="{router}"']},
     )
 
 

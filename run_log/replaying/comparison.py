@@ -1,4 +1,4 @@
-"""Where two messages differ: the first field, bit for bit, in words."""
+"""What a replay makes beside what was recorded: how much of it differs, and the first field that does, in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from protocol import codec
+from protocol import messages as m
 from protocol.messages import Array
+from run_log.run import Entry
 
 Shown = float | int | str | bool | None
 
@@ -22,6 +25,46 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
     """For example "command.u[0]" or "keyframe.arrays.oracle.K[3, 1]"."""
     recorded: Shown
     replayed: Shown
+
+
+class Comparison:
+    """Counts what was compared, and keeps the first difference."""
+
+    def __init__(self) -> None:
+        self.ticks = 0
+        self.keyframes = 0
+        self.first: Difference | None = None
+        self.differing: set[tuple[str, int]] = set()
+        """(run, tick)."""
+        self.largest: float | None = 0.0
+        """See `ReplayResult.largest_difference`."""
+
+    def compare(self, entry: Entry[Any], replayed: m.Message | None, name: str) -> None:
+        """Byte for byte; `name` begins the field that a difference is in. None: the replay made no such message."""
+        payload = b"" if replayed is None else codec.encode(replayed)
+        if payload == entry.payload:
+            return
+        recorded = entry.message
+        self.differing.add((recorded.run_id, recorded.seq))
+        if self.first is None:
+            found = first_difference(recorded, replayed, name)
+            field, left, right = found or first_byte(entry.payload, payload, name)
+            self.first = Difference(
+                run_id=recorded.run_id, tick=recorded.seq, field=field, recorded=left, replayed=right
+            )
+
+    def compare_keyframe(self, entry: Entry[m.Keyframe], replayed: m.Keyframe) -> None:
+        """As `compare`, and counted."""
+        self.compare(entry, replayed, "keyframe")
+        self.keyframes += 1
+
+    def measure(self, recorded: m.Command, replayed: m.Command) -> None:
+        """How far two plans are apart."""
+        a, b = recorded.plan, replayed.plan
+        if self.largest is None or [len(row) for row in a] != [len(row) for row in b]:
+            self.largest = None
+            return
+        self.largest = max(self.largest, float(np.max(np.abs(np.array(a) - np.array(b)), initial=0.0)))
 
 
 def first_difference(recorded: Any, replayed: Any, path: str) -> tuple[str, Shown, Shown] | None:

@@ -1,0 +1,54 @@
+"""What a log file looks like, for whoever writes or reads one: its format number, channels and metadata."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mcap.records import Header
+from mcap.writer import LIBRARY_IDENTIFIER
+
+from run_log.errors import LogError
+
+PROFILE = "tandem"
+"""The MCAP profile: what tells our logs from other MCAP files."""
+VERSIONS = {1: "0.1.0"}
+"""By format: the version of Tandem that brought it. A new line is due when an older reader would be misled."""
+FORMAT = max(VERSIONS)
+"""Of the logs that are written now: which channels, attachments and metadata there are."""
+READABLE = (FORMAT,)
+"""Formats that this version reads."""
+LIBRARY = f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}"
+"""What the header, a file's first record, says of who wrote it: the format's number is in it."""
+
+RAW, VIEW = "raw/", "view/"
+"""Channels: a topic's bytes as they travelled, and the same messages for people."""
+IDENTITY = "tandem"
+"""Metadata that says what a log is of."""
+CONTINUED = "continued"
+"""Metadata of a log that goes on in another file."""
+RECOVERED = "recovered"
+"""Metadata of a log that was made whole again."""
+CONFIG = "config.json"
+"""The attachment with the resolved configuration."""
+
+
+def check_header(path: Path, header: Header) -> None:
+    """Raises `LogError`: the file is MCAP, but no log of Tandem, or has a format that this version does not read."""
+    if header.profile != PROFILE:
+        whose = f"profile {header.profile!r}" if header.profile else "no profile"
+        raise LogError(
+            f"{path}: is an MCAP file with {whose}, written by {header.library!r}; not a log of Tandem"
+        )
+    found = re.match(r"tandem log (\d{1,9});", header.library)
+    if found is None:
+        raise LogError(f"{path}: was written as {header.library!r}, which says no format of a log of Tandem")
+    number = int(found[1])
+    if number not in READABLE:
+        way = (
+            f"Tandem {VERSIONS[number]} reads it"
+            if number in VERSIONS
+            else "it needs a newer Tandem: the version that wrote it, or a later one"
+        )
+        ours = ", ".join(map(str, READABLE))
+        raise LogError(f"{path}: is a log of format {number}, and this version reads format {ours}; {way}")

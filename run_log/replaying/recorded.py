@@ -1,0 +1,92 @@
+"""What a log says of each controller: its messages by tick, its configuration and its certified sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from controller_node.certified_sets import CertifiedSets
+from lbmpc.sets.certificate import CertificateError
+from node_runtime.config.sections import Config, from_json
+from node_runtime.config.strict import ConfigError
+from protocol import messages as m
+from protocol import topics
+from protocol.topics import Topic
+from run_log.errors import LogError
+from run_log.run import Entry, Run
+
+
+@dataclass(frozen=True)
+class RecordedController:
+    """One run of a controller. The dictionaries are by tick."""
+
+    run_id: str
+    config: Config
+    ticks: dict[int, Entry[m.Tick]]
+    commands: dict[int, Entry[m.Command]]
+    backups: dict[int, Entry[m.Backup]]
+    results: dict[int, Entry[m.TickResult]]
+    weights: dict[int, Entry[m.OutputWeights]]
+    keyframes: dict[int, Entry[m.Keyframe]]
+    sets: CertifiedSets | None
+    complete: bool
+    """The log holds the run to its end; if not, its last tick may lack some of its messages."""
+
+    @property
+    def last(self) -> int:
+        """The last tick, of which a log that ends early may have some messages only."""
+        ends = [max(found, default=-1) for found in (self.ticks, self.commands, self.results)]
+        return max(ends) if self.complete else min(ends)
+
+
+def recorded_controllers(run: Run) -> list[RecordedController]:
+    """In the order of the log, without strangers.
+
+    Raises:
+        LogError: two different messages of one tick, a configuration or certified sets that cannot be read.
+    """
+    return [_recorded(run, run_id) for run_id in run.controllers]
+
+
+def _recorded(run: Run, run_id: str) -> RecordedController:
+    infos = [info for info in run.run_infos if info.run_id == run_id]
+    try:
+        config = from_json(infos[0].config) if infos else run.config
+    except ConfigError as error:
+        raise LogError(f"{run.path}: {error}; the log was made by another version of Tandem") from error
+    said = [health.status for health in run.health if health.run_id == run_id]
+    return RecordedController(
+        run_id=run_id,
+        config=config,
+        ticks=_by_tick(run, run_id, topics.TICK),
+        commands=_by_tick(run, run_id, topics.COMMAND),
+        backups=_by_tick(run, run_id, topics.BACKUP),
+        results=_by_tick(run, run_id, topics.RESULT),
+        weights=_by_tick(run, run_id, topics.OUTPUT_WEIGHTS),
+        keyframes=_by_tick(run, run_id, topics.KEYFRAME),
+        sets=_sets(run, run_id),
+        # A simulation has no health; a live run that ended says so.
+        complete=not run.ends_within and (not said or "stopping" in said),
+    )
+
+
+def _by_tick(run: Run, run_id: str, topic: Topic) -> dict[int, Entry[Any]]:
+    found: dict[int, Entry[Any]] = {}
+    for entry in run.entries(topic):
+        seq = entry.message.seq
+        if entry.message.run_id == run_id and found.setdefault(seq, entry).payload != entry.payload:
+            raise LogError(
+                f"{run.path}: {topic.name} of tick {seq} is there twice, and different; "
+                f"another process spoke as {run_id}, or the log was edited"
+            )
+    return found
+
+
+def _sets(run: Run, run_id: str) -> CertifiedSets | None:
+    for entry in run.entries(topics.SETS):
+        if entry.message.run_id == run_id:
+            try:
+                return CertifiedSets.from_bytes(entry.message.content)
+            except CertificateError as error:
+                raise LogError(f"{run.path}: the certified sets of {run_id}: {error}") from error
+    return None

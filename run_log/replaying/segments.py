@@ -1,0 +1,100 @@
+"""Which ticks of a run can be replayed: those behind a keyframe, up to the next one that the log lacks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from run_log.errors import LogError
+from run_log.reading.gaps import stretches
+from run_log.replaying.recorded import RecordedController
+from run_log.run import Run
+
+NAMED = 8
+"""Tick numbers that a note lists before it says how many more there are."""
+
+
+@dataclass
+class Segments:
+    """(keyframe, last tick) of each segment in `ranges`, and a note on all that lies between them."""
+
+    start: int
+    """The keyframe at which the replay begins."""
+    ranges: list[tuple[int, int]] = field(default_factory=list)
+    lost: int = 0
+    """Ticks that cannot be replayed, or not be compared whole."""
+    notes: list[str] = field(default_factory=list)
+
+
+def replayable(run: Run, recorded: RecordedController, from_tick: int | None) -> Segments:
+    """The segments from the nearest keyframe before `from_tick` on; None: from the first keyframe of the log.
+
+    Raises:
+        LogError: there is no keyframe before `from_tick`.
+    """
+    segments = _begin(run, recorded, from_tick)
+    last, begin = recorded.last, segments.start
+    missing = (seq for seq in range(begin + 1, last + 1) if seq not in recorded.ticks)
+    # A missing tick ends a segment: what the controller knew after it is known again at the next keyframe.
+    for gap, length in stretches(missing):
+        if gap <= begin:
+            continue
+        if gap > begin + 1:
+            segments.ranges.append((begin, gap - 1))
+        later = [seq for seq in recorded.keyframes if gap < seq < last and seq + 1 in recorded.ticks]
+        begin = min(later, default=last)
+        segments.lost += begin - gap + 1
+        way = (
+            f"replay goes on at tick {begin + 1}, behind the next keyframe"
+            if later
+            else "there is no keyframe behind it to go on from"
+        )
+        segments.notes.append(
+            f"gap of {length} tick{'s' * (length > 1)} at tick {gap} of {recorded.run_id}: the recorder lost them; "
+            f"{way}{run.unreadable}"
+        )
+    if begin < last:
+        segments.ranges.append((begin, last))
+    _note_uncompared(run, recorded, segments)
+    return segments
+
+
+def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Segments:
+    """Where to begin, and a note on what comes before it."""
+    wanted = 0 if from_tick is None else from_tick
+    before = [seq for seq in recorded.keyframes if seq < wanted]
+    if before:
+        return Segments(max(before))
+    later = min((seq for seq in recorded.keyframes if seq < recorded.last), default=None)
+    missing = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log"
+    unknown = f"{missing}: the controller's memory is not known there"
+    if from_tick is not None:
+        way = "" if later is None else f"; the first one is after tick {later}: use --from-tick {later + 1}"
+        raise LogError(f"{run.path}: {unknown}{way}{run.unreadable}")
+    segments = Segments(recorded.last if later is None else later)
+    # What comes before the first keyframe of a part is in the part before this one as well.
+    if run.part == 1 or later is None:
+        way = "none of it can be replayed" if later is None else f"replay begins at tick {later + 1}"
+        segments.lost = sum(seq <= segments.start for seq in recorded.ticks)
+        segments.notes.append(f"{unknown}; {way}{run.unreadable}")
+    return segments
+
+
+def _note_uncompared(run: Run, recorded: RecordedController, segments: Segments) -> None:
+    """Ticks that are replayed although the log lacks something that they are compared with."""
+    every, end = recorded.config.controller.keyframe_every, recorded.last + recorded.complete
+    replayed = [seq for begin, last in segments.ranges for seq in range(begin + 1, last + 1)]
+    uncompared: set[int] = set()
+    for name, expected, found in (
+        ("command", replayed, recorded.commands),
+        ("result", replayed, recorded.results),
+        ("keyframe", [seq for seq in replayed if (seq + 1) % every == 0 and seq < end], recorded.keyframes),
+    ):
+        absent = [seq for seq in expected if seq not in found]
+        uncompared.update(absent)
+        if absent:
+            more = f" and {len(absent) - NAMED} more" if len(absent) > NAMED else ""
+            segments.notes.append(
+                f"not compared, the recorder lost them: {name} of tick {', '.join(map(str, absent[:NAMED]))}{more} "
+                f"of {recorded.run_id}{run.unreadable}"
+            )
+    segments.lost += len(uncompared)

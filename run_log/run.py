@@ -1,0 +1,136 @@
+"""A run in memory: every message of it decoded, beside its exact bytes. Read from a log, or never in a file at all."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from lbmpc.plants import Plant, get_plant
+from node_runtime.config.sections import Config
+from protocol import codec, topics
+from protocol import messages as m
+from protocol.topics import Topic
+from run_log.errors import LogError
+
+M = TypeVar("M", bound=m.Message)
+
+
+@dataclass(frozen=True)
+class Entry(Generic[M]):
+    """One message as it was logged."""
+
+    log_time: int
+    """ns; Unix time of arrival for a live run, virtual time for a simulated one."""
+    payload: bytes
+    message: M
+
+
+class Messages(Generic[M]):
+    """Of one topic, or of several in the order of their times: an attribute of a `Run`."""
+
+    def __init__(self, *of: Topic):
+        self._of = of
+
+    def __get__(self, run: Run, owner: type[Run]) -> list[M]:
+        entries = [entry for topic in self._of for entry in run.entries(topic)]
+        if len(self._of) > 1:
+            entries.sort(key=lambda entry: entry.log_time)
+        return [entry.message for entry in entries]
+
+
+@dataclass
+class Run:
+    """All that a log says. The lists are in the order of the log; `entries` has the bytes as well."""
+
+    path: Path
+    config: Config
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    streams: dict[str, list[Entry[Any]]] = field(default_factory=dict)
+    """By topic name."""
+    bad: dict[str, int] = field(default_factory=dict)
+    """Logged payloads that are no valid messages, by topic and reason."""
+    strangers: dict[str, int] = field(default_factory=dict)
+    """Messages on keys that are no topic of ours, by key."""
+    truncated: bool = False
+    recovered: bool = False
+    part: int = 1
+    """Which one of its run's logs this is (`run_log.writing.parts`)."""
+    continued: str | None = None
+    """Name of the next one; None: this is the last, or was cut short."""
+    note: str = ""
+    """What a person should know about the file, e.g. where it was cut."""
+
+    plant_states = Messages[m.PlantState](topics.PLANT_STATE)
+    commands = Messages[m.Command](topics.COMMAND)
+    ticks = Messages[m.Tick](topics.TICK)
+    results = Messages[m.TickResult](topics.RESULT)
+    timings = Messages[m.TickTiming](topics.TIMING)
+    output_weights = Messages[m.OutputWeights](topics.OUTPUT_WEIGHTS)
+    hidden_weights = Messages[m.HiddenWeights](topics.HIDDEN_WEIGHTS)
+    keyframes = Messages[m.Keyframe](topics.KEYFRAME)
+    health = Messages[m.Health](*topics.HEALTH.values())
+    _sample_batches = Messages[m.Samples](topics.SAMPLES)
+    _all_run_infos = Messages[m.RunInfo](*topics.RUN_INFO.values())
+
+    def entries(self, topic: Topic) -> list[Entry[Any]]:
+        return self.streams.get(topic.name, [])
+
+    @property
+    def samples(self) -> list[m.Sample]:
+        return [sample for batch in self._sample_batches for sample in batch.samples]
+
+    @property
+    def run_infos(self) -> list[m.RunInfo]:
+        """One for each process incarnation, the first that it sent."""
+        first: dict[str, m.RunInfo] = {}
+        for info in self._all_run_infos:
+            first.setdefault(info.run_id, info)
+        return list(first.values())
+
+    @property
+    def controllers(self) -> list[str]:
+        """Runs with ticks, in order, without strangers.
+
+        A stranger said nothing of itself (no info, health or keyframe), or has no tick that one of its own results is
+        of, by the checksum in the result. Where that is so of all, nobody is one.
+        """
+        spoke = {x.run_id for x in (*self.run_infos, *self.health, *self.keyframes)}
+        sums: dict[tuple[str, int], set[int]] = {}
+        for entry in self.entries(topics.TICK):
+            sums.setdefault((entry.message.run_id, entry.message.seq), set()).add(zlib.crc32(entry.payload))
+        answered = {r.run_id for r in self.results if r.tick_crc32 in sums.get((r.run_id, r.seq), ())}
+        ticked = list(dict.fromkeys(run_id for run_id, _seq in sums))
+        known = [run_id for run_id in ticked if run_id in spoke]
+        return [run_id for run_id in known if run_id in answered] or known or ticked
+
+    @property
+    def ends_within(self) -> bool:
+        """The log ends while its run goes on: the last tick may lack some of its messages."""
+        return self.truncated or self.recovered or self.continued is not None
+
+    @property
+    def unreadable(self) -> str:
+        """What ends a sentence about something that the log lacks: it may be there, and be no valid message."""
+        found = ", ".join(f"{count} {what}" for what, count in self.bad.items())
+        return f". In the log but not readable: {found}" if found else ""
+
+
+def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], path: str | Path = "") -> Run:
+    """A `Run` of messages that never were in a file: (topic, message, log_time in ns)."""
+    run = Run(Path(path), config)
+    for topic, message, log_time in messages:
+        run.streams.setdefault(topic.name, []).append(Entry(log_time, codec.encode(message), message))
+    return run
+
+
+def plant_of(run: Run) -> Plant:
+    """The plant that the run is about. Raises `LogError` when this Tandem does not have it."""
+    try:
+        return get_plant(run.config.plant.model)
+    except KeyError as error:
+        raise LogError(
+            f"{run.path}: {error.args[0]} The log needs the plant that it was made with."
+        ) from error

@@ -1,0 +1,72 @@
+"""A log says its format first, and a reader refuses a format that it does not know, in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Header
+from mcap.writer import Writer
+
+from node_runtime.config.sections import Config, override
+from run_log.errors import LogError
+from run_log.file_format import FORMAT, IDENTITY, PROFILE, VERSIONS, check_header
+from run_log.reading.reader import read_run
+from run_log.reading.recover import recover
+from tests.helpers.run_log_samples import synthetic, write
+
+
+def log_of(path: Path, library: str) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile=PROFILE, library=library)
+        writer.finish()
+    return path
+
+
+def stated(path: Path) -> tuple[str, str]:
+    """The library in the header, and the format in the metadata."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        (identity,) = (record for record in reader.iter_metadata() if record.name == IDENTITY)
+        return reader.get_header().library, identity.metadata["format"]
+
+
+def test_a_log_says_its_format_and_recovery_keeps_it(tmp_path: Path) -> None:
+    config = override(Config(), ["log.chunk_bytes=8192"])
+    whole = write(tmp_path / "run.mcap", config, synthetic(config, 30)[1])
+    library, number = stated(whole)
+    assert library.startswith("tandem log 1; mcap-python/")
+    assert number == "1"
+    cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+    cut.write_bytes(whole.read_bytes()[:-1000])
+    recover(cut, saved)
+    assert stated(saved) == (library, number)
+    assert read_run(saved).ticks == read_run(whole).ticks
+
+
+def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    path = log_of(tmp_path / "x.mcap", f"tandem log {FORMAT + 1}; mcap-python/9.9")
+    said = rf"x\.mcap: is a log of format {FORMAT + 1}, and this version reads format {FORMAT}; it needs a newer Tandem"
+    with pytest.raises(LogError, match=said):
+        read_run(path)
+    with pytest.raises(LogError, match=said):
+        recover(path, tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_log_of_an_older_format_names_the_version_that_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a later Tandem says of today's logs, should it no longer read them."""
+    monkeypatch.setitem(VERSIONS, 2, "0.2.0")
+    monkeypatch.setattr("run_log.file_format.READABLE", (2, 3))
+    with pytest.raises(
+        LogError, match=r"format 1, and this version reads format 2, 3; Tandem 0\.1\.0 reads it"
+    ):
+        check_header(Path("old.mcap"), Header(profile=PROFILE, library="tandem log 1; mcap-python/1.6.0"))
+
+
+@pytest.mark.parametrize("library", ["", "tandem log", "tandem log one; x", "another; tandem log 1; x"])
+def test_a_header_without_a_format_is_refused(tmp_path: Path, library: str) -> None:
+    with pytest.raises(LogError, match="says no format of a log of Tandem"):
+        read_run(log_of(tmp_path / "x.mcap", library))

@@ -1,0 +1,1 @@
+"""Programs beside a run that send what must not be obeyed."""
