@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -126,32 +127,20 @@ def build_model(config: Config) -> Model:
         raise ConfigError(f"controller: {error}") from error
 
 
-class TimedSolver:
-    """A solver, and how long its last solve took: for the log, never for a decision."""
+class TimedSolver(Solver):
+    """Knows how long its last solve took: for the log, never for a decision."""
 
-    def __init__(self, solver: Solver):
-        self._solver = solver
-        self.seconds = 0.0
+    seconds = 0.0
 
-    def solve(
-        self,
-        x: np.ndarray,
-        oracle_parameters: np.ndarray,
-        warm_start: np.ndarray,
-        *,
-        first: Box | None = None,
-    ) -> Solution:
+    def solve(self, *args: Any, **options: Any) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.solve(x, oracle_parameters, warm_start, first=first)
+        solution = super().solve(*args, **options)
         self.seconds = time.perf_counter() - before
         return solution
 
-    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
-        self._solver.prepare(x, oracle_parameters, warm_start)
-
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.feedback(x, first)
+        solution = super().feedback(x, first)
         self.seconds = time.perf_counter() - before
         return solution
 
@@ -184,7 +173,7 @@ def build_controller(
     except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
-    solver = TimedSolver(Solver(problem, chosen.max_iterations, chosen.tolerance, realise))
+    solver = TimedSolver(problem, chosen.max_iterations, chosen.tolerance, realise)
     problem.oracle.compile(realise)
     controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
     _warm_up(controller, solver, config.seed)
