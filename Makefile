@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper bench test compose-test remote-test faults fuzz soak lint format clean
+.PHONY: help setup run simulate paper bench test compose-test wheel-test remote-test faults fuzz soak lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -16,7 +16,7 @@ setup: $(READY)  ## a virtual environment in .venv with everything in it
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[trainer,log,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[trainer,log,experiment,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
@@ -29,13 +29,16 @@ paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html: a
 	$(BIN)/tandem experiment paper --out paper $(ARGS)
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
-	$(BIN)/tandem bench solver --document docs/performance.md $(ARGS)
+	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)
 
 test: $(READY)  ## all tests
 	$(BIN)/pytest $(ARGS)
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s tests/compose/live_compose.py $(ARGS)
+
+wheel-test: $(READY)  ## the wheel, built and installed in bare environments, in an empty folder: some minutes
+	$(BIN)/pytest -x -s tests/packaging/live_wheel.py $(ARGS)
 
 remote-test: $(READY)  ## docs/remote.md to the letter, the trainer in another network namespace: 2 minutes; needs root
 	$(BIN)/pytest -x -s tests/remote/live_remote.py $(ARGS)

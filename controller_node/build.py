@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,6 +26,7 @@ from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture
+from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
@@ -33,20 +35,8 @@ SHORTEST_WATCH = 8
 
 
 def build_plant(config: Config) -> Plant:
-    """The plant named by the configuration. Raises `ConfigError`."""
-    try:
-        return get_plant(config.plant.model)
-    except KeyError as error:
-        raise ConfigError(f"plant.model: {error.args[0]}") from error
-
-
-def initial_state(config: Config, plant: Plant) -> np.ndarray:
-    """x0 in the plant's own units, (d,). Raises `ConfigError`."""
-    if config.plant.x0 is None:
-        return plant.x0.copy()
-    if len(config.plant.x0) != plant.d:
-        raise ConfigError(f"plant.x0 has {len(config.plant.x0)} entries, {plant.name} has {plant.d} states")
-    return np.array(config.plant.x0, dtype=float)
+    """The plant named by the configuration, whose lengths fit it. Raises `ConfigError`."""
+    return plant_of(config, get_plant)
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
@@ -82,9 +72,8 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
         chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)
-        unknown = [name for name in chosen if name not in names]
-        if unknown or not chosen:
-            raise ConfigError(f"l2nw.variables: {unknown or 'empty'}; choose from {', '.join(names)}")
+        if not chosen:
+            raise ConfigError(f"l2nw.variables: empty; choose from {', '.join(names)}")
         indices = tuple(names.index(name) for name in chosen)
         settings = config.l2nw
         return L2nwOracle(
@@ -138,32 +127,20 @@ def build_model(config: Config) -> Model:
         raise ConfigError(f"controller: {error}") from error
 
 
-class TimedSolver:
-    """A solver, and how long its last solve took: for the log, never for a decision."""
+class TimedSolver(Solver):
+    """Knows how long its last solve took: for the log, never for a decision."""
 
-    def __init__(self, solver: Solver):
-        self._solver = solver
-        self.seconds = 0.0
+    seconds = 0.0
 
-    def solve(
-        self,
-        x: np.ndarray,
-        oracle_parameters: np.ndarray,
-        warm_start: np.ndarray,
-        *,
-        first: Box | None = None,
-    ) -> Solution:
+    def solve(self, *args: Any, **options: Any) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.solve(x, oracle_parameters, warm_start, first=first)
+        solution = super().solve(*args, **options)
         self.seconds = time.perf_counter() - before
         return solution
 
-    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
-        self._solver.prepare(x, oracle_parameters, warm_start)
-
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         before = time.perf_counter()
-        solution = self._solver.feedback(x, first)
+        solution = super().feedback(x, first)
         self.seconds = time.perf_counter() - before
         return solution
 
@@ -196,7 +173,7 @@ def build_controller(
     except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
-    solver = TimedSolver(Solver(problem, chosen.max_iterations, chosen.tolerance, realise))
+    solver = TimedSolver(problem, chosen.max_iterations, chosen.tolerance, realise)
     problem.oracle.compile(realise)
     controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
     _warm_up(controller, solver, config.seed)

@@ -24,14 +24,16 @@ import numpy as np
 from lbmpc.model import Model
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
+from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
+from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
 SLACK = 3e-4
-SHIPPED = Path(__file__).resolve().parent.parent / "configs" / "sets"
+SHIPPED = shipped("sets")
 Kind = Literal["given", "box", "hull", "regions"]
 PREFERRED: tuple[Kind, ...] = ("regions", "hull", "box")
 """What is looked for where no file is named: the largest first."""
@@ -235,9 +237,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
 
 def start_of(config: Config, model: Model) -> np.ndarray:
     """x0 of the configuration in deviation coordinates, (d,)."""
-    plant = model.plant
-    x0 = plant.x0 if config.plant.x0 is None else np.array(config.plant.x0, dtype=float)
-    return np.asarray(x0 - plant.x_e)
+    return np.asarray(initial_state(config, model.plant) - model.plant.x_e)
 
 
 def _sets_for(model: Model, path: Path) -> CertifiedSets:

@@ -6,13 +6,11 @@ import logging
 import os
 import threading
 
-import numpy as np
-
 from lbmpc.plants import PlantError, get_plant
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.plant import initial_state, plant_of
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
 from node_runtime.provenance import run_info
@@ -37,16 +35,8 @@ NOTES: dict[InputSource, str] = {
 
 def build(config: Config, run_id: str) -> PlantSim:
     """The plant that the configuration names. Raises `ConfigError`."""
-    try:
-        plant = get_plant(config.plant.model)
-    except KeyError as error:
-        raise ConfigError(f"plant.model: {error.args[0]}") from None
-    x0 = plant.x0 if config.plant.x0 is None else np.array(config.plant.x0, dtype=float)
-    if x0.shape != plant.x0.shape:
-        raise ConfigError(
-            f"plant.x0 has {len(x0)} entries; {plant.name} has {plant.d} states: {', '.join(plant.states)}"
-        )
-    return PlantSim(plant, config.period, x0, config.plant.plan_patience, run_id)
+    plant = plant_of(config, get_plant)
+    return PlantSim(plant, config.period, initial_state(config, plant), config.plant.plan_patience, run_id)
 
 
 class PlantNode:

@@ -1,6 +1,6 @@
 """What a person reads (rich) and what a program reads (one JSON object on standard output).
 
-rich is imported when something is shown: every process comes by here, and most show nothing.
+What it needs is imported when something is shown: every process comes by here, and most show nothing.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress, ProgressColumn
 
 
 class Refused(Exception):
@@ -26,8 +25,16 @@ def console(as_json: bool) -> Console:
     return Console(stderr=as_json, highlight=False, soft_wrap=False)
 
 
+def say(console: Console, *lines: str, style: str | None = None) -> None:
+    """Lines for a person as they are: nothing in them is markup, and none is broken."""
+    for text in lines:
+        console.print(text, style=style, markup=False, soft_wrap=True)
+
+
 def emit(result: Mapping[str, Any]) -> None:
     """One JSON object on standard output; NaN becomes null, which JSON has."""
+    import msgspec
+
     sys.stdout.write(msgspec.json.encode(result, enc_hook=_plain).decode() + "\n")
     sys.stdout.flush()
 
@@ -39,6 +46,33 @@ def complain(text: str, as_json: bool) -> None:
     Console(stderr=True, highlight=False).print(f"tandem: {text}", style="red", markup=False, soft_wrap=True)
     if as_json:
         emit({"error": text})
+
+
+def progress_bar(console: Console) -> Progress:
+    """A bar of things done, on a terminal."""
+    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+
+    return _bar(console, MofNCompleteColumn(), TimeRemainingColumn())
+
+
+def share_bar(console: Console) -> Progress:
+    """A bar of shares of a whole, on a terminal."""
+    from rich.progress import TaskProgressColumn, TimeElapsedColumn
+
+    return _bar(console, TaskProgressColumn(), TimeElapsedColumn())
+
+
+def _bar(console: Console, *columns: ProgressColumn) -> Progress:
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *columns,
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+    )
 
 
 def _plain(value: object) -> Any:

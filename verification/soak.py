@@ -142,7 +142,7 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
     readings: dict[str, list[tuple[float, int]]] = {}
     with stalls.watched(folder / "stalls.txt", Config().realtime.priority):
         running = subprocess.Popen(
-            [sys.executable, "-m", "tandem", *words],
+            [sys.executable, "-P", "-m", "tandem", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -181,7 +181,8 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
     with tempfile.TemporaryDirectory() as folder, Router(config):
         file = Path(folder) / "fleet.toml"
         file.write_text(to_toml(config))
-        command = [sys.executable, "-m", "tandem", "trainer", "--plants", "plant*", "--config", str(file)]
+        words = ("trainer", "--plants", "plant*", "--config", str(file))
+        command = [sys.executable, "-P", "-m", "tandem", *words]
         with zenoh.open(session_config("client", endpoint, 10_000)) as session:
             arrived: list[tuple[str, bytes, float]] = []
             declared = _serve(session, controllers, arrived)

@@ -23,8 +23,8 @@ def of(supervisor: int) -> Iterator[tuple[str, Path]]:
             continue
         if int(entry.name) == supervisor:
             yield "supervisor", entry
-        elif parent == supervisor and b"tandem.live.child" in words:
-            command = words[words.index(b"tandem.live.child") + 2].decode()
+        elif parent == supervisor and b"tandem.child" in words:
+            command = words[words.index(b"tandem.child") + 2].decode()
             yield NAMES.get(command, command), entry
 
 

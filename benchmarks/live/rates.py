@@ -195,7 +195,7 @@ def _replayed(log: Path) -> str:
 
 def _tandem(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "tandem", *arguments],
+        [sys.executable, "-P", "-m", "tandem", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

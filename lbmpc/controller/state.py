@@ -54,12 +54,3 @@ class ControllerState:
             float(arrays["delay"][0]),
             oracle,
         )
-
-
-def same_memory(a: ControllerState, b: ControllerState) -> str | None:
-    """Name of the first array that differs between two states, bit for bit, or None."""
-    left, right = a.to_arrays(), b.to_arrays()
-    for name in sorted(left.keys() | right.keys()):
-        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
-            return name
-    return None

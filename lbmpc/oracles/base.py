@@ -168,15 +168,3 @@ def follow_symbols(s: ca.MX, u: ca.MX, after: ca.MX) -> ca.MX:
 def by_point(slopes: list[ca.MX]) -> list[ca.MX]:
     """From the slopes of n points along each variable, (d, n) each, to the Jacobian of each point."""
     return [ca.horzcat(*columns) for columns in zip(*(ca.horzsplit(slope) for slope in slopes), strict=True)]
-
-
-def function(oracle: Oracle) -> ca.Function:
-    """(s, u, theta) -> (h_hat (d,), Jacobian (d, D + m)) as a CasADi function, for tests."""
-    s, u = ca.MX.sym("s", oracle.d + remembered(oracle)), ca.MX.sym("u", oracle.m)
-    theta = ca.MX.sym("theta", oracle.parameters)
-    su = ca.vertcat(s, u)
-    parts = oracle.split(theta)
-    (jacobian,) = oracle.jacobians(su, parts)
-    return ca.Function(
-        "oracle", [s, u, theta], [oracle.value(su, parts), jacobian], ["s", "u", "theta"], ["h", "J"]
-    )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lbmpc.plants import get_plant
 from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
+from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
@@ -45,10 +46,10 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         punctual(min(READER_PRIORITY, config.realtime.priority), silent=True) as punctuality,
     ):
         try:
-            plant = get_plant(config.plant.model)
+            plant = plant_of(config, get_plant)
             writer = PartedLog(config, plant, now=clock.now(), start_ns=time.time_ns())
-        except (LogError, KeyError) as error:
-            log.error("%s", error.args[0])
+        except (LogError, ConfigError) as error:
+            log.error("%s", error)
             return EXIT_CANNOT
         if writer.error is not None:
             log.error("%s; trying again every %d ms", writer.error, config.log.flush_ms)

@@ -1,45 +1,77 @@
-"""What every command of `tandem` has, and what every command with a configuration has."""
+"""What every command of `tandem` has, and what every command with a configuration has.
+
+A command's file holds its arguments and what it does. Its imports stand in the functions that need them: all commands
+are loaded for `tandem --help`, and each process loads only what it needs.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import UseAppendAction, arg
 
+from tandem import terminal
+
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lbmpc.plants import Plant
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
+OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
+"""Those of the extras. Where one is missing, the command ends with a message."""
+NO_SETS, INTERRUPTED = 3, 130
+"""Exit codes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """What every command has."""
 
+    EXTRAS: ClassVar[str] = ""
+    """What must be installed for it, as in pip install 'tandem-control[EXTRAS]'."""
+
     json: bool = False
     """Print the result as one JSON object on standard output, and nothing else there."""
 
     def run(self) -> int:
-        """Do it; returns the exit code. Raises `ConfigError` or `Refused` for what cannot be done."""
+        """Do it; returns the exit code. Raises `ConfigError`, `LogError` or `Refused` for what cannot be done."""
         raise NotImplementedError
+
+    @cached_property
+    def console(self) -> Console:
+        """Where a person reads."""
+        return terminal.console(self.json)
+
+    def say(self, *lines: str, style: str | None = None) -> None:
+        """Lines for a person, as they are."""
+        terminal.say(self.console, *lines, style=style)
+
+    def emit(self, result: Mapping[str, Any]) -> None:
+        """The result as one JSON object, where `--json` asks for it."""
+        if self.json:
+            terminal.emit(result)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Configured(Command):
     """A command that reads a configuration."""
 
+    KEYS: ClassVar[tuple[tuple[str, str], ...]] = ()
+    """(option, key of the configuration that it stands for). An option of None changes nothing."""
+
     config: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped values)")
     ] = None
-    """Configuration in TOML; see configs/compressor.toml."""
+    """Configuration in TOML; `tandem config show` prints one with all keys."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Change one value of the configuration."""
-
-    def flags(self) -> dict[str, tuple[str, Any]]:
-        """Options that stand for a configuration key: option -> (key, value or None)."""
-        return {}
 
     def resolve(self) -> tuple[Config, dict[str, Any]]:
         """The configuration: file, then --set, then the command's options. And the tree as it was given."""
@@ -48,16 +80,31 @@ class Configured(Command):
 
         tree = load_tree(self.config)
         origins = {apply_override(tree, text): f"--set {text}" for text in self.set}
-        for option, (key, value) in self.flags().items():
-            if value is not None:
-                *tables, last = key.split(".")
-                table = tree
-                for name in tables:
-                    table = table.setdefault(name, {})
-                    if not isinstance(table, dict):
-                        raise ConfigError(
-                            f"{self.config}: {name} is a table: write [{name}] and its keys below"
-                        )
-                table[last] = value
-                origins[key] = option
+        for option, key in self.KEYS:
+            value = getattr(self, option)
+            if value is None:
+                continue
+            *tables, last = key.split(".")
+            table = tree
+            for name in tables:
+                table = table.setdefault(name, {})
+                if not isinstance(table, dict):
+                    raise ConfigError(f"{self.config}: {name} is a table: write [{name}] and its keys below")
+            table[last] = str(value) if isinstance(value, Path) else value
+            origins[key] = f"--{option}"
         return from_tree(tree, str(self.config or "configuration"), origins), tree
+
+    def resolve_with_plant(self) -> tuple[Config, Plant]:
+        """The configuration, and the plant that it names and fits."""
+        from lbmpc.plants import get_plant
+        from node_runtime.config.plant import plant_of
+
+        config, _ = self.resolve()
+        return config, plant_of(config, get_plant)
+
+
+def require(*packages: str) -> None:
+    """Raises `ModuleNotFoundError` for a package that would be missed late, or in another process only."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -2,105 +2,103 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-import msgspec
+from tyro.conf import Positional, arg
 
 from tandem import terminal
-from tandem.commands.various import log_packages, progress_bar
+from tandem.commands.base import Command
 from tandem.terminal import Refused
 
-SHIPPED = Path(__file__).resolve().parents[2] / "configs" / "experiments"
 
+@dataclass(frozen=True, kw_only=True)
+class Experiment(Command):
+    """Run an experiment, `paper` or a file of your own, and report it on one page; `list` says which there are."""
 
-def files() -> dict[str, Path]:
-    """The shipped experiments, by name."""
-    return {path.stem: path for path in sorted(SHIPPED.glob("*.toml"))}
+    EXTRAS = "experiment"
 
+    what: Annotated[Positional[str], arg(metavar="NAME|FILE.toml|list")]
+    """A shipped experiment, your own file ("Experiments" in the documentation), or `list`."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(needed, except for list)")] = None
+    """Where the report goes. An experiment that was interrupted goes on from what lies there."""
+    quick: bool = False
+    """Few seeds, states and values: whether everything works, in minutes."""
+    jobs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
+    """Runs at the same time; the figures do not depend on it."""
+    only: Annotated[str | None, arg(metavar="GROUP", help_behavior_hint="(default: all)")] = None
+    """One group of the experiment."""
 
-def show_list(as_json: bool) -> int:
-    from tandem.experiments.experiment import overview
-    from tandem.experiments.study.declaration import load
+    def run(self) -> int:
+        if self.what == "list":
+            return self._list()
+        if self.out is None:
+            raise Refused("--out DIR is missing: where should the report go?")
+        return self._run(self.out)
 
-    console = terminal.console(as_json)
-    told = []
-    for name, path in files().items():
-        about = overview(load(path))
-        told.append(about)
-        console.print(f"{name}: {about['title']}", markup=False, soft_wrap=True)
-        console.print(f"  groups: {', '.join(about['groups'])}", style="dim", markup=False, soft_wrap=True)
-    if not told:
-        raise Refused(
-            f"no experiment is shipped with this installation; name a file of your own ({SHIPPED} is empty)"
-        )
-    if as_json:
-        terminal.emit({"experiments": told})
-    return 0
+    def _list(self) -> int:
+        from tandem.experiments.experiment import overview
+        from tandem.experiments.study.declaration import load
 
+        told = []
+        for name, path in _shipped_files().items():
+            about = overview(load(path))
+            told.append(about)
+            self.say(f"{name}: {about['title']}")
+            self.say(f"  groups: {', '.join(about['groups'])}", style="dim")
+        if not told:
+            raise Refused("no experiment is shipped with this installation; name a file of your own")
+        self.emit({"experiments": told})
+        return 0
 
-def find(what: str) -> Path:
-    """A shipped name, or a file. Raises `Refused`."""
-    shipped = files()
-    if what in shipped:
-        return shipped[what]
-    path = Path(what)
-    if path.suffix == ".toml" or path.exists():
-        return path
-    near = difflib.get_close_matches(what, shipped, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(shipped) or 'none'}"
-    raise Refused(f"no experiment is called {what!r}; {hint} Or name a file, FILE.toml")
+    def _run(self, out: Path) -> int:
+        """Run it, and leave report.html, summary.json and logs in `out`."""
+        import msgspec
 
-
-def run(what: str, out: Path, quick: bool, jobs: int | None, only: str | None, as_json: bool) -> int:
-    """Run it, and leave report.html, summary.json and logs in `out`."""
-    with log_packages():
+        from controller_node.build import build_plant
         from tandem.experiments import experiment
         from tandem.experiments.study.declaration import load
         from tandem.experiments.study.runner import RunnerError
-    from run_log.errors import LogError
-    from tandem.checks import plant_of
 
-    if jobs is not None and jobs < 1:
-        raise Refused(f"--jobs {jobs}: at least 1")
-    path = find(what)
-    declared = load(path)
-    plant = plant_of(experiment.settings(declared, str(path)))
-    name = what if what in files() else path.name
-    command = f"tandem experiment {name} --out DIR" + (" --quick" if quick else "")
-    processes = jobs or len(os.sched_getaffinity(0))
-    console, began = terminal.console(as_json), time.monotonic()
-    with progress_bar(console) as bar:
-        tasks = {}
+        if self.jobs is not None and self.jobs < 1:
+            raise Refused(f"--jobs {self.jobs}: at least 1")
+        path = _find(self.what)
+        declared = load(path)
+        plant = build_plant(experiment.settings(declared, str(path)))
+        name = self.what if self.what in _shipped_files() else path.name
+        command = f"tandem experiment {name} --out DIR" + (" --quick" if self.quick else "")
+        processes = self.jobs or len(os.sched_getaffinity(0))
+        began = time.monotonic()
+        with terminal.progress_bar(self.console) as bar:
+            tasks = {}
 
-        def progress(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
+            def progress(stage: str, done: int, total: int) -> None:
+                if stage not in tasks:
+                    tasks[stage] = bar.add_task(stage, total=total)
+                bar.update(tasks[stage], completed=done, total=total)
 
-        try:
-            made = experiment.run(
-                declared, str(path), plant, out, processes, command, quick, only, progress=progress
-            )
-        except (RunnerError, LogError) as error:
-            raise Refused(str(error)) from error
-        except OSError as error:
-            raise Refused(f"{error.filename or out}: cannot be written: {error.strerror}") from error
-        except KeyboardInterrupt:
-            console.print(
-                f"interrupted; finished runs are kept in {out}: the same command goes on from there",
-                markup=False,
-                soft_wrap=True,
-            )
-            raise
-    seconds = time.monotonic() - began
-    console.print(f"{len(made.rows)} runs in {seconds:.0f} s", markup=False)
-    for file in (made.report, made.summary):
-        console.print(f"wrote {file}", markup=False, soft_wrap=True)
-    if as_json:
-        terminal.emit(
+            try:
+                made = experiment.run(
+                    *(declared, str(path), plant, out, processes, command),
+                    quick=self.quick,
+                    only=self.only,
+                    progress=progress,
+                )
+            except RunnerError as error:
+                raise Refused(str(error)) from error
+            except OSError as error:
+                raise Refused(f"{error.filename or out}: cannot be written: {error.strerror}") from error
+            except KeyboardInterrupt:
+                text = f"interrupted; finished runs are kept in {out}: the same command goes on from there"
+                self.say(text)
+                raise
+        seconds = time.monotonic() - began
+        self.say(f"{len(made.rows)} runs in {seconds:.0f} s")
+        self.say(*(f"wrote {file}" for file in (made.report, made.summary)))
+        self.emit(
             {
                 "report": str(made.report),
                 "summary": str(made.summary),
@@ -109,4 +107,25 @@ def run(what: str, out: Path, quick: bool, jobs: int | None, only: str | None, a
                 "rows": msgspec.to_builtins(made.rows),
             }
         )
-    return 0
+        return 0
+
+
+def _shipped_files() -> dict[str, Path]:
+    """The shipped experiments, by name."""
+    from node_runtime.config.shipped import shipped
+
+    return {path.stem: path for path in sorted(shipped("experiments").glob("*.toml"))}
+
+
+def _find(what: str) -> Path:
+    """A shipped name, or a file. Raises `Refused`."""
+    from node_runtime.config.strict import did_you_mean
+
+    files = _shipped_files()
+    if what in files:
+        return files[what]
+    path = Path(what)
+    if path.suffix == ".toml" or path.exists():
+        return path
+    hint = did_you_mean(what, files, f"there are {', '.join(files) or 'none'}")
+    raise Refused(f"no experiment is called {what!r}; {hint} Or name a file, FILE.toml")

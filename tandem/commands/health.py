@@ -3,25 +3,67 @@
 from __future__ import annotations
 
 import sys
-import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, get_args
 
-from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
-from node_runtime.config.sections import Config
-from node_runtime.lifecycle import new_run_id
-from node_runtime.realtime import clock
-from protocol import codec, topics
-from protocol.messages import Health
+from tyro.conf import Positional, arg
+
+from node_runtime.config.literals import ProcessName
 from tandem import terminal
+from tandem.commands.base import Configured
+
+if TYPE_CHECKING:
+    from node_runtime.config.sections import Config
+    from protocol import messages
 
 WELL = ("ready", "running")
 
 
-def ask(config: Config, process: str, seconds: float) -> Health | None:
+@dataclass(frozen=True, kw_only=True)
+class Health(Configured):
+    """Ask the bus how a process is: exit code 0 when it is ready or running, 1 when not. Made for health checks."""
+
+    process: Annotated[Positional[ProcessName], arg(metavar="|".join(get_args(ProcessName)))]
+    """Which process."""
+    seconds: Annotated[float, arg(metavar="S")] = 3.0
+    """How long to listen; a process speaks twice a second."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        return answer(config, self.process, self.seconds, self.json)
+
+
+def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
+    """Say how the process is; 0 when it is ready or running, 1 when it is not or says nothing."""
+    health = ask(config, process, seconds)
+    if health is None:
+        text = f"{process}: not heard of for {seconds:g} s at {config.bus.endpoint}"
+        if not as_json:
+            sys.stdout.write(text + "\n")
+        else:
+            terminal.emit({"process": process, "status": None, "error": text})
+        return 1
+    if as_json:
+        fields = ("process", "run_id", "status", "note", "counters")
+        terminal.emit({name: getattr(health, name) for name in fields})
+    else:
+        sys.stdout.write(": ".join(filter(None, (process, health.status, health.note))) + "\n")
+    return 0 if health.status in WELL else 1
+
+
+def ask(config: Config, process: str, seconds: float) -> messages.Health | None:
     """The next `Health` of a process; None when it says nothing for `seconds`, or no router answers.
 
     Raises:
         ConfigError: the endpoint is none.
     """
+    import threading
+
+    from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
+    from node_runtime.lifecycle import new_run_id
+    from node_runtime.realtime import clock
+    from protocol import codec, messages, topics
+
     topic = topics.HEALTH[process]
     deadline = clock.now() + seconds
     stop = threading.Event()
@@ -39,28 +81,10 @@ def ask(config: Config, process: str, seconds: float) -> Health | None:
                     message = codec.decode(topic, delivery.payload)
                 except codec.BadMessage:
                     continue
-                if isinstance(message, Health):
+                if isinstance(message, messages.Health):
                     return message
     except OpenInterrupted:
         pass
     finally:
         timer.cancel()
     return None
-
-
-def run(config: Config, process: str, seconds: float, as_json: bool) -> int:
-    """Say how the process is; 0 when it is ready or running, 1 when it is not or says nothing."""
-    health = ask(config, process, seconds)
-    if health is None:
-        text = f"{process}: not heard of for {seconds:g} s at {config.bus.endpoint}"
-        if not as_json:
-            sys.stdout.write(text + "\n")
-        else:
-            terminal.emit({"process": process, "status": None, "error": text})
-        return 1
-    if as_json:
-        fields = ("process", "run_id", "status", "note", "counters")
-        terminal.emit({name: getattr(health, name) for name in fields})
-    else:
-        sys.stdout.write(": ".join(filter(None, (process, health.status, health.note))) + "\n")
-    return 0 if health.status in WELL else 1

@@ -1,103 +1,161 @@
-"""`tandem keys`: what it says of the certificates that it makes and finds."""
+"""`tandem keys`: certificates for links that leave the machine."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.table import Table
-from rich.text import Text
+from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
-from node_runtime.config.sections import PLANT_NAME
-from node_runtime.tls.credentials import WARN_DAYS
-from protocol.rights import ROLES, rights_of
-from tandem import certificate_authority, terminal
-from tandem.certificate_authority import AUTHORITY_FOLDER, Issued
+from tandem.commands.base import Command
 from tandem.terminal import Refused
 
-PLANT = re.compile(PLANT_NAME)
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from tandem.certificate_authority import Issued
+
+ROLE = "router|plant|controller|trainer|recorder|operator"
 
 
-def create(plant: str, hosts: Sequence[str], out: Path | None, days: int, as_json: bool) -> int:
-    """Make them; 0."""
-    if not PLANT.fullmatch(plant):
-        raise Refused(f"--plant {plant}: at most 40 letters, digits, _ and -, as `name` in the configuration")
-    folder = out or Path("keys") / plant
-    made = certificate_authority.create(plant, hosts, folder, days)
-    console = terminal.console(as_json)
-    _show(made, as_json)
-    router = next(one for one in made if one.role == "router")
-    for text in (
-        f"The router answers to {', '.join(router.hosts)}; --host adds others.",
-        f"Each machine gets its own roles' folders and nothing else. {folder / AUTHORITY_FOLDER / 'key.pem'} can make "
-        "any of these: it is needed to renew one and never to run, so keep it elsewhere.",
-    ):
-        console.print(text, markup=False, soft_wrap=True)
-    return 0
+class Shows(Command):
+    """A command that shows certificates."""
 
+    def _show(self, there: list[Issued]) -> None:
+        from rich.table import Table
 
-def renew(
-    roles: Sequence[str], folder: Path, hosts: Sequence[str], days: int, authority: Path | None, as_json: bool
-) -> int:
-    """Make some anew; 0."""
-    for role in roles:
-        if role not in ROLES:
-            raise Refused(f"--role {role}: one of {', '.join(ROLES)}")
-    if not roles:
-        raise Refused(f"--role is missing: one of {', '.join(ROLES)}")
-    console = terminal.console(as_json)
-    renewed = []
-    for role in roles:
-        old, new = certificate_authority.renew(
-            role, folder, hosts if role == "router" or len(roles) == 1 else [], days, authority
-        )
-        renewed.append(new)
-        console.print(
-            f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}, was {old.valid_until:%Y-%m-%d}. Copy the folder to "
-            f"the {role}'s machine and start the {role} again. The old certificate works until its end.",
-            markup=False,
-            soft_wrap=True,
-        )
-    if as_json:
-        terminal.emit({"certificates": [_plain(one) for one in renewed]})
-    return 0
+        from node_runtime.tls.credentials import WARN_DAYS
+        from protocol.rights import ROLES
 
-
-def show(folder: Path, as_json: bool) -> int:
-    """What there is; 0, or 1 when one has expired."""
-    there = certificate_authority.found(folder)
-    _show(there, as_json)
-    return 1 if any(one.days_left < 0 for one in there) else 0
-
-
-def _show(there: list[Issued], as_json: bool) -> None:
-    console = terminal.console(as_json)
-    for plant in dict.fromkeys(one.plant for one in there):
-        table = Table(title=f"keys of {plant}", title_justify="left", show_lines=True)
-        table.add_column("role", no_wrap=True)
-        table.add_column("may", ratio=1)
-        for head in ("valid until", "SHA-256"):
-            table.add_column(head, no_wrap=True)
+        for plant in dict.fromkeys(one.plant for one in there):
+            table = Table(title=f"keys of {plant}", title_justify="left", show_lines=True)
+            table.add_column("role", no_wrap=True)
+            table.add_column("may", ratio=1)
+            for head in ("valid until", "SHA-256"):
+                table.add_column(head, no_wrap=True)
+            for one in there:
+                if one.plant == plant:
+                    table.add_row(*_row(one))
+            self.console.print(table)
         for one in there:
-            if one.plant == plant:
-                table.add_row(*_row(one))
-        console.print(table)
-    for one in there:
-        if one.days_left < WARN_DAYS:
-            end = "has expired" if one.days_left < 0 else f"expires in {one.days_left:.0f} days"
-            how = (
-                f"`tandem keys renew --role {one.role}`"
-                if one.role in ROLES
-                else "`tandem keys create` again"
+            if one.days_left < WARN_DAYS:
+                end = "has expired" if one.days_left < 0 else f"expires in {one.days_left:.0f} days"
+                how = (
+                    f"`tandem keys renew --role {one.role}`"
+                    if one.role in ROLES
+                    else "`tandem keys create` again"
+                )
+                self.say(f"{one.folder}: {end}; {how}", style="yellow")
+        self.emit({"certificates": [_plain(one) for one in there]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeysCreate(Shows):
+    """Make a private authority for one plant, and with it one certificate a role."""
+
+    plant: Annotated[str, arg(metavar="NAME")]
+    """The plant's name, as `name` in the configuration."""
+    host: Annotated[UseAppendAction[list[str]], arg(metavar="NAME|IP")] = field(default_factory=list)
+    """A name or address under which other machines reach the router. May be given several times."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: keys/NAME)")] = None
+    """Where they go; must not exist yet."""
+    days: Annotated[int, arg(metavar="N")] = 365
+    """How long the roles' certificates are valid; the authority's is for ten years."""
+
+    def run(self) -> int:
+        from node_runtime.config.sections import PLANT_NAME
+        from tandem import certificate_authority
+
+        if not re.fullmatch(PLANT_NAME, self.plant):
+            raise Refused(
+                f"--plant {self.plant}: at most 40 letters, digits, _ and -, as `name` in the configuration"
             )
-            console.print(f"{one.folder}: {end}; {how}", style="yellow", markup=False, soft_wrap=True)
-    if as_json:
-        terminal.emit({"certificates": [_plain(one) for one in there]})
+        folder = self.out or Path("keys") / self.plant
+        made = certificate_authority.create(self.plant, self.host, folder, self.days)
+        self._show(made)
+        router = next(one for one in made if one.role == "router")
+        authority_key = folder / certificate_authority.AUTHORITY_FOLDER / "key.pem"
+        self.say(
+            f"The router answers to {', '.join(router.hosts)}; --host adds others.",
+            f"Each machine gets its own roles' folders and nothing else. {authority_key} can make any of these: it is "
+            "needed to renew one and never to run, so keep it elsewhere.",
+        )
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeysRenew(Command):
+    """Make one role's key and certificate anew, from the authority that there is."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """The plant's folder: keys/NAME."""
+    role: Annotated[UseAppendAction[list[str]], arg(metavar=ROLE)] = field(default_factory=list)
+    """Whose. May be given several times."""
+    host: Annotated[UseAppendAction[list[str]], arg(metavar="NAME|IP")] = field(default_factory=list)
+    """A further name or address of the router."""
+    authority: Annotated[
+        Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: FOLDER/authority)")
+    ] = None
+    """Where the authority's certificate and key are, if they are kept elsewhere."""
+    days: Annotated[int, arg(metavar="N")] = 365
+    """How long it is valid."""
+
+    def run(self) -> int:
+        from protocol.rights import ROLES
+        from tandem import certificate_authority
+
+        for role in self.role:
+            if role not in ROLES:
+                raise Refused(f"--role {role}: one of {', '.join(ROLES)}")
+        if not self.role:
+            raise Refused(f"--role is missing: one of {', '.join(ROLES)}")
+        renewed = []
+        for role in self.role:
+            hosts = self.host if role == "router" or len(self.role) == 1 else []
+            old, new = certificate_authority.renew(role, self.folder, hosts, self.days, self.authority)
+            renewed.append(new)
+            self.say(
+                f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}, was {old.valid_until:%Y-%m-%d}. Copy the "
+                f"folder to the {role}'s machine and start the {role} again. The old certificate works until its end.",
+            )
+        self.emit({"certificates": [_plain(one) for one in renewed]})
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeysShow(Shows):
+    """Say what each certificate's holder may do, and until when. Exit code 1 when one has expired."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("keys")
+    """A role's folder, a plant's, or that of all plants."""
+
+    def run(self) -> int:
+        """0, or 1 when one has expired."""
+        from tandem import certificate_authority
+
+        there = certificate_authority.found(self.folder)
+        self._show(there)
+        return 1 if any(one.days_left < 0 for one in there) else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeysCommand:
+    """Certificates for links that leave the machine: create, renew, show."""
+
+    action: (
+        Annotated[KeysCreate, subcommand("create")]
+        | Annotated[KeysRenew, subcommand("renew")]
+        | Annotated[KeysShow, subcommand("show")]
+    )
 
 
 def _row(one: Issued) -> list[Text]:
+    from rich.text import Text
+
+    from node_runtime.tls.credentials import WARN_DAYS
+
     # As Text: in a plain string rich would take `:CD:` in a fingerprint for the name of a picture.
     end = Text(f"{one.valid_until:%Y-%m-%d}\n")
     end.append(f"{one.days_left:.0f} days", style="bold red" if one.days_left < WARN_DAYS else "")
@@ -105,6 +163,9 @@ def _row(one: Issued) -> list[Text]:
 
 
 def _may(role: str) -> list[str]:
+    from protocol.rights import ROLES, rights_of
+    from tandem.certificate_authority import AUTHORITY_FOLDER
+
     if role == AUTHORITY_FOLDER:
         return ["make certificates of all roles; may do nothing on the bus itself"]
     if role not in ROLES:
@@ -122,6 +183,8 @@ def _may(role: str) -> list[str]:
 
 
 def _plain(one: Issued) -> dict[str, Any]:
+    from protocol.rights import ROLES, rights_of
+
     plain: dict[str, Any] = {
         "role": one.role,
         "plant": one.plant,

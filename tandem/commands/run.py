@@ -3,126 +3,155 @@
 from __future__ import annotations
 
 import os
-import socket
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import msgspec
-from rich.console import Console
-from rich.status import Status
+from tyro.conf import arg
 
-from controller_node.build import build_model
-from controller_node.guarantee import guarantee
-from node_runtime.config.sections import Config, to_toml
-from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
-from run_log.errors import LogError
-from run_log.reading.reader import read_run
-from run_log.reporting import report
-from run_log.reporting.summary import summarise
-from run_log.writing.parts import existing_parts
-from tandem import summary_table, terminal
-from tandem.checks import plant_of
-from tandem.live.files import RunFiles, claimed
-from tandem.live.monitor import Monitor, Snapshot
-from tandem.live.screen import Screen
-from tandem.live.supervisor import Impatient, StartError, Supervisor, Wish, wishes
+from node_runtime.config.literals import OracleName
+from tandem import terminal
+from tandem.commands.base import FROM_CONFIG, INTERRUPTED, Configured, require
 
-INTERRUPTED = 130
+if TYPE_CHECKING:
+    from node_runtime.config.sections import Config
+    from tandem.live.files import RunFiles
+    from tandem.live.monitor import Monitor, Snapshot
+    from tandem.live.supervisor import Wish
 
 
-def run(config: Config, seconds: float, endpoint_given: bool, as_json: bool, trainer: bool = True) -> int:
-    """Run everything for `seconds` from the first command; returns the exit code.
+@dataclass(frozen=True, kw_only=True)
+class Run(Configured):
+    """Run router, recorder, trainer, plant and controller here, watch them, and leave a log and a picture."""
 
-    trainer: False: it runs elsewhere.
+    EXTRAS = "trainer,log"
+    KEYS = (("oracle", "controller.oracle"), ("rate", "rate"), ("seed", "seed"), ("log", "log.path"))
 
-    Raises:
-        Refused: there is nothing to run, or no place for the log.
-        ConfigError: the configuration does not fit the plant.
-    """
-    if not seconds > config.period:
-        raise terminal.Refused(f"--seconds {seconds:g}: less than one period of {config.period:g} s")
-    plant = plant_of(config)
-    console = terminal.console(as_json)
-    said = guarantee(config, build_model(config))
-    with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
-        for text in moved:
-            console.print(text, style="dim", markup=False, soft_wrap=True)
-        console.print(said, markup=False, soft_wrap=True)
-        bus = config.bus if endpoint_given else msgspec.structs.replace(config.bus, endpoint=_free_endpoint())
-        log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
-        # A run is a new experiment: it begins with what the configuration says and nothing else.
-        controller = msgspec.structs.replace(config.controller, checkpoint="")
-        resolved = msgspec.structs.replace(config, bus=bus, log=log, controller=controller)
-        files.config.write_text(to_toml(resolved), encoding="utf-8")
-        monitor = Monitor(resolved, plant, seconds)
+    seconds: Annotated[float, arg(metavar="S")] = 20.0
+    """How long, counted from the first command."""
+    oracle: Annotated[
+        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+    ] = None
+    """What the controller learns with."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
+    """Samples a second."""
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
+    """Of everything random."""
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
+    """The log; a file of that name is moved aside, never overwritten. The picture lies beside it."""
+    no_trainer: bool = False
+    """Start no trainer here: it comes from another machine ("Put the trainer on another machine" in the
+    documentation), or not at all."""
+
+    def run(self) -> int:
+        """Run everything for `seconds` from the first command."""
+        config, given = self.resolve()
+        if not self.seconds > config.period:
+            raise terminal.Refused(f"--seconds {self.seconds:g}: less than one period of {config.period:g} s")
+        import msgspec
+
+        from controller_node.build import build_model, build_plant
+        from controller_node.guarantee import guarantee
+        from node_runtime.config.sections import to_toml
+        from tandem.live.files import claimed
+        from tandem.live.monitor import Monitor
+        from tandem.live.supervisor import Impatient, StartError, trains, wishes
+
+        require("zstandard", "matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
+        plant = build_plant(config)
+        said = guarantee(config, build_model(config))
+        with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
+            self.say(*moved, style="dim")
+            self.say(said)
+            endpoint = config.bus.endpoint if "endpoint" in given.get("bus", {}) else _free_endpoint()
+            bus = msgspec.structs.replace(config.bus, endpoint=endpoint)
+            log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
+            # A run is a new experiment: it begins with what the configuration says and nothing else.
+            controller = msgspec.structs.replace(config.controller, checkpoint="")
+            resolved = msgspec.structs.replace(config, bus=bus, log=log, controller=controller)
+            files.config.write_text(to_toml(resolved), encoding="utf-8")
+            monitor = Monitor(resolved, plant, self.seconds)
+            try:
+                trouble, logged = self._supervise(resolved, files, monitor, wish)
+            except StartError as error:
+                terminal.complain(f"{error}\nAll output is in {files.folder}.", self.json)
+                return 2 if error.exit_code == 2 else 1
+            except Impatient:
+                text = f"ended at once, everything was killed; {files.log} may be cut short"
+                terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", self.json)
+                return INTERRUPTED
+            return self._conclude(files, trouble, logged, monitor.first_command is not None)
+
+    def _supervise(
+        self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
+    ) -> tuple[str | None, bool]:
+        """Why the run ended badly, or None; and whether its log is whole."""
+        from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
+        from tandem.live.screen import Screen
+        from tandem.live.supervisor import Supervisor
+
+        priority = min(READER_PRIORITY, config.realtime.priority)
+        with Screen(self.console, monitor.new_events) as screen, punctual(priority, silent=True):
+            garbage = GarbageCollection()
+            garbage.begin()
+
+            def show(now: Snapshot) -> None:
+                screen.show(now)
+                garbage.idle()
+
+            supervisor = Supervisor(
+                config, files.config, files.folder, monitor, wish, show, not self.no_trainer
+            )
+            trouble = supervisor.run()
+            return trouble, not supervisor.recorder_died
+
+    def _conclude(self, files: RunFiles, trouble: str | None, logged: bool, began: bool) -> int:
+        """Figures and picture from the log alone."""
+        from run_log.errors import LogError
+        from run_log.reading.reader import read_run
+        from run_log.reporting import report
+        from run_log.reporting.summary import summarise
+        from run_log.writing.parts import existing_parts
+        from tandem import summary_table
+
+        if trouble is None and not logged:
+            trouble = (
+                f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
+            )
+        if trouble is None and not began:
+            trouble = "stopped before the first command"
+        result: dict[str, Any] = {}
         try:
-            trouble, logged = _supervise(resolved, files, monitor, wish, console, trainer)
-        except StartError as error:
-            terminal.complain(f"{error}\nAll output is in {files.folder}.", as_json)
-            return 2 if error.exit_code == 2 else 1
-        except Impatient:
-            text = f"ended at once, everything was killed; {files.log} may be cut short"
-            terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", as_json)
-            return INTERRUPTED
-        return _conclude(files, console, trouble, logged, monitor.first_command is not None, as_json)
-
-
-def _supervise(
-    config: Config, files: RunFiles, monitor: Monitor, wish: Wish, console: Console, trainer: bool
-) -> tuple[str | None, bool]:
-    """Why the run ended badly, or None; and whether its log is whole."""
-    priority = min(READER_PRIORITY, config.realtime.priority)
-    with Screen(console, monitor.new_events) as screen, punctual(priority, silent=True):
-        garbage = GarbageCollection()
-        garbage.begin()
-
-        def show(now: Snapshot) -> None:
-            screen.show(now)
-            garbage.idle()
-
-        supervisor = Supervisor(config, files.config, files.folder, monitor, wish, show, trainer)
-        trouble = supervisor.run()
-        return trouble, not supervisor.recorder_died
-
-
-def _conclude(
-    files: RunFiles, console: Console, trouble: str | None, logged: bool, began: bool, as_json: bool
-) -> int:
-    """Figures and picture from the log alone."""
-    if trouble is None and not logged:
-        trouble = f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
-    if trouble is None and not began:
-        trouble = "stopped before the first command"
-    result: dict[str, Any] = {}
-    try:
-        with Status("reading the log and drawing", console=console):
-            parts = existing_parts(files.log)
-            ran = read_run(parts[0] if parts else files.log)
-            summary = summarise(ran)
-            picture = report.picture(ran, files.picture)
-    except LogError as error:
-        trouble = f"{trouble}\n{error}" if trouble else str(error)
-    else:
-        result = summary_table.of(summary)
-        console.print(summary_table.table(summary))
-        console.print(f"picture {_near(picture)}", markup=False, soft_wrap=True)
-        for part in parts:
-            console.print(f"replay  tandem replay {_near(part)}", markup=False, soft_wrap=True)
-        if len(parts) > 1:
-            text = f"the log has {len(parts)} parts; table and picture are of the first, {_near(parts[0])}"
-            console.print(text, style="yellow", markup=False, soft_wrap=True)
-        elif ran.note:
-            console.print(ran.note, style="yellow", markup=False, soft_wrap=True)
-    if trouble is not None:
-        terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
-        result = {"error": trouble, **result}
-    if as_json:
-        terminal.emit(result)
-    return 0 if trouble is None else 1
+            with self.console.status("reading the log and drawing"):
+                parts = existing_parts(files.log)
+                ran = read_run(parts[0] if parts else files.log)
+                summary = summarise(ran)
+                picture = report.picture(ran, files.picture)
+        except LogError as error:
+            trouble = f"{trouble}\n{error}" if trouble else str(error)
+        else:
+            result = summary_table.of(summary)
+            self.console.print(summary_table.table(summary))
+            self.say(f"picture {_near(picture)}")
+            self.say(*(f"replay  tandem replay {_near(part)}" for part in parts))
+            if len(parts) > 1:
+                text = (
+                    f"the log has {len(parts)} parts; table and picture are of the first, {_near(parts[0])}"
+                )
+                self.say(text, style="yellow")
+            elif ran.note:
+                self.say(ran.note, style="yellow")
+        if trouble is not None:
+            terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
+            result = {"error": trouble, **result}
+        self.emit(result)
+        return 0 if trouble is None else 1
 
 
 def _free_endpoint() -> str:
     """A loopback port that nobody listens on at this moment."""
+    import socket
+
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -43,6 +43,12 @@ TABLE = (
 STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
 
 
+def command_line(command: str, config: Path) -> list[str]:
+    """Starts a tandem command that ends when this process does, and imports nothing from the current folder."""
+    child = (sys.executable, "-P", "-m", "tandem.child", str(os.getpid()))
+    return [*child, command, "--config", str(config)]
+
+
 class Child:
     """A process of the table, running in a process group of its own, its output in a file."""
 
@@ -52,10 +58,7 @@ class Child:
         self.started_at = 0.0
         """Of the newest start, seconds on the monotonic clock."""
         self._output = folder / f"{process.name}.txt"
-        self._command = [
-            *(sys.executable, "-m", "tandem.live.child", str(os.getpid())),
-            *(process.command, "--config", str(config)),
-        ]
+        self._command = command_line(process.command, config)
         self._running: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:

@@ -15,11 +15,10 @@ import pytest
 
 from controller_node.codegen.compiler import Compiler
 from lbmpc.casadi_buffers import Bound
-from lbmpc.oracles.base import function
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem
 from tests.helpers.paths import ROOT
-from tests.helpers.science import compressor, oracle_named, trained_theta
+from tests.helpers.science import compressor, function, oracle_named, trained_theta
 
 MODEL = compressor()
 

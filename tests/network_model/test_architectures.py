@@ -20,7 +20,6 @@ from lbmpc.oracles import DnnOracle, HiddenSet, Verdict
 from lbmpc.oracles.base import follow
 from lbmpc.plants import Truth
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.ipopt_reference import ReferenceSolver
 from lbmpc.solver.problem import build_problem
 from lbmpc.solver.solution import Status
 from network_model import architectures, registry
@@ -32,6 +31,7 @@ from protocol import topics
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import summarise
 from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.ipopt_reference import ReferenceSolver
 from tests.helpers.paths import DOCS
 from tests.helpers.science import compressor, describe
 from tests.network_model.test_parity import check_parity
@@ -197,10 +197,10 @@ def test_every_field_is_in_the_hash_and_that_of_an_mlp_is_what_it_always_was() -
     ],
 )
 def test_a_wrong_setting_is_named(settings: list[str], said: str) -> None:
-    from controller_node.build import build_controller
+    from controller_node.build import build_controller, build_model
 
     with pytest.raises(ConfigError, match=said):
-        build_controller(load(None, settings))
+        build_controller(config := load(None, settings), build_model(config))
 
 
 @pytest.mark.parametrize(("name", "window"), [("rnn", 5), ("cnn", 5)])

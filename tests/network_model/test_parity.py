@@ -15,6 +15,7 @@ from lbmpc.oracles.dnn.oracle import DnnOracle
 from network_model.description import NetworkDescription
 from network_model.operations import BOUNDED, Activation
 from network_model.registry import architecture_names, get_architecture
+from tests.helpers.science import function
 from trainer_node.network import Network
 
 ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
@@ -74,11 +75,11 @@ def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) 
     slopes = [torch.autograd.grad(values[:, i].sum(), rows, retain_graph=True)[0].numpy() for i in range(d)]
 
     oracle = DnnOracle(description)
-    function, theta = oracle.function(), oracle.pack(hidden, K)
+    expressions, theta = function(oracle), oracle.pack(hidden, K)
     in_numpy = oracle.output_scale * (oracle.features_of(hidden, windows) @ K)
     for p, window in enumerate(windows):
         s, u = np.concatenate([window[-1, :d], window[:-1].ravel()]), window[-1, d:]
-        h, jacobian = (np.array(part) for part in function(s, u, theta))
+        h, jacobian = (np.array(part) for part in expressions(s, u, theta))
         # In units of the scales, so that neither a large unit nor a small one decides.
         ours = values[p].detach().numpy() / description.output_scale
         assert np.abs(h.ravel() / description.output_scale - ours).max() < 1e-12
@@ -108,10 +109,10 @@ def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> N
     hidden, K = [np.array([[0.0], [1.0], [0.0]]), np.array([[-21.0], [1.0]])], np.array([[0.0], [1.0]])
     network, oracle = Network(description, torch.float64), DnnOracle(description)
     network.load(hidden)
-    function, theta = oracle.function(), oracle.pack(hidden, K)
+    expressions, theta = function(oracle), oracle.pack(hidden, K)
     for x in (-60.0, -5.0, 0.0, 19.9, 20.1, 21.0, 30.0, 49.0, 51.0, 600.0):
         ours = network(network.tensor([[x, 0.0]]), network.tensor(K)).item()
-        assert abs(ours - float(function([x], [0.0], theta)[0])) < 1e-12
+        assert abs(ours - float(expressions([x], [0.0], theta)[0])) < 1e-12
 
 
 def test_a_controller_and_a_plant_load_neither_torch_nor_the_trainer() -> None:

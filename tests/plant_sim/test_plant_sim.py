@@ -382,7 +382,7 @@ def test_a_wrong_plant_is_a_message_for_a_person(caplog: pytest.LogCaptureFixtur
     assert node.main(live_config('plant.model="moore"')) == 2
     assert node.main(live_config("plant.x0=[1.0]")) == 2
     assert "did you mean 'moore_greitzer'?" in caplog.text
-    assert "plant.x0 has 1 entries; moore_greitzer has 4 states: z, y, r, rdot" in caplog.text
+    assert "plant.x0 has 1 entries; moore_greitzer has 4 states (z, y, r, rdot)" in caplog.text
 
 
 @pytest.mark.live

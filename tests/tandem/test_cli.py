@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,6 @@ COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
     "health",
     "config show",
-    "bench solver",
     *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {
@@ -247,3 +247,74 @@ def test_recover_makes_a_cut_log_whole(
     assert shown.returncode == 0, shown.stderr
     assert json.loads(shown.stdout)["log"] == str(tmp_path / "cut.recovered.mcap")
     assert tandem("recover", str(cut)).returncode == 2  # it is there now, and nothing is overwritten
+
+
+def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]):
+    assert called("--version") == 0
+    assert capsys.readouterr().out == f"tandem {metadata.version('tandem-control')}\n"
+
+
+WITHOUT = """
+import sys
+from importlib.machinery import PathFinder
+
+class Absent(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        if name.partition(".")[0] == sys.argv[1]:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent)
+from tandem.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+"""A command, as it is where one package is not installed."""
+
+
+@pytest.mark.parametrize(
+    ("package", "command", "extras"),
+    [
+        ("torch", "run --seconds 1", "trainer,log"),
+        ("torch", "trainer", "trainer"),
+        ("torch", "simulate --steps 2", "trainer,log"),
+        ("mcap", "run --seconds 1", "trainer,log"),
+        ("mcap", "record --log x.mcap", "log"),
+        ("mcap", "simulate --steps 2", "trainer,log"),
+        ("mcap", "replay x.mcap", "log"),
+        ("mcap", "recover x.mcap", "log"),
+        ("zstandard", "run --seconds 1", "trainer,log"),
+        ("zstandard", "simulate --steps 2 --log x.mcap", "trainer,log"),
+        ("zstandard", "record --log x.mcap", "log"),
+        ("zstandard", "replay x.mcap", "log"),
+        ("matplotlib", "run --seconds 1", "trainer,log"),
+        ("matplotlib", "report x.mcap", "log"),
+        ("matplotlib", "sets plot x.json", "log"),
+        ("matplotlib", "experiment list", "experiment"),
+        ("jinja2", "experiment paper --out paper", "experiment"),
+    ],
+)
+def test_a_package_that_is_missing_names_the_extra(package: str, command: str, extras: str, tmp_path: Path):
+    shown = subprocess.run(
+        [sys.executable, "-c", WITHOUT, package, *command.split()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert shown.returncode == 2, shown.stderr
+    assert shown.stderr.count("tandem: ") == 1
+    assert shown.stderr.endswith(f"this command needs {package}: pip install 'tandem-control[{extras}]'\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_extras_a_linear_run_needs_no_torch(tmp_path: Path):
+    shown = subprocess.run(
+        [sys.executable, "-c", WITHOUT, "torch", *["simulate", "--steps", "2", "--oracle", "linear"]],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert shown.returncode == 0, shown.stderr

@@ -18,22 +18,6 @@ def project_columns(K: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     return K * np.where(norms > bounds, bounds / np.where(norms > bounds, norms, 1.0), 1.0)
 
 
-def adapt(K: np.ndarray, phi: np.ndarray, error: np.ndarray, gamma: float, bounds: np.ndarray) -> np.ndarray:
-    """One step of the law, as the paper writes it. The tick calls `.last_layer`, which is held to this.
-
-    Args:
-        K: output weights K_t, (n, d).
-        phi: features phi_j(x_t, u_t) of the hidden weights in force when u_t was applied, (n,), phi[0] = 1.
-        error: xtilde_{t+1} = h_hat_t(x_t, u_t) - h(x_t, u_t), (d,), in the units of K' phi.
-        gamma: learning rate, 0 < gamma < 1.
-        bounds: Wbar_i, (d,), in the same units.
-
-    Returns:
-        K_{t+1}, (n, d).
-    """
-    return project_columns(K - (gamma / (phi @ phi)) * np.outer(phi, error), bounds)
-
-
 def refit(K: np.ndarray, phi: np.ndarray, h: np.ndarray, ridge: float, bounds: np.ndarray) -> np.ndarray:
     """The output weights that explain n samples best under new features, then projected.
 

@@ -90,10 +90,6 @@ class DnnOracle(NetworkExpressions):
     def theta(self, state: OracleState) -> np.ndarray:
         return self.pack(self.hidden(state), state["K"])
 
-    def features(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """phi_j(x, u) with the past in this state, (1 + n_L,), with phi[0] = 1."""
-        return self.features_of(self.hidden(state), np.vstack([self.past(state), np.concatenate([x, u])]))
-
     def compile(self, realise: Realise) -> None:
         """Let `realise` turn what every tick calls into something faster; the virtual machine runs it otherwise."""
         self._last_layer = LastLayer(self, self.gamma, self.bounds, realise)

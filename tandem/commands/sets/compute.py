@@ -6,138 +6,140 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-from rich.console import Console
-from rich.progress import TaskID
-from rich.table import Table
+from tyro.conf import arg
 
-from controller_node.build import build_model
-from controller_node.certified_sets import (
-    CertifiedSets,
-    Found,
-    Kind,
-    SavedArrays,
-    Work,
-    default_cache,
-    read_sets,
-    start_of,
-    write_sets,
-)
-from lbmpc.model import Model
-from lbmpc.sets.certificate import Certificate, CertificateError
-from lbmpc.sets.check import check
-from lbmpc.sets.construct import construct, volume_fraction
-from lbmpc.sets.enclosures.disturbance import DisturbanceError
-from lbmpc.sets.geometry.polytope import SetError
-from lbmpc.sets.guard import Guard
-from node_runtime.config.sections import Config
 from tandem import terminal
-from tandem.checks import plant_of
-from tandem.commands.sets.check import HAIR, REFUSED, sample, share_bar
+from tandem.commands.base import NO_SETS, Configured
 from tandem.terminal import Refused
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.progress import TaskID
+    from rich.table import Table
+
+    from controller_node.certified_sets import CertifiedSets, Kind
+    from lbmpc.model import Model
 
 WARNING_SAMPLES = 20_000
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """What the sets are for."""
+@dataclass(frozen=True, kw_only=True)
+class SetsCompute(Configured):
+    """Compute sets in which the true plant can be kept for ever, have them checked, and write them to a file."""
 
-    model: Model
-    start: np.ndarray
-    W: np.ndarray | None
-    slack: float
-    fresh: bool
-    cache: Path
+    kind: Annotated[
+        Literal["regions", "hull", "box", "given", "all"], arg(metavar="regions|hull|box|given|all")
+    ] = "regions"
+    """What is known of the model error h: its bound as a box, as a hull, by regions around a way from x0 as well, or
+    given as controller.W. `all`: box, hull and regions in one table, and the last one written."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("sets.json")
+    """Where the sets go; gzipped where the name ends in .gz."""
+    slack: Annotated[float, arg(metavar="SHARE")] = 3e-4
+    """Room beyond W, as a share of X's half-widths: more ends sooner, with smaller sets."""
+    fresh: bool = False
+    """Take nothing from the cache."""
 
+    def run(self) -> int:
+        """0: written; 3: there are no such sets, and why."""
+        config, _ = self.resolve()
+        import numpy as np
 
-def run(config: Config, kinds: Sequence[Kind], out: Path, slack: float, fresh: bool, as_json: bool) -> int:
-    """0: written; 3: there are no such sets, and why. Raises `Refused`, `ConfigError`."""
-    if not 0.0 < slack < 1.0:
-        raise Refused(f"--slack {slack:g}: a share between 0 and 1")
-    if out.is_dir():
-        raise Refused(f"{out}: is a folder; name a file")
-    plant_of(config)
-    model = build_model(config)
-    W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
-    asked = _Asked(model, start_of(config, model), W, slack, fresh, default_cache())
-    console = terminal.console(as_json)
-    made: list[tuple[Kind, CertifiedSets | str, bool]] = []
-    for kind in kinds:
-        try:
-            sets, cached = _one(asked, kind, as_json, console)
-            made.append((kind, sets, cached))
-        except (SetError, DisturbanceError) as error:
-            made.append((kind, str(error), False))
-        except OSError as error:
-            raise Refused(f"{error.filename or asked.cache}: cannot be written: {error.strerror}") from error
-    results = [_result(kind, sets, cached) for kind, sets, cached in made]
-    good = [sets for _, sets, _ in made if isinstance(sets, CertifiedSets)]
-    if good:
-        try:
-            write_sets(good[-1], out)
-        except OSError as error:
-            raise Refused(f"{out}: cannot be written: {error.strerror}") from error
-        results[[s for _, s, _ in made].index(good[-1])]["file"] = str(out)
-        console.print(_table(results))
-        console.print(_meaning(good[-1], asked), markup=False, soft_wrap=True)
-        console.print(f"wrote {out}", markup=False, soft_wrap=True)
-    for kind, reason, _ in made:
-        if isinstance(reason, str):
-            terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
-    if as_json:
-        terminal.emit(results[0] if len(results) == 1 else {"sets": results})
-    return 0 if len(good) == len(made) else REFUSED
+        from controller_node.build import build_model
+        from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
+        from lbmpc.sets.enclosures.disturbance import DisturbanceError
+        from lbmpc.sets.geometry.polytope import SetError
 
+        if not 0.0 < self.slack < 1.0:
+            raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
+        if self.out.is_dir():
+            raise Refused(f"{self.out}: is a folder; name a file")
+        model = build_model(config)
+        W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
+        start = start_of(config, model)
+        kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)
+        made: list[tuple[Kind, CertifiedSets | str, bool]] = []
+        for kind in kinds:
+            try:
+                made.append((kind, *self._one(kind, model, start, W)))
+            except (SetError, DisturbanceError) as error:
+                made.append((kind, str(error), False))
+            except OSError as error:
+                where = error.filename or default_cache()
+                raise Refused(f"{where}: cannot be written: {error.strerror}") from error
+        results = [_result(kind, sets, cached) for kind, sets, cached in made]
+        good = [sets for _, sets, _ in made if isinstance(sets, CertifiedSets)]
+        if good:
+            try:
+                write_sets(good[-1], self.out)
+            except OSError as error:
+                raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
+            results[[s for _, s, _ in made].index(good[-1])]["file"] = str(self.out)
+            self.console.print(_table(results))
+            self.say(_meaning(good[-1], model), f"wrote {self.out}")
+        for kind, reason, _ in made:
+            if isinstance(reason, str):
+                terminal.complain(f"no certified sets of kind {kind}: {reason}", as_json=False)
+        self.emit(results[0] if len(results) == 1 else {"sets": results})
+        return 0 if len(good) == len(made) else NO_SETS
 
-def _one(asked: _Asked, kind: Kind, as_json: bool, console: Console) -> tuple[CertifiedSets, bool]:
-    """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
-    work = Work.of(asked.model, kind, asked.start, asked.W, asked.slack, asked.cache)
-    if not asked.fresh and work.sets.exists():
-        try:
-            return read_sets(work.sets), True
-        except CertificateError as error:
-            console.print(f"{error}; computed again", style="yellow", markup=False, soft_wrap=True)
-    saved = SavedArrays(work.folder)
-    if asked.fresh:
-        saved.clear()
-    began = time.monotonic()
-    try:
-        certificate = _constructed(asked, kind, saved, as_json)
-    except KeyboardInterrupt:
-        console.print(
-            f"interrupted; what was done is kept in {work.folder}: the same command goes on from there",
-            markup=False,
-            soft_wrap=True,
+    def _one(
+        self, kind: Kind, model: Model, start: np.ndarray, W: np.ndarray | None
+    ) -> tuple[CertifiedSets, bool]:
+        """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
+        from controller_node.certified_sets import (
+            CertifiedSets,
+            Found,
+            SavedArrays,
+            Work,
+            default_cache,
+            read_sets,
+            write_sets,
         )
-        raise
-    seconds = time.monotonic() - began
-    with share_bar(as_json) as bar:
-        task = bar.add_task(f"{kind}: proving the claim", total=1.0)
-        verdict = check(certificate, progress=lambda done: bar.update(task, completed=done))
-    if not verdict.ok:
-        raise SetError(f"constructed, but the checker refuses it: {verdict.reason}")
-    contains = Guard(certificate).first_inputs(asked.start).piece >= 0
-    found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
-    sets = CertifiedSets.of(certificate, found)
-    write_sets(sets, work.sets)
-    return sets, False
+        from lbmpc.sets.certificate import CertificateError
+        from lbmpc.sets.check import check
+        from lbmpc.sets.construct import construct, volume_fraction
+        from lbmpc.sets.geometry.polytope import SetError
+        from lbmpc.sets.guard import Guard
 
+        work = Work.of(model, kind, start, W, self.slack, default_cache())
+        saved = SavedArrays(work.folder)
+        if self.fresh:
+            saved.clear()
+        elif work.sets.exists():
+            try:
+                return read_sets(work.sets), True
+            except CertificateError as error:
+                self.say(f"{error}; computed again", style="yellow")
+        began = time.monotonic()
+        tasks: dict[str, TaskID] = {}
+        with terminal.share_bar(self.console) as bar:
 
-def _constructed(asked: _Asked, kind: Kind, saved: SavedArrays, as_json: bool) -> Certificate:
-    tasks: dict[str, TaskID] = {}
-    with share_bar(as_json) as bar:
+            def report(what: str, share: float) -> None:
+                # "the invariant set: step 12, 340 facets" is one bar, whose text changes.
+                stage = what.split(":")[0]
+                if stage not in tasks:
+                    tasks[stage] = bar.add_task(what, total=1.0)
+                bar.update(tasks[stage], completed=share, description=f"{kind}: {what}")
 
-        def report(what: str, share: float) -> None:
-            # "the invariant set: step 12, 340 facets" is one bar, whose text changes.
-            stage = what.split(":")[0]
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(what, total=1.0)
-            bar.update(tasks[stage], completed=share, description=f"{kind}: {what}")
-
-        return construct(asked.model, kind, asked.start, asked.W, asked.slack, saved=saved, report=report)
+            try:
+                certificate = construct(model, kind, start, W, self.slack, saved=saved, report=report)
+            except KeyboardInterrupt:
+                self.say(
+                    f"interrupted; what was done is kept in {work.folder}: the same command goes on from there"
+                )
+                raise
+            seconds = time.monotonic() - began
+            proving = bar.add_task(f"{kind}: proving the claim", total=1.0)
+            verdict = check(certificate, progress=lambda done: bar.update(proving, completed=done))
+        if not verdict.ok:
+            raise SetError(f"constructed, but the checker refuses it: {verdict.reason}")
+        contains = Guard(certificate).first_inputs(start).piece >= 0
+        found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
+        sets = CertifiedSets.of(certificate, found)
+        write_sets(sets, work.sets)
+        return sets, False
 
 
 def _result(kind: Kind, sets: CertifiedSets | str, cached: bool) -> dict[str, Any]:
@@ -162,6 +164,8 @@ def _result(kind: Kind, sets: CertifiedSets | str, cached: bool) -> dict[str, An
 
 
 def _table(results: Sequence[dict[str, Any]]) -> Table:
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("W", style="bold")
     for name in ("sets", "facets", "share of X", "x0", "margin", "seconds", "certificate"):
@@ -184,7 +188,9 @@ def _table(results: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def _meaning(sets: CertifiedSets, asked: _Asked) -> str:
+def _meaning(sets: CertifiedSets, model: Model) -> str:
+    from tandem.commands.sets.sampling import HAIR, sample
+
     certificate = sets.certificate
     count = len(certificate.pieces)
     given = certificate.source_of_W == "given"
@@ -196,7 +202,7 @@ def _meaning(sets: CertifiedSets, asked: _Asked) -> str:
     if not given:
         return text + "whatever the true h does within its proved bound."
     text += "as long as h stays in the W that was given."
-    found = sample(certificate, asked.model, WARNING_SAMPLES)
+    found = sample(certificate, model, WARNING_SAMPLES)
     if found.excess > HAIR:
         text += f"\nWarning: the plant's own equations leave that W: {found.where}."
     return text

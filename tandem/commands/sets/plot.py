@@ -2,61 +2,76 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+from tyro.conf import Positional, arg
 
-from controller_node.certified_sets import CertifiedSets, read_sets
-from lbmpc.model import ModelError, build_model
-from lbmpc.plants import get_plant
-from lbmpc.sets.certificate import CertificateError, require_match
-from lbmpc.sets.geometry.polytope import SetError
 from tandem import terminal
-from tandem.commands.sets.check import REFUSED
-from tandem.commands.various import log_packages
+from tandem.commands.base import NO_SETS, Command
 from tandem.terminal import Refused
 
+if TYPE_CHECKING:
+    from controller_node.certified_sets import CertifiedSets
 
-def run(file: Path, log: Path | None, out: Path | None, as_json: bool) -> int:
-    """0: drawn; 3: the file is refused. Raises `Refused`."""
-    with log_packages():
-        from run_log.errors import LogError
+
+@dataclass(frozen=True, kw_only=True)
+class SetsPlot(Command):
+    """Draw sets: projections and slices with X, W, the tube, x0, and a run if there is one."""
+
+    EXTRAS = "log"
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """A file of certified sets."""
+    log: Annotated[Path | None, arg(name="run", metavar="LOG", help_behavior_hint="(default: none)")] = None
+    """A log whose states are laid over the sets."""
+    out: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: FILE with .png)")] = None
+    """Where the picture goes."""
+
+    def run(self) -> int:
+        """0: drawn; 3: the file is refused."""
+        import numpy as np
+
+        from controller_node.certified_sets import read_sets
+        from lbmpc.model import ModelError, build_model
+        from lbmpc.plants import get_plant
+        from lbmpc.sets.certificate import CertificateError, require_match
+        from lbmpc.sets.geometry.polytope import SetError
         from run_log.reading.reader import read_run
         from run_log.reporting.summary import trajectory
         from run_log.run import plant_of
         from tandem.commands.sets.picture import Drawn, picture
-    out = file.with_suffix("").with_suffix(".png") if out is None else out
-    try:
-        sets = read_sets(file)
-        plant = get_plant(sets.certificate.model.plant)
-        model = build_model(plant, sets.certificate.model.period)
-        require_match(sets.certificate, model)
-    except (CertificateError, ModelError) as error:
-        terminal.complain(f"refused: {error}", as_json)
-        return REFUSED
-    except KeyError as error:
-        raise Refused(f"{file}: {error.args[0]}") from error
-    states, x0 = None, plant.x0
-    if log is not None:
+
+        file, log = self.file, self.log
+        out = file.with_suffix("").with_suffix(".png") if self.out is None else self.out
         try:
+            sets = read_sets(file)
+            plant = get_plant(sets.certificate.model.plant)
+            model = build_model(plant, sets.certificate.model.period)
+            require_match(sets.certificate, model)
+        except (CertificateError, ModelError) as error:
+            terminal.complain(f"refused: {error}", self.json)
+            return NO_SETS
+        except KeyError as error:
+            raise Refused(f"{file}: {error.args[0]}") from error
+        states, x0 = None, plant.x0
+        if log is not None:
             ran = read_run(log)
             if plant_of(ran).name != plant.name:
                 raise Refused(f"{log}: is a run of {plant_of(ran).name}, and the sets are of {plant.name}")
             states = trajectory(ran, plant).x
             x0 = states[0]
-        except LogError as error:
-            raise Refused(str(error)) from error
-    try:
-        figure = picture(Drawn(sets.certificate, model, np.asarray(x0), states), _title(sets))
-        figure.savefig(out, dpi=120)
-    except SetError as error:
-        raise Refused(f"{file}: {error}") from error
-    except OSError as error:
-        raise Refused(f"{out}: cannot be written: {error.strerror}") from error
-    terminal.console(as_json).print(f"picture {out}", markup=False, soft_wrap=True)
-    if as_json:
-        terminal.emit({"picture": str(out), "sha256": sets.sha256})
-    return 0
+        try:
+            figure = picture(Drawn(sets.certificate, model, np.asarray(x0), states), _title(sets))
+            figure.savefig(out, dpi=120)
+        except SetError as error:
+            raise Refused(f"{file}: {error}") from error
+        except OSError as error:
+            raise Refused(f"{out}: cannot be written: {error.strerror}") from error
+        self.say(f"picture {out}")
+        self.emit({"picture": str(out), "sha256": sets.sha256})
+        return 0
 
 
 def _title(sets: CertifiedSets) -> str:

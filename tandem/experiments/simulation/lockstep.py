@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from controller_node.build import initial_state
 from controller_node.core import ControllerCore, Outputs
 from lbmpc.plants import Plant, PlantError
-from node_runtime.config.sections import Config, override
+from node_runtime.config.plant import initial_state
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
 from plant_sim.simulator import PlantSim
@@ -46,18 +46,13 @@ class Outcome:
     """Why the true motion could not be followed to the end; None when it could."""
 
 
-def simulate(config: Config, steps: int, adapt_only: bool = False, progress: Progress | None = None) -> Run:
+def simulate(config: Config, steps: int, progress: Progress | None = None) -> Run:
     """`follow`, without faults, of a plant that is not lost.
-
-    Args:
-        adapt_only: hidden layers are never trained.
 
     Raises:
         ConfigError: the configuration admits no controller.
         PlantError: the true plant left every state from which its equations can be followed.
     """
-    if adapt_only:
-        config = override(config, ["trainer.enabled=false"])
     outcome = follow(config, steps, progress=progress)
     if outcome.lost is not None:
         raise PlantError(outcome.lost)

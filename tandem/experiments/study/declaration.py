@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, PositiveInt, Section, from_tree
-from node_runtime.config.strict import ConfigError, apply_override, load_tree, strict
+from node_runtime.config.strict import ConfigError, apply_override, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults
 
 Picture = Literal["trajectories", "states", "survival", "lemma", "recovery", "rows"]
@@ -196,13 +195,8 @@ def _x0s(declared: Declaration, case: Case, plant: Plant, where: str) -> list[li
 
 def _known(path: Path, key: str, name: str, names: list[str]) -> None:
     if name not in names:
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
-        _fail(f"{path}: {key} = {name!r} is not known; {hint}")
-
-
-def _fail(text: str) -> NoReturn:
-    raise ConfigError(text)
+        hint = did_you_mean(name, names, f"there are {', '.join(names)}")
+        raise ConfigError(f"{path}: {key} = {name!r} is not known; {hint}")
 
 
 def _merged(tree: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:

@@ -93,7 +93,8 @@ def code_version() -> str:
     root = Path(__file__).resolve().parents[3]
     for name in CODE:
         path = root / name
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+        files = [one for one in sorted(path.rglob("*")) if one.suffix in (".py", ".c")]
+        for file in files or [path]:
             digest.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
     for package, version in provenance.versions((*provenance.SCIENCE, "torch")).items():
         digest.update(f"{package} {version}\0".encode())

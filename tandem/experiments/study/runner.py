@@ -5,10 +5,12 @@ A run is the same in any process, so neither the number of processes nor an inte
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -81,9 +83,7 @@ def run_all(
     done = len(wants) - len(missing)
     if progress is not None:
         progress(done, len(wants))
-    with ProcessPoolExecutor(
-        processes, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent
-    ) as pool:
+    with _workers(processes) as pool:
         futures: list[Future[str]] = []
         try:
             for key in order:
@@ -106,6 +106,22 @@ def run_all(
     if lacking:
         raise RunnerError(f"{folder}: {lacking[0]}.json was there and is gone or cannot be read; run again")
     return {key: record for key, record in records.items() if record is not None}
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Fresh processes that leave Ctrl-C to this one and import nothing from the current folder."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        with ProcessPoolExecutor(
+            count, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent
+        ) as pool:
+            yield pool
+    finally:
+        del os.environ["PYTHONSAFEPATH"]
+        if before is not None:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def _leave_ctrl_c_to_the_parent() -> None:
@@ -160,7 +176,7 @@ def time_all(
     for case in cases:
         most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
     timings: dict[str, Timing] = {}
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent) as pool:
+    with _workers(1) as pool:
         for done, (key, case) in enumerate(by_key.items()):
             path = folder / f"{key}.json"
             try:

@@ -16,7 +16,6 @@ from lbmpc.oracles import DnnOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.plants import Truth
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.ipopt_reference import ReferenceSolver
 from lbmpc.solver.least_distance import Nearest, least_distance
 from lbmpc.solver.problem import Problem, build_problem
 from node_runtime.config.sections import Config, override
@@ -24,6 +23,7 @@ from protocol import codec, topics
 from protocol import messages as m
 from run_log.replaying.replay import replay
 from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.ipopt_reference import ReferenceSolver
 from tests.helpers.science import compressor, describe, oracle_named
 
 N = 40

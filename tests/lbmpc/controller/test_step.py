@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lbmpc.controller.signals import Observation
-from lbmpc.controller.state import ControllerState, same_memory
+from lbmpc.controller.state import ControllerState
 from lbmpc.controller.step import Controller
 from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
@@ -18,7 +18,7 @@ from lbmpc.solver.problem import build_problem
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution, Status
 from network_model.description import hash_layers
-from tests.helpers.science import compressor, describe
+from tests.helpers.science import compressor, describe, features
 
 MODEL = compressor()
 ORACLE = DnnOracle(describe(MODEL, [8, 8]))
@@ -37,6 +37,15 @@ def offered(shift: float, version: int = 1) -> HiddenSet:
     hidden = ORACLE.hidden(CONTROLLER.initial_state(0).oracle)
     layers = [(layer + shift).astype(np.float32).astype(float) for layer in hidden]
     return HiddenSet(version, layers, hash_layers(layers), ORACLE.description.sha256())
+
+
+def same_memory(a: ControllerState, b: ControllerState) -> str | None:
+    """Name of the first array that differs between two states, bit for bit, or None."""
+    left, right = a.to_arrays(), b.to_arrays()
+    for name in sorted(left.keys() | right.keys()):
+        if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
+            return name
+    return None
 
 
 def test_the_label_uses_the_input_that_was_applied_and_not_the_commanded_one() -> None:
@@ -60,7 +69,7 @@ def test_a_swap_learns_the_old_label_with_the_old_features() -> None:
     # And from then on the new features count.
     after = CONTROLLER.step(swapped, seen(X, 2))[0].oracle["K"]
     assert not np.array_equal(after, CONTROLLER.step(plain, seen(X, 2))[0].oracle["K"])
-    phi = ORACLE.features(swapped.oracle, X_NEXT, np.array([0.1]))
+    phi = features(ORACLE, swapped.oracle, X_NEXT, np.array([0.1]))
     h = X - MODEL.A @ X_NEXT - MODEL.B @ [0.1]
     error = swapped.oracle["K"].T @ phi - h / ORACLE.output_scale
     expected = swapped.oracle["K"] - ORACLE.gamma * np.outer(phi, error) / (phi @ phi)

@@ -19,7 +19,7 @@ from lbmpc.solver.problem import build_problem
 from node_runtime.config.sections import TrainerConfig
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.science import compressor, describe
+from tests.helpers.science import compressor, describe, features
 from trainer_node.network import Network
 from trainer_node.training import Trainer
 
@@ -115,7 +115,7 @@ def test_the_trainer_sees_the_window_that_the_controller_saw() -> None:
             )
             sample = msgspec.msgpack.decode(msgspec.msgpack.encode(sample), type=m.Sample)
             assert trainer.add("run", [sample]) == 1
-            phis.append(ORACLE.features(before.oracle, label.x, label.u))
+            phis.append(features(ORACLE, before.oracle, label.x, label.u))
     network = Network(ORACLE.description, torch.float64)
     network.load(trainer.hidden)
     with torch.no_grad():

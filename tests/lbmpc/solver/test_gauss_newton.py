@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from lbmpc.oracles import DnnOracle, LinearOracle
 from lbmpc.plants import Truth
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.ipopt_reference import ReferenceSolver
 from lbmpc.solver.problem import build_problem, input_set
 from lbmpc.solver.solution import Status
+from tests.helpers.ipopt_reference import ReferenceSolver
 from tests.helpers.paths import ROOT
 from tests.helpers.science import compressor, describe, oracle_named, trained_theta
 

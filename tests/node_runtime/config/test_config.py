@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from lbmpc.plants import get_plant
+from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import (
     Config,
     from_json,
@@ -19,7 +21,6 @@ from node_runtime.config.sections import (
     to_tree,
 )
 from node_runtime.config.strict import ConfigError
-from tandem.checks import plant_of
 from tests.helpers.paths import CONFIGS
 
 SHIPPED = CONFIGS / "compressor.toml"
@@ -53,7 +54,7 @@ def test_commented_values_of_the_shipped_file_are_valid():
     shown = from_tree(tomllib.loads(text))
     assert shown.plant.x0 is not None
     assert shown.controller.W is not None
-    plant = plant_of(shown)
+    plant = plant_of(shown, get_plant)
     assert shown.plant.x0 == plant.x0.tolist()
     assert pytest.approx(plant.W * shown.period) == shown.controller.W
     assert tuple(shown.l2nw.variables or ()) == plant.kernel
@@ -149,4 +150,4 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
 )
 def test_what_the_plant_does_not_have(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
-        plant_of(override(Config(), [given]))
+        plant_of(override(Config(), [given]), get_plant)

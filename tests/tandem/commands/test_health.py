@@ -49,9 +49,9 @@ def test_the_exit_code_follows_the_status(
         said.set(status, "held at x0")
         # What it said before is on nobody's way any more.
         ear.until(health_of("plant", status=status, note="held at x0"))
-        assert health.run(config, "plant", HANG_S, as_json=False) == code
+        assert health.answer(config, "plant", HANG_S, as_json=False) == code
         assert capsys.readouterr().out == f"plant: {status}: held at x0\n"
-        assert health.run(config, "plant", HANG_S, as_json=True) == code
+        assert health.answer(config, "plant", HANG_S, as_json=True) == code
         shown = json.loads(capsys.readouterr().out)
     assert (shown["process"], shown["run_id"], shown["status"]) == ("plant", "plant-1", status)
 
@@ -62,7 +62,7 @@ def test_another_process_does_not_answer_for_it(config: Config, capsys: pytest.C
         HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,
     ):
         said.set("running")
-        assert health.run(config, "trainer", 1.0, as_json=False) == 1
+        assert health.answer(config, "trainer", 1.0, as_json=False) == 1
     assert "trainer: not heard of for 1 s at tcp/127.0.0.1:" in capsys.readouterr().out
 
 
@@ -93,14 +93,18 @@ def test_garbage_is_not_health(config: Config) -> None:
 
 def test_without_a_router_it_gives_up_in_time(capsys: pytest.CaptureFixture[str]) -> None:
     began = clock.now()
-    assert health.run(live_config(), "router", 0.5, as_json=True) == 1
+    assert health.answer(live_config(), "router", 0.5, as_json=True) == 1
     assert clock.now() - began < HANG_S
     assert json.loads(capsys.readouterr().out)["status"] is None
 
 
 def test_it_loads_nothing_heavy() -> None:
     heavy = ("torch", "casadi", "scipy", "matplotlib", "mcap")
-    program = f"import sys, tandem.commands.health; print([name for name in {heavy} if name in sys.modules])"
+    program = (
+        "import sys; from node_runtime.config.sections import Config; from tandem.commands import health;"
+        "assert health.ask(Config(), 'plant', 0.05) is None;"
+        f"print([name for name in {heavy} if name in sys.modules])"
+    )
     ran = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
     )

@@ -26,7 +26,7 @@ from tandem.experiments.study.declaration import Resolved, load, resolve
 from tandem.experiments.study.plan import Job, code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
 from tandem.experiments.study.work import Record, read
-from tests.helpers.paths import CONFIGS
+from tests.helpers.paths import CONFIGS, write_namesakes
 
 PLANT = get_plant("moore_greitzer")
 SHIPPED = CONFIGS / "experiments" / "paper.toml"
@@ -287,6 +287,26 @@ def a_result(
         plan.job.key: a_record(cost, overshoot, violations) for plan, cost in zip(plans, costs, strict=True)
     }
     return results.collect(plans, records, {}, PLANT)[0]
+
+
+def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: Path) -> None:
+    small.write_text(SMALL.replace("steps = 30", "steps = 3", 1))
+    here = tmp_path / "here"
+    here.mkdir()
+    write_namesakes(here)
+    # As the installed `tandem`, whose own path begins with its folder.
+    program = "import sys; sys.path.remove(''); from tandem.cli import main; sys.exit(main())"
+    arguments = ("experiment", str(small), "--only", "rows", "--out", "out", "--jobs", "1")
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=here,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (here / "out" / "report.html").exists()
 
 
 def test_words_follow_from_the_figures() -> None:

@@ -8,7 +8,6 @@ import pytest
 from controller_node.build import build_oracle
 from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle, PerfectOracle
-from lbmpc.oracles.base import function
 from lbmpc.oracles.dnn.adaptation_law import refit
 from lbmpc.plants import PlantError, Truth, get_plant
 from node_runtime.config.sections import Config, load
@@ -18,6 +17,7 @@ from run_log.run import Run
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.simulation.lockstep import follow
 from tandem.experiments.study.lemma import measure
+from tests.helpers.science import function
 
 PLANT = get_plant("moore_greitzer")
 SETTINGS = [

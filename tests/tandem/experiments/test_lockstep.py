@@ -20,8 +20,12 @@ SEEDS = range(10)
 
 def run_summary(case: tuple[str, int, bool]) -> Summary:
     oracle, seed, adapt_only = case
-    config = load(None, [f"controller.oracle={oracle}", f"seed={seed}"])
-    return summarise(simulate(config, STEPS, adapt_only=adapt_only))
+    settings = [
+        f"controller.oracle={oracle}",
+        f"seed={seed}",
+        *(["trainer.enabled=false"] if adapt_only else []),
+    ]
+    return summarise(simulate(load(None, settings), STEPS))
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from run_log.reading.reader import read_run
 from tandem.live.files import claimed
 from tandem.terminal import Refused
 from tests.helpers.live import wait_for
+from tests.helpers.paths import write_namesakes
 
 pytestmark = pytest.mark.live
 PATIENCE_S = 180.0
@@ -30,7 +31,8 @@ SMALL = {
     "controller.horizon": "30",
     "controller.solver.compile": "never",
 }
-RUN = [sys.executable, "-m", "tandem", "run"]
+RUN = [sys.executable, "-P", "-m", "tandem", "run"]
+"""As the installed `tandem run`: it imports nothing from the current folder either."""
 
 
 def small(**more: str) -> list[str]:
@@ -164,6 +166,16 @@ def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
     assert result["ticks"] >= 1
     assert not read_run(tmp_path / "run.mcap").truncated
     assert (tmp_path / "run.png").exists()
+
+
+def test_files_in_the_current_folder_are_not_imported(tmp_path: Path):
+    write_namesakes(tmp_path)
+    with launched(tmp_path, *small()) as run:
+        run.hears("the first command")
+        run.signal(signal.SIGINT)
+        code, result = run.ends()
+    assert code == 0, run.said
+    assert "error" not in result
 
 
 def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):

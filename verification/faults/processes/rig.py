@@ -22,6 +22,7 @@ from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
+from tandem.live.processes import command_line
 from verification.faults.processes import link as links
 from verification.faults.processes.running import Event, Heard, Running
 from verification.faults.processes.scenes import Surroundings
@@ -175,8 +176,7 @@ class Rig:
                 str(self.trace),
             ]
         else:
-            child = [sys.executable, "-m", "tandem.live.child", str(os.getpid())]
-            words = [*child, COMMANDS[name], "--config", str(file)]
+            words = command_line(COMMANDS[name], file)
         return Running(name, [*prefix, *words], self._around.environment, self.folder / f"{name}.txt")
 
     def end(self) -> None:

@@ -21,7 +21,7 @@ from node_runtime.realtime import clock
 from plant_sim import node
 from plant_sim.simulator import CommandVerdict, PlantSim
 from protocol.messages import Command, PlantState
-from tandem.live.child import end_with
+from tandem.child import end_with
 
 
 class Sampled(msgspec.Struct, frozen=True, tag="sample"):

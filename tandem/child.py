@@ -1,6 +1,6 @@
 """What runs in a process that `tandem run` starts: a tandem command that ends when its supervisor does.
 
-    python -m tandem.live.child SUPERVISOR_PID COMMAND...
+    python -P -m tandem.child SUPERVISOR_PID COMMAND...
 
 A supervisor that is killed cannot stop its children, so they watch it.
 """

@@ -1,0 +1,35 @@
+"""`tandem config`: the configuration as it is resolved."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import Suppress, subcommand
+
+from tandem import terminal
+from tandem.commands.base import Configured
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfigShow(Configured):
+    """Print the whole configuration as it is resolved: file, then --set, then defaults."""
+
+    def run(self) -> int:
+        config, _ = self.resolve_with_plant()
+        from node_runtime.config.sections import to_toml, to_tree
+
+        if self.json:
+            terminal.emit(to_tree(config))
+        else:
+            sys.stdout.write(to_toml(config))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfigCommand:
+    """Work with the configuration."""
+
+    # A union, so that `show` is a word of its own on the command line.
+    action: Annotated[ConfigShow, subcommand("show")] | Annotated[None, Suppress]

@@ -1,0 +1,102 @@
+"""`tandem router`, `controller`, `trainer`, `plant` and `record`: one process each, until it is told to stop."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from tandem.commands.base import FROM_CONFIG, Configured, require
+
+if TYPE_CHECKING:
+    from node_runtime.config.sections import Config
+
+
+class Process(Configured):
+    """A command that is one process."""
+
+    def _process(self, name: str, main: Callable[[Config], int], config: Config) -> int:
+        """Run it; its log goes to standard error."""
+        import logging
+
+        logging.basicConfig(
+            stream=sys.stderr,
+            level=logging.INFO,
+            format=f"%(asctime)s.%(msecs)03d {name} %(levelname)s: %(message)s",
+            datefmt="%H:%M:%S",
+        )
+        code = main(config)
+        self.emit({"process": name, "exit_code": code})
+        return code
+
+
+@dataclass(frozen=True, kw_only=True)
+class Router(Process):
+    """The Zenoh router that all processes are clients of."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from node_runtime.router import main
+
+        return self._process("router", main, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller(Process):
+    """The controller: one tick a period, latch, solve, command."""
+
+    def run(self) -> int:
+        config, _ = self.resolve_with_plant()
+        from controller_node.node import main
+
+        return self._process("controller", main, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trainer(Process):
+    """The trainer: collects samples, trains the hidden layers, sends them. Needs torch, not CasADi."""
+
+    EXTRAS = "trainer"
+
+    plants: str | None = None
+    """Train for all plants whose names match, e.g. 'jet*'; by default the one named in the configuration."""
+
+    def run(self) -> int:
+        config, _ = self.resolve()
+        from trainer_node.main import main
+
+        return self._process("trainer", lambda config: main(config, plants=self.plants), config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plant(Process):
+    """The plant: integrates the truth in real time, applies commands as they arrive."""
+
+    def run(self) -> int:
+        config, _ = self.resolve_with_plant()
+        from plant_sim.node import main
+
+        return self._process("plant", main, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Process):
+    """The recorder: writes everything on the bus to a log."""
+
+    EXTRAS = "log"
+    KEYS = (("log", "log.path"),)
+
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=FROM_CONFIG)] = None
+    """The log; must not exist yet."""
+
+    def run(self) -> int:
+        config, _ = self.resolve_with_plant()
+        from run_log.writing.recorder import main
+
+        require("zstandard")
+
+        return self._process("recorder", main, config)

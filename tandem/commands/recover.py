@@ -1,0 +1,44 @@
+"""`tandem recover`: a whole log beside the one that was cut short."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from tandem.commands.base import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recover(Command):
+    """Make a log whole whose recorder did not end cleanly."""
+
+    EXTRAS = "log"
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The log; it stays as it is."""
+    output: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: NAME.recovered.mcap)")
+    ] = None
+    """Where the whole log goes."""
+
+    def run(self) -> int:
+        import msgspec
+
+        from run_log.reading.recover import recover
+
+        file = self.file
+        saved = recover(file, self.output or file.with_suffix(f".recovered{file.suffix or '.mcap'}"))
+        if saved.log is None:
+            text = f"{file} is whole: {saved.messages} messages over {saved.seconds:.1f} s; nothing to do"
+        else:
+            text = f"{saved.log}: {saved.messages} messages over {saved.seconds:.1f} s saved from {file}"
+            if saved.cut_at is not None:
+                text += (
+                    f", which was cut at byte {saved.cut_at} ({saved.lost_bytes} bytes of a torn record lost)"
+                )
+        self.say(text, *saved.damage)
+        self.emit(msgspec.to_builtins(saved))
+        return 0

@@ -1,0 +1,64 @@
+"""`tandem replay`: a log's ticks once more, compared byte for byte."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from tandem import terminal
+from tandem.commands.base import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Command):
+    """Give a log's ticks to a fresh controller and compare every command and keyframe, byte for byte."""
+
+    EXTRAS = "log"
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """A log that `tandem run` or `tandem simulate --log` wrote."""
+    from_tick: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: the first)")] = None
+    """Start at this tick, from the nearest keyframe before it."""
+    set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
+    """Replay with another value than the log's configuration has."""
+
+    def run(self) -> int:
+        """0 when every command and keyframe is equal, 1 when one differs or the log lacks some."""
+        import msgspec
+
+        from run_log.reading.reader import read_run
+        from run_log.replaying.replay import replay
+
+        ran = read_run(self.file)
+        with terminal.progress_bar(self.console) as bar:
+            task = bar.add_task("replaying", total=None)
+            found = replay(
+                ran,
+                self.from_tick,
+                self.set,
+                lambda done, total: bar.update(task, completed=done, total=total),
+            )
+        if found.equal:
+            text = (
+                f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
+            )
+            self.say(text, style="yellow" if found.lost_ticks else "green")
+        else:
+            self.console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+        if found.lost_ticks:
+            text = f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps"
+            self.console.print(text, style="bold red")
+        first = found.first_difference
+        if first is not None:
+            values = f"recorded {first.recorded}, replayed {first.replayed}"
+            self.say(f"first at tick {first.tick}: {first.field} {values}")
+        if not found.equal and found.largest_difference is not None:
+            self.console.print(
+                f"largest difference of an input: {found.largest_difference:.3g}", markup=False
+            )
+        self.say(*(f"note: {note}" for note in found.notes), style="yellow")
+        self.emit(msgspec.to_builtins(found))
+        return 0 if found.equal and not found.lost_ticks else 1

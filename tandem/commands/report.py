@@ -1,0 +1,42 @@
+"""`tandem report`: pictures and a table of a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from tandem.commands.base import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Draw a run and tabulate it, from its log alone."""
+
+    EXTRAS = "log"
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The log."""
+    output: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the log's)")] = None
+    """Where the pictures go."""
+
+    def run(self) -> int:
+        import msgspec
+
+        from run_log.reading.reader import read_run
+        from run_log.reporting.report import report
+        from run_log.reporting.summary import summarise
+        from tandem import summary_table
+
+        ran = read_run(self.file)
+        summary = summarise(ran)
+        with self.console.status("drawing"):
+            drawn = report(self.file, self.output or self.file.parent)
+        self.console.print(summary_table.table(summary))
+        self.say(*(f"picture {picture}" for picture in drawn))
+        if ran.note:
+            self.say(ran.note, style="yellow")
+        self.emit({**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]})
+        return 0

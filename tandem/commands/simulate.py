@@ -1,0 +1,83 @@
+"""`tandem simulate`: everything in lock-step in one process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from node_runtime.config.literals import OracleName, TighteningName
+from tandem import terminal
+from tandem.commands.base import FROM_CONFIG, Configured, require
+from tandem.terminal import Refused
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate(Configured):
+    """Controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
+
+    EXTRAS = "trainer,log"
+    KEYS = (
+        *(("oracle", "controller.oracle"), ("tightening", "controller.tightening")),
+        *(("seed", "seed"), ("x0", "plant.x0")),
+    )
+
+    oracle: Annotated[
+        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+    ] = None
+    """What the controller learns with."""
+    steps: Annotated[int, arg(metavar="INT")] = 200
+    """How many ticks."""
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
+    """Of everything random; the same seed gives the same run, bit for bit."""
+    tightening: Annotated[
+        TighteningName | None,
+        arg(metavar="none|first_step|tube|invariant", help_behavior_hint=FROM_CONFIG),
+    ] = None
+    """How the nominal constraints are tightened."""
+    adapt_only: bool = False
+    """Never train the hidden layers; adapt the last one only."""
+    x0: Annotated[
+        list[float] | None, arg(metavar="X...", help_behavior_hint="(default: the plant's own)")
+    ] = None
+    """Initial state, in the plant's own units."""
+    log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
+    """Write the run's log too, in the format of a live run."""
+
+    def run(self) -> int:
+        config, _ = self.resolve_with_plant()
+        if self.steps < 1:
+            raise Refused(f"--steps {self.steps}: at least 1")
+        if self.log is not None and self.log.exists():
+            raise Refused(
+                f"{self.log}: exists already, and a log never overwrites anything; choose another name"
+            )
+        from controller_node.build import build_model
+        from controller_node.guarantee import guarantee
+        from lbmpc.plants import PlantError
+        from node_runtime.config.sections import override
+        from run_log.reporting.summary import summarise
+        from run_log.writing.save import save
+        from tandem import summary_table
+        from tandem.experiments.simulation.lockstep import simulate
+
+        require("zstandard")
+        if self.adapt_only:
+            config = override(config, ["trainer.enabled=false"])
+        self.say(guarantee(config, build_model(config)))
+        with terminal.progress_bar(self.console) as bar:
+            task = bar.add_task(f"simulating, {config.controller.oracle}", total=self.steps)
+            try:
+                ran = simulate(config, self.steps, progress=lambda step: bar.update(task, completed=step))
+            except PlantError as error:
+                terminal.complain(f"the plant was lost: {error}", self.json)
+                return 1
+        if self.log is not None:
+            save(ran, self.log)
+            ran.path = self.log
+        summary = summarise(ran)
+        self.console.print(summary_table.table(summary))
+        self.emit(summary_table.of(summary))
+        return 0

@@ -1,0 +1,123 @@
+"""The wheel in bare environments, used from an empty folder. `make wheel-test`: some minutes, most of them pip's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.live import free_endpoint
+from tests.helpers.wheel import build_wheel, copy_sources
+
+PATIENCE_S = 600.0
+"""A limit only ends a hang."""
+
+
+class Environment:
+    """A virtual environment with the wheel and some of its extras; commands run in a folder of their own."""
+
+    def __init__(self, wheel: Path, folder: Path, extras: str = ""):
+        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+        self._bin = folder / "bin"
+        what = f"{wheel}[{extras}]" if extras else str(wheel)
+        subprocess.run([str(self._bin / "python"), "-I", "-m", "pip", "install", "--quiet", what], check=True)
+
+    def tandem(self, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            self.command(*arguments),
+            **{"cwd": cwd, "env": BARE, "capture_output": True, "text": True},
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def command(self, *arguments: str) -> list[str]:
+        return [str(self._bin / "tandem"), *arguments]
+
+    @contextmanager
+    def running(self, cwd: Path, *arguments: str) -> Iterator[None]:
+        """A command for as long as the block takes; it must not end by itself."""
+        process = subprocess.Popen(self.command(*arguments), cwd=cwd, env=BARE)
+        try:
+            yield
+            assert process.poll() is None
+        finally:
+            process.terminate()
+            process.wait(PATIENCE_S)
+
+
+BARE = {"PATH": "/usr/bin:/bin"}
+"""No PYTHONPATH: nothing is found but what is installed."""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    (folder / "sources").mkdir()
+    return build_wheel(copy_sources(folder / "sources"), folder / "built")
+
+
+@pytest.fixture(scope="module")
+def whole(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    return Environment(wheel, tmp_path_factory.mktemp("whole"), "trainer,log,experiment")
+
+
+@pytest.fixture(scope="module")
+def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    return Environment(wheel, tmp_path_factory.mktemp("bare"))
+
+
+@pytest.mark.parametrize(
+    ("command", "leaves"),
+    [
+        ("--version", ""),
+        ("config show", ""),
+        ("run --seconds 5", "run.mcap"),
+        ("run --seconds 5 --set controller.tightening=invariant", "run.png"),
+        ("simulate --steps 20 --log simulated.mcap", "simulated.mcap"),
+        ("experiment list", ""),
+        ("experiment paper --quick --out paper --only lemma", "paper/report.html"),
+    ],
+)
+def test_with_all_extras_every_command_works(whole: Environment, command: str, leaves: str, tmp_path: Path):
+    done = whole.tandem(tmp_path, *command.split())
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / leaves).exists()
+
+
+def test_without_extras_router_plant_and_controller_run(bare: Environment, tmp_path: Path):
+    here = ("--set", f'bus.endpoint="{free_endpoint()}"')
+    with ExitStack() as started:
+        for process in ("router", "plant", "controller"):
+            started.enter_context(bare.running(tmp_path, process, *here))
+        for process in ("router", "plant", "controller"):
+            done = bare.tandem(tmp_path, "health", process, "--seconds", "120", *here)
+            while ": starting" in done.stdout:
+                done = bare.tandem(tmp_path, "health", process, "--seconds", "120", *here)
+            assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "extras"),
+    [
+        ("run", "trainer,log"),
+        ("simulate", "trainer,log"),
+        ("trainer", "trainer"),
+        ("record", "log"),
+        ("replay x.mcap", "log"),
+        ("report x.mcap", "log"),
+        ("recover x.mcap", "log"),
+        ("experiment paper --out paper", "experiment"),
+    ],
+)
+def test_without_extras_the_rest_says_which_it_wants(
+    bare: Environment, command: str, extras: str, tmp_path: Path
+):
+    done = bare.tandem(tmp_path, *command.split())
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("tandem: this command needs ")
+    assert f"pip install 'tandem-control[{extras}]'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
