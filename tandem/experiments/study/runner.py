@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -60,7 +60,7 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
 
 
 def run_all(
-    wants: dict[str, Want], folder: Path, processes: int, progress: Progress | None = None
+    wants: dict[str, Want], folder: Path, processes: int, progress: Progress = lambda done, total: None
 ) -> dict[str, Record]:
     """Every job's record, by key; those that `folder` holds already are not run again.
 
@@ -72,28 +72,24 @@ def run_all(
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob("*.partial"):
         leftover.unlink()
-    found = {key: read(folder / f"{key}.json", want.detail) for key, want in wants.items()}
-    missing = {
-        key: want
+    missing = [
+        (key, want)
         for key, want in wants.items()
-        if found[key] is None or (want.log is not None and not want.log.exists())
-    }
+        if read(folder / f"{key}.json", want.detail) is None
+        or (want.log is not None and not want.log.exists())
+    ]
     # Long ones first, or one of them would keep a single core busy at the end.
-    order = sorted(missing, key=lambda key: _effort(missing[key].job), reverse=True)
-    done = len(wants) - len(missing)
-    if progress is not None:
-        progress(done, len(wants))
+    missing.sort(key=lambda one: _effort(one[1].job), reverse=True)
+    there = len(wants) - len(missing)
+    progress(there, len(wants))
     with _workers(processes) as pool:
-        futures: list[Future[str]] = []
         try:
-            for key in order:
-                want = missing[key]
-                futures.append(pool.submit(work, want.job, key, folder, want.detail, want.log))
-            for future in as_completed(futures):
+            futures = [
+                pool.submit(work, want.job, key, folder, want.detail, want.log) for key, want in missing
+            ]
+            for done, future in enumerate(as_completed(futures), there + 1):
                 future.result()
-                done += 1
-                if progress is not None:
-                    progress(done, len(wants))
+                progress(done, len(wants))
         except BrokenProcessPool as error:
             raise RunnerError(
                 "a process of the experiment was killed, for want of memory perhaps; the finished runs are kept: "
@@ -101,11 +97,13 @@ def run_all(
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
-    records = {key: read(folder / f"{key}.json", want.detail) for key, want in wants.items()}
-    lacking = [key for key, record in records.items() if record is None]
-    if lacking:
-        raise RunnerError(f"{folder}: {lacking[0]}.json was there and is gone or cannot be read; run again")
-    return {key: record for key, record in records.items() if record is not None}
+    records = {}
+    for key, want in wants.items():
+        record = read(folder / f"{key}.json", want.detail)
+        if record is None:
+            raise RunnerError(f"{folder}: {key}.json was there and is gone or cannot be read; run again")
+        records[key] = record
+    return records
 
 
 @contextmanager
@@ -163,7 +161,7 @@ def time_all(
     repeats: Callable[[Resolved], int],
     seconds: float,
     folder: Path,
-    progress: Progress | None = None,
+    progress: Progress,
 ) -> dict[str, Timing]:
     """Solve times by case name; one process, nothing beside it. Those in `folder` are taken as they are.
 
@@ -177,7 +175,7 @@ def time_all(
         most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
     timings: dict[str, Timing] = {}
     with _workers(1) as pool:
-        for done, (key, case) in enumerate(by_key.items()):
+        for done, (key, case) in enumerate(by_key.items(), 1):
             path = folder / f"{key}.json"
             try:
                 timing = msgspec.json.decode(path.read_bytes(), type=Timing)
@@ -188,8 +186,7 @@ def time_all(
                 timing = Timing([*timing.runs, times])
                 write_whole(path, msgspec.json.encode(timing))
             timings[key] = timing
-            if progress is not None:
-                progress(done + 1, len(by_key))
+            progress(done, len(by_key))
     return {case.name: timings[keys[case.name]] for case in cases}
 
 

@@ -55,8 +55,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return self.lost is None and self.violations == 0
 
 
-def work(job: Job, key: str, folder: Path, detail: bool, log: Path | None) -> str:
-    """Run `job` and write `folder`/`key`.json, and its log. Returns the key.
+def work(job: Job, key: str, folder: Path, detail: bool, log: Path | None) -> None:
+    """Run `job` and write `folder`/`key`.json, and its log.
 
     Raises:
         ConfigError: the job's configuration admits no controller.
@@ -67,11 +67,10 @@ def work(job: Job, key: str, folder: Path, detail: bool, log: Path | None) -> st
         partial.unlink(missing_ok=True)
         save(outcome.run, partial)
         partial.replace(log)
-    write_whole(folder / f"{key}.json", msgspec.json.encode(record(job, outcome, detail)))
-    return key
+    write_whole(folder / f"{key}.json", msgspec.json.encode(_record(job, outcome, detail)))
 
 
-def record(job: Job, outcome: Outcome, detail: bool) -> Record:
+def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
     run, lost = outcome.run, outcome.lost
     summary = summarise(run)
     return Record(
