@@ -16,7 +16,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 
 Reason = Literal["oversized", "malformed", "not finite", "wrong size"]
-M = TypeVar("M", bound=m.Message)
+T = TypeVar("T", bound=msgspec.Struct)
 UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError)
 """All that msgspec raises for bytes that are none of ours."""
 
@@ -32,7 +32,7 @@ class BadMessage(ValueError):
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoders: dict[type, msgspec.msgpack.Decoder] = {}
+_decoder = cache(msgspec.msgpack.Decoder)
 
 
 def encode(message: m.Message) -> bytes:
@@ -47,23 +47,17 @@ class Head(msgspec.Struct):
     seq: m.Sequence
 
 
-_head = msgspec.msgpack.Decoder(Head)
-
-
 def head_of(payload: bytes) -> Head | None:
     """Who wrote a message, and its number, without a look at the rest of it; None where that cannot be read."""
     try:
-        return _head.decode(payload)
+        return decode_as(Head, payload)
     except UNREADABLE:
         return None
 
 
-def decode_as(kind: type[M], payload: bytes) -> M:
+def decode_as(kind: type[T], payload: bytes) -> T:
     """Decode with the schema alone. Raises `msgspec.DecodeError` (its `ValidationError` included)."""
-    decoder = _decoders.get(kind)
-    if decoder is None:
-        decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
-    return decoder.decode(payload)
+    return _decoder(kind).decode(payload)
 
 
 def decode(topic: Topic, payload: bytes) -> m.Message:
@@ -82,6 +76,16 @@ def decode(topic: Topic, payload: bytes) -> m.Message:
     if field is not None:
         raise BadMessage(topic.name, "not finite", f"field {field}")
     return message
+
+
+WITHOUT_FLOATS = (
+    inspect.StrType,
+    inspect.IntType,
+    inspect.BoolType,
+    inspect.NoneType,
+    inspect.BytesType,
+    inspect.LiteralType,
+)
 
 
 @cache
@@ -103,17 +107,7 @@ def _may_hold_float(kind: inspect.Type) -> bool:
             return _may_hold_float(inner)
         case inspect.StructType(cls=struct):
             return struct is m.Array or bool(_fields_with_floats(struct))
-        case (
-            inspect.StrType()
-            | inspect.IntType()
-            | inspect.BoolType()
-            | inspect.NoneType()
-            | inspect.BytesType()
-            | inspect.LiteralType()
-        ):
-            return False
-        case _:
-            return True
+    return not isinstance(kind, WITHOUT_FLOATS)
 
 
 @cache

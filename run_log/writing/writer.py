@@ -142,6 +142,12 @@ class LogWriter:
         if not self.sink.close():
             raise LogError(f"{self.sink.error}; the log is cut short: `tandem recover` saves what there is")
 
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _register_raw(self, name: str) -> int | None:
         topic = topics.BY_NAME.get(name)
         if topic is None:
