@@ -87,11 +87,11 @@ class Network:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 
     def layers(self, of: torch.Tensor | None = None) -> list[torch.Tensor]:
-        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: views of a gradient of the same layout."""
+        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: of these (..., N) instead."""
         flat = self.flat if of is None else of
         views, start = [], 0
         for rows, columns in self.description.layer_shapes:
-            views.append(flat[start : start + rows * columns].view(rows, columns))
+            views.append(flat[..., start : start + rows * columns].view(*flat.shape[:-1], rows, columns))
             start += rows * columns
         return views
 
