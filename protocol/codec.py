@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cache
 from math import isfinite
-from operator import attrgetter
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -110,17 +109,6 @@ def _may_hold_float(kind: inspect.Type) -> bool:
     return not isinstance(kind, WITHOUT_FLOATS)
 
 
-@cache
-def _floats_of(kind: type[msgspec.Struct]) -> Callable[[Any], tuple[object, ...]]:
-    names = _fields_with_floats(kind)
-    # Of a single name attrgetter would give the value itself.
-    return (
-        attrgetter(*names)
-        if len(names) > 1
-        else lambda struct: tuple(getattr(struct, name) for name in names)
-    )
-
-
 def _surely_finite(value: object) -> bool:
     """False where `first_non_finite` has to look closer; quick, for it is asked of every message of a fast loop."""
     if isinstance(value, float):
@@ -137,7 +125,7 @@ def _surely_finite(value: object) -> bool:
         return all(map(_surely_finite, value))
     if not isinstance(value, msgspec.Struct) or isinstance(value, m.Array):
         return False
-    return all(map(_surely_finite, _floats_of(type(value))(value)))
+    return all(_surely_finite(getattr(value, name)) for name in _fields_with_floats(type(value)))
 
 
 def first_non_finite(value: object, path: str = "") -> str | None:

@@ -130,17 +130,12 @@ class Trainer:
         try:
             new = self._add(run_id, batch)
         except ValueError:
-            # Some are bad: which ones, is found out one by one.
-            new, good = 0, 0
-            for sample in batch:
-                try:
-                    new += self._add(run_id, [sample])
-                    good += 1
-                except ValueError:
-                    self.counters["bad samples"] += 1
-            self.counters["samples met before"] += good - new
-        else:
-            self.counters["samples met before"] += len(batch) - new
+            if len(batch) > 1:
+                # Which ones are bad, is found out one by one.
+                return sum(self.add(run_id, [sample]) for sample in batch)
+            new, batch = 0, []
+            self.counters["bad samples"] += 1
+        self.counters["samples met before"] += len(batch) - new
         self.counters["samples"] += new
         self._fresh += new
         return new

@@ -112,7 +112,7 @@ def _copy(
                     record.publish_time,
                     record.sequence,
                 )
-                sink.drain()
+                sink.flush()
     writer.finish()
     if not sink.close():
         raise LogError(f"{sink.error}; {out} is not whole")
