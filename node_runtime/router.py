@@ -38,56 +38,35 @@ class RouterError(RuntimeError):
     """The router cannot listen; the text says where and what to do."""
 
 
-class Router:
-    """A Zenoh session in router mode, listening on `config.bus.endpoint` and `bus.remote`. A context manager."""
+def open_router(config: Config) -> zenoh.Session:
+    """A Zenoh session in router mode, listening on `config.bus.endpoint` and `bus.remote`; a context manager.
 
-    def __init__(self, config: Config):
-        self.config = config
-        self.run_id = new_run_id("router")
-        self._session: zenoh.Session | None = None
-
-    def open(self) -> None:
-        """Listen. Raises `RouterError` when that is not possible.
-
-        Raises:
-            ConfigError: an endpoint is none, or the router's certificate cannot be used.
-        """
-        bus = self.config.bus
-        places = " and ".join(filter(None, (bus.endpoint, bus.remote)))
-        if bus.remote and not secure(bus.remote):
-            raise ConfigError(
-                f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
-            )
-        settings = None
-        if remote(self.config):
-            from node_runtime.tls import access_control, credentials
-
-            own = credentials.of_process(bus.tls.keys, "router", self.config.name)
-            settings = access_control.router_settings(own, self.config.name)
-        routing = session_config(
-            "router", bus.endpoint, lease_ms(self.config, "router"), bus.remote or None, settings
+    Raises:
+        RouterError: it cannot listen there.
+        ConfigError: an endpoint is none, or the router's certificate cannot be used.
+    """
+    bus = config.bus
+    places = " and ".join(filter(None, (bus.endpoint, bus.remote)))
+    if bus.remote and not secure(bus.remote):
+        raise ConfigError(
+            f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
         )
-        try:
-            self._session = zenoh.open(routing)
-        except zenoh.ZError as error:
-            if "in use" in str(error):
-                raise RouterError(
-                    f"{places} is taken: another router may be running. "
-                    "Stop it, or set bus.endpoint or bus.remote to another port."
-                ) from error
-            raise RouterError(f"the router cannot listen on {places}: {error}") from error
+    settings = None
+    if remote(config):
+        from node_runtime.tls import access_control, credentials
 
-    def close(self) -> None:
-        if self._session is not None:
-            self._session.close()
-            self._session = None
-
-    def __enter__(self) -> Router:
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        own = credentials.of_process(bus.tls.keys, "router", config.name)
+        settings = access_control.router_settings(own, config.name)
+    routing = session_config("router", bus.endpoint, lease_ms(config, "router"), bus.remote or None, settings)
+    try:
+        return zenoh.open(routing)
+    except zenoh.ZError as error:
+        if "in use" in str(error):
+            raise RouterError(
+                f"{places} is taken: another router may be running. "
+                "Stop it, or set bus.endpoint or bus.remote to another port."
+            ) from error
+        raise RouterError(f"the router cannot listen on {places}: {error}") from error
 
 
 def remote(config: Config) -> bool:
@@ -134,7 +113,7 @@ def _route(config: Config, stopping: threading.Event) -> int:
             filters = zenoh_log.REFUSED if fast else zenoh_log.DENIED
             while_listening.enter_context(zenoh_log.counting_refusals(bad, filters))
         try:
-            router = while_listening.enter_context(Router(config))
+            while_listening.enter_context(open_router(config))
         except RouterError as error:
             log.error("%s", error)
             return 1
@@ -142,9 +121,10 @@ def _route(config: Config, stopping: threading.Event) -> int:
         if config.bus.remote:
             log.info("and for other machines, with certificates, on %s", config.bus.remote)
         # Its health travels like everybody else's, through a client of itself.
-        info = run_info(config, "router", router.run_id)
+        run_id = new_run_id("router")
+        info = run_info(config, "router", run_id)
         with (
-            Bus(config, "router", router.run_id, stopping) as bus,
+            Bus(config, "router", run_id, stopping) as bus,
             HealthPublisher(bus, info, bad.counters, note=note) as health,
         ):
             health.set("running")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import groupby
 from operator import mul
 from typing import Literal
 
@@ -113,7 +114,8 @@ class PlantSim:
         if segments:
             source = segments[-1].source
             applied = self._applied(segments)
-        pieces = [Piece(s.duration, s.u.tolist()) for s in _merged(segments) if s.u is not None]
+        moves = groupby(segments, key=lambda segment: None if segment.u is None else segment.u.tolist())
+        pieces = [Piece(sum(s.duration for s in same), u) for u, same in moves if u is not None]
         self._orders = orders
         self._pending = [order for order in self._pending if order.arrived > t]
         if orders is not None:
@@ -180,20 +182,3 @@ class PlantSim:
             return inputs[0]
         shares = [segment.duration / total for segment in segments]
         return [sum(map(mul, shares, entries)) for entries in zip(*inputs, strict=True)]
-
-
-def _merged(segments: list[_Segment]) -> list[_Segment]:
-    """The same motion with neighbours under the same input made one."""
-    merged: list[_Segment] = []
-    for segment in segments:
-        last = merged[-1] if merged else None
-        if (
-            last is not None
-            and last.u is not None
-            and segment.u is not None
-            and last.u.tolist() == segment.u.tolist()
-        ):
-            merged[-1] = _Segment(last.duration + segment.duration, last.u, segment.source)
-        else:
-            merged.append(segment)
-    return merged

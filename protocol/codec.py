@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cache
 from math import isfinite
-from operator import attrgetter
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,7 +15,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 
 Reason = Literal["oversized", "malformed", "not finite", "wrong size"]
-M = TypeVar("M", bound=m.Message)
+T = TypeVar("T", bound=msgspec.Struct)
 UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError)
 """All that msgspec raises for bytes that are none of ours."""
 
@@ -32,7 +31,7 @@ class BadMessage(ValueError):
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoders: dict[type, msgspec.msgpack.Decoder] = {}
+_decoder = cache(msgspec.msgpack.Decoder)
 
 
 def encode(message: m.Message) -> bytes:
@@ -47,23 +46,17 @@ class Head(msgspec.Struct):
     seq: m.Sequence
 
 
-_head = msgspec.msgpack.Decoder(Head)
-
-
 def head_of(payload: bytes) -> Head | None:
     """Who wrote a message, and its number, without a look at the rest of it; None where that cannot be read."""
     try:
-        return _head.decode(payload)
+        return decode_as(Head, payload)
     except UNREADABLE:
         return None
 
 
-def decode_as(kind: type[M], payload: bytes) -> M:
+def decode_as(kind: type[T], payload: bytes) -> T:
     """Decode with the schema alone. Raises `msgspec.DecodeError` (its `ValidationError` included)."""
-    decoder = _decoders.get(kind)
-    if decoder is None:
-        decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
-    return decoder.decode(payload)
+    return _decoder(kind).decode(payload)
 
 
 def decode(topic: Topic, payload: bytes) -> m.Message:
@@ -82,6 +75,16 @@ def decode(topic: Topic, payload: bytes) -> m.Message:
     if field is not None:
         raise BadMessage(topic.name, "not finite", f"field {field}")
     return message
+
+
+WITHOUT_FLOATS = (
+    inspect.StrType,
+    inspect.IntType,
+    inspect.BoolType,
+    inspect.NoneType,
+    inspect.BytesType,
+    inspect.LiteralType,
+)
 
 
 @cache
@@ -103,28 +106,7 @@ def _may_hold_float(kind: inspect.Type) -> bool:
             return _may_hold_float(inner)
         case inspect.StructType(cls=struct):
             return struct is m.Array or bool(_fields_with_floats(struct))
-        case (
-            inspect.StrType()
-            | inspect.IntType()
-            | inspect.BoolType()
-            | inspect.NoneType()
-            | inspect.BytesType()
-            | inspect.LiteralType()
-        ):
-            return False
-        case _:
-            return True
-
-
-@cache
-def _floats_of(kind: type[msgspec.Struct]) -> Callable[[Any], tuple[object, ...]]:
-    names = _fields_with_floats(kind)
-    # Of a single name attrgetter would give the value itself.
-    return (
-        attrgetter(*names)
-        if len(names) > 1
-        else lambda struct: tuple(getattr(struct, name) for name in names)
-    )
+    return not isinstance(kind, WITHOUT_FLOATS)
 
 
 def _surely_finite(value: object) -> bool:
@@ -143,7 +125,7 @@ def _surely_finite(value: object) -> bool:
         return all(map(_surely_finite, value))
     if not isinstance(value, msgspec.Struct) or isinstance(value, m.Array):
         return False
-    return all(map(_surely_finite, _floats_of(type(value))(value)))
+    return all(_surely_finite(getattr(value, name)) for name in _fields_with_floats(type(value)))
 
 
 def first_non_finite(value: object, path: str = "") -> str | None:

@@ -7,9 +7,10 @@ that of `descend` alone; a stack sums in another order.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,14 +47,6 @@ class Descent(NamedTuple):
     before: float
     after: float
     """The losses."""
-
-
-class _Loss(Protocol):
-    def values(self) -> torch.Tensor:
-        """The loss of each plant, (P,)."""
-
-    def gradient(self) -> torch.Tensor:
-        """(P, N), one row a plant; the next call may overwrite it."""
 
 
 def shape_of(description: NetworkDescription) -> Hashable:
@@ -99,11 +92,10 @@ def descend_together(problems: Sequence[Problem], steps: int, learning_rate: flo
 def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
     if len(problems) == 1:
         return [descend(problems[0], steps, learning_rate)]
-    stack = _Stack(problems)
-    loss: _Loss = _Dense(stack) if stack.network.dense else _Mapped(stack)
-    before = loss.values().tolist()
-    _adam(stack.flat, loss.gradient, steps, learning_rate)
-    after = loss.values().tolist()
+    stack = _Dense(problems) if problems[0].network.dense else _Mapped(problems)
+    before = stack.values().tolist()
+    _adam(stack.flat, stack.gradient, steps, learning_rate)
+    after = stack.values().tolist()
     # One copy from the device, not one for each layer of each plant.
     rows = stack.flat.cpu()
     hidden = [[W.numpy().astype(np.float64) for W in stack.network.layers(row)] for row in rows]
@@ -137,8 +129,8 @@ def _adam(
             )
 
 
-class _Stack:
-    """P problems as tensors. A plant with fewer than M samples is filled up with rows of weight 0."""
+class _Stack(ABC):
+    """P problems as tensors, and their losses. A plant with fewer than M samples is filled up with rows of weight 0."""
 
     def __init__(self, problems: Sequence[Problem]):
         self.network = problems[0].network
@@ -167,15 +159,24 @@ class _Stack:
         self.share = stacked([tensor([[1.0 / len(p.window)]] * len(p.window)) for p in problems])
         """(P, M, 1): what a row counts in its plant's mean."""
 
+    @abstractmethod
+    def values(self) -> torch.Tensor:
+        """The loss of each plant, (P,)."""
 
-class _Mapped:
+    @abstractmethod
+    def gradient(self) -> torch.Tensor:
+        """(P, N), one row a plant; the next call may overwrite it."""
+
+
+class _Mapped(_Stack):
     """Any architecture: its loss mapped over the plants."""
 
-    def __init__(self, stack: _Stack):
+    def __init__(self, problems: Sequence[Problem]):
+        super().__init__(problems)
         # Only here: it takes a while to import, and a single plant does without.
         from torch.func import grad, vmap
 
-        network = stack.network
+        network = self.network
 
         def loss(
             flat: torch.Tensor,
@@ -188,48 +189,40 @@ class _Mapped:
             residual = offset + network.activations(inputs, layers) @ weights
             return (residual.square() * share).sum()
 
-        self._stack = stack
         self._values, self._gradient = vmap(loss), vmap(grad(loss))
-
-    def _data(self) -> tuple[torch.Tensor, ...]:
-        s = self._stack
-        return s.flat, s.inputs, s.offset, s.weights, s.share
+        self._data = self.flat, self.inputs, self.offset, self.weights, self.share
 
     @torch.no_grad()
     def values(self) -> torch.Tensor:
-        return self._values(*self._data())
+        return self._values(*self._data)
 
     def gradient(self) -> torch.Tensor:
         with torch.enable_grad():
-            return self._gradient(*self._data()).detach()
+            return self._gradient(*self._data).detach()
 
 
-class _Dense:
+class _Dense(_Stack):
     """Dense layers, their gradient by hand, as `DenseLoss` with one more dimension in front."""
 
-    def __init__(self, stack: _Stack):
-        self._stack, description = stack, stack.network.description
-        self._slope = torch.zeros_like(stack.flat)
-        self._back, self._double = stack.weights.transpose(1, 2).contiguous(), 2.0 * stack.share
-        self._W, self._dW, start = [], [], 0
-        for rows, columns in description.layer_shapes:
-            part = slice(start, start + rows * columns)
-            self._W.append(stack.flat[:, part].view(-1, rows, columns))
-            self._dW.append(self._slope[:, part].view(-1, rows, columns))
-            start += rows * columns
+    def __init__(self, problems: Sequence[Problem]):
+        super().__init__(problems)
+        description = self.network.description
+        self._slope = torch.zeros_like(self.flat)
+        self._back, self._double = self.weights.transpose(1, 2).contiguous(), 2.0 * self.share
+        self._W, self._dW = self.network.layers(self.flat), self.network.layers(self._slope)
         self._forth = [ACTIVATIONS[name] for name in description.activations]
         self._backward = [BACKWARD[name] for name in description.activations]
 
     def _forward(self) -> tuple[list[torch.Tensor], torch.Tensor]:
-        values = [self._stack.inputs]
+        values = [self.inputs]
         for W, psi in zip(self._W, self._forth, strict=True):
             values.append(psi(torch.baddbmm(W[:, :1], values[-1], W[:, 1:])))
-        return values, torch.baddbmm(self._stack.offset, values[-1], self._stack.weights)
+        return values, torch.baddbmm(self.offset, values[-1], self.weights)
 
     @torch.no_grad()
     def values(self) -> torch.Tensor:
         _, residual = self._forward()
-        return (residual.square() * self._stack.share).sum(dim=(1, 2))
+        return (residual.square() * self.share).sum(dim=(1, 2))
 
     @torch.no_grad()
     def gradient(self) -> torch.Tensor:

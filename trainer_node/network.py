@@ -8,8 +8,9 @@ does every other architecture.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ class _Tensors:
         return torch.cat(list(parts), dim=1)
 
 
-class Network(torch.nn.Module):
+class Network:
     """h_hat(x, u) = output_scale * K' phi(x, u), with W_1..W_{L-1} as its only parameter and K given.
 
     What it is given is (x, u) (M, d + m), or a window of k pairs, oldest first, (M, k (d + m)): one row a sample.
@@ -67,7 +68,6 @@ class Network(torch.nn.Module):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ):
-        super().__init__()
         self.description = description
         self.dtype = dtype
         self.device = torch.device(device)
@@ -87,11 +87,11 @@ class Network(torch.nn.Module):
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 
     def layers(self, of: torch.Tensor | None = None) -> list[torch.Tensor]:
-        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: views of a gradient of the same layout."""
+        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: of these (..., N) instead."""
         flat = self.flat if of is None else of
         views, start = [], 0
         for rows, columns in self.description.layer_shapes:
-            views.append(flat[start : start + rows * columns].view(rows, columns))
+            views.append(flat[..., start : start + rows * columns].view(*flat.shape[:-1], rows, columns))
             start += rows * columns
         return views
 
@@ -119,59 +119,56 @@ class Network(torch.nn.Module):
         pairs = scaled.split(self.description.pair, dim=1)
         return self._architecture.forward(_Tensors(), self._sizes, layers, pairs)
 
-    def features(self, window: torch.Tensor) -> torch.Tensor:
-        """phi, (M, 1 + n_L), of windows in deviation coordinates and plant units."""
-        psi = self.activations(self.scaled(window), [(layer[0], layer[1:]) for layer in self.layers()])
-        return torch.cat([torch.ones_like(psi[:, :1]), psi], dim=1)
-
-    def forward(self, window: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-        """h_hat, (M, d), in units of h, for K of shape (1 + n_L, d)."""
-        return self._output_scale * (self.features(window) @ K)
-
     def scaled_targets(self, h: torch.Tensor) -> torch.Tensor:
         """h, (M, d), in units of `output_scale`."""
         return h / self._output_scale
 
 
-class Loss(Protocol):
-    """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient."""
-
-    def value(self) -> float:
-        """The loss at the present hidden layers."""
-
-    def gradient(self) -> torch.Tensor:
-        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
-
-
-def build_loss(network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray) -> Loss:
-    """The loss of a network whose hidden layers are trained.
+class Loss(ABC):
+    """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient.
 
     Args:
-        network: the network.
+        network: whose hidden layers are trained.
         window: what it is given, (M, k (d + m)), plant units.
         h: (M, d), units of h.
         K: (1 + n_L, d), fixed; a copy is kept.
     """
-    kind = DenseLoss if network.dense else AutogradLoss
-    return kind(network, window, h, K)
-
-
-class AutogradLoss:
-    """`Loss` of any architecture; arguments as for `build_loss`."""
 
     def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
         self._network = network
         output = network.tensor(K)
         self._inputs = network.scaled(network.tensor(window))
+        # K' phi - h is one fused call when the targets are folded into the bias of the output layer.
         self._offset = output[0] - network.scaled_targets(network.tensor(h))
         self._weights = output[1:]
+        self._gradient = torch.zeros_like(network.flat, requires_grad=False)
+
+    @abstractmethod
+    def value(self) -> float:
+        """The loss at the present hidden layers."""
+
+    @abstractmethod
+    def gradient(self) -> torch.Tensor:
+        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
+
+
+def build_loss(network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray) -> Loss:
+    """The loss as it is computed fastest for this network; arguments as for `Loss`."""
+    kind = DenseLoss if network.dense else AutogradLoss
+    return kind(network, window, h, K)
+
+
+class AutogradLoss(Loss):
+    """Of any architecture."""
+
+    def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
+        super().__init__(network, window, h, K)
         # Leaves of their own on the same memory: views of one parameter would each give a gradient of its full length.
         self._layers = [
             (layer[0].detach().requires_grad_(), layer[1:].detach().requires_grad_())
             for layer in network.layers()
         ]
         self._leaves = [leaf for layer in self._layers for leaf in layer]
-        self._gradient = torch.zeros_like(network.flat, requires_grad=False)
         self._parts = [part for layer in network.layers(self._gradient) for part in (layer[0], layer[1:])]
 
     def _loss(self) -> torch.Tensor:
@@ -191,19 +188,13 @@ class AutogradLoss:
         return self._gradient
 
 
-class DenseLoss:
-    """`Loss` of dense layers, its gradient by hand; arguments as for `build_loss`."""
+class DenseLoss(Loss):
+    """Of dense layers, its gradient by hand."""
 
     def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
-        self._network = network
-        output = network.tensor(K)
-        self._inputs = network.scaled(network.tensor(window))
-        # K' phi - h is one fused call when the targets are folded into the bias of the output layer.
-        self._offset = output[0] - network.scaled_targets(network.tensor(h))
-        self._weights = output[1:]
+        super().__init__(network, window, h, K)
         self._samples = len(window)
         self._back = (2.0 / self._samples) * self._weights.T.contiguous()
-        self._gradient = torch.zeros_like(network.flat, requires_grad=False)
         self._layers = [
             _Layer(W[0], W[1:], W[1:].T, dW[0], dW[1:], ACTIVATIONS[activation], BACKWARD[activation])
             for W, dW, activation in zip(

@@ -94,7 +94,7 @@ class ReplayBuffer:
         self._next = 0
         self._xu = np.empty((0, len(self._scale)))
         self._h = np.empty((0, 0))
-        self._pairs: _ClosestPairs | None = None
+        self._pairs = _ClosestPairs(capacity, len(scale)) if strategy == "novelty" else None
 
     def __len__(self) -> int:
         return self._length
@@ -138,9 +138,7 @@ class ReplayBuffer:
 
     def _slot(self, scaled: np.ndarray) -> int | None:
         """Where the sample goes, or None when it is not kept."""
-        if self.strategy == "novelty":
-            if self._pairs is None:
-                self._pairs = _ClosestPairs(self.capacity, len(scaled))
+        if self._pairs is not None:
             return self._pairs.insert(scaled)
         if self._length < self.capacity:
             return self._length
@@ -148,7 +146,7 @@ class ReplayBuffer:
         return drawn if drawn < self.capacity else None
 
     def _store(self, slot: int, xu: np.ndarray, h: np.ndarray) -> None:
-        self._make_room(slot + 1, len(xu), len(h))
+        self._make_room(slot + 1, len(h))
         self._xu[slot], self._h[slot] = xu, h
         self._length = max(self._length, slot + 1)
 
@@ -157,7 +155,7 @@ class ReplayBuffer:
         n = len(xu)
         if not n:
             return
-        self._make_room(min(self.capacity, self._length + n), xu.shape[1], h.shape[1])
+        self._make_room(min(self.capacity, self._length + n), h.shape[1])
         slots = (self._next + np.arange(n)) % self.capacity
         # Where they are more than the buffer holds, the last ones stay.
         kept = slice(max(0, n - self.capacity), n)
@@ -166,11 +164,11 @@ class ReplayBuffer:
         self._next = (self._next + n) % self.capacity
         self.offered += n
 
-    def _make_room(self, length: int, columns: int, labels: int) -> None:
+    def _make_room(self, length: int, labels: int) -> None:
         if length > len(self._xu):
             room = min(self.capacity, max(256, 2 * len(self._xu), length))
-            self._xu = _grown(self._xu, room, columns)
-            self._h = _grown(self._h, room, labels)
+            self._xu.resize((room, len(self._scale)), refcheck=False)
+            self._h.resize((room, labels), refcheck=False)
 
 
 class _ClosestPairs:
@@ -183,9 +181,9 @@ class _ClosestPairs:
     def __init__(self, capacity: int, dimensions: int):
         self._capacity = capacity
         self._points = np.empty((0, dimensions))
-        self._nearest = np.empty((0, 1))
-        self._neighbour = np.empty((0, 1), dtype=np.int64)
-        self._born = np.empty((0, 1), dtype=np.int64)
+        self._nearest = np.empty(0)
+        self._neighbour = np.empty(0, dtype=np.int64)
+        self._born = np.empty(0, dtype=np.int64)
         self._length = 0
         self._births = 0
 
@@ -196,27 +194,25 @@ class _ClosestPairs:
             slot = self._length
             if slot == len(self._points):
                 room = min(self._capacity, max(256, 2 * slot))
-                self._points = _grown(self._points, room, len(point))
-                self._nearest = _grown(self._nearest, room, 1)
-                self._neighbour = _grown(self._neighbour, room, 1)
-                self._born = _grown(self._born, room, 1)
+                self._points.resize((room, len(point)), refcheck=False)
+                for figures in (self._nearest, self._neighbour, self._born):
+                    figures.resize(room, refcheck=False)
             self._length += 1
         else:
             one, other = self._closest()
-            if distances.min() <= self._nearest[one, 0]:
+            if distances.min() <= self._nearest[one]:
                 return None
-            slot = one if self._born[one, 0] > self._born[other, 0] else other
-            orphans = self._neighbour[: self._length, 0] == slot
-            self._neighbour[: self._length, 0][orphans] = -1
+            slot = one if self._born[one] > self._born[other] else other
+            self._neighbour[self._neighbour == slot] = -1
             distances[slot] = np.inf
         self._place(slot, point, distances)
         return slot
 
     def _place(self, slot: int, point: np.ndarray, distances: np.ndarray) -> None:
         self._points[slot] = point
-        self._born[slot, 0] = self._births
+        self._born[slot] = self._births
         self._births += 1
-        nearest, neighbour = self._nearest[: len(distances), 0], self._neighbour[: len(distances), 0]
+        nearest, neighbour = self._nearest[: len(distances)], self._neighbour[: len(distances)]
         closer = distances < nearest
         nearest[closer], neighbour[closer] = distances[closer], slot
         self._settle(slot, distances)
@@ -224,22 +220,22 @@ class _ClosestPairs:
     def _settle(self, slot: int, distances: np.ndarray) -> None:
         if len(distances) and np.isfinite(distances).any():
             found = int(distances.argmin())
-            self._nearest[slot, 0], self._neighbour[slot, 0] = distances[found], found
+            self._nearest[slot], self._neighbour[slot] = distances[found], found
         else:
-            self._nearest[slot, 0], self._neighbour[slot, 0] = np.inf, -1
+            self._nearest[slot], self._neighbour[slot] = np.inf, -1
 
     def _closest(self) -> tuple[int, int]:
         """The closest pair stored. With one point, that point twice."""
         if self._length == 1:
             return 0, 0
         for _ in range(STALE_LOOKS):
-            first = int(self._nearest[: self._length, 0].argmin())
-            if self._neighbour[first, 0] >= 0:
+            first = int(self._nearest[: self._length].argmin())
+            if self._neighbour[first] >= 0:
                 break
             self._look_up(first)
         else:
             self._look_up(first)
-        return first, int(self._neighbour[first, 0])
+        return first, int(self._neighbour[first])
 
     def _look_up(self, slot: int) -> None:
         distances = self._distances(self._points[slot])
@@ -249,11 +245,3 @@ class _ClosestPairs:
     def _distances(self, point: np.ndarray) -> np.ndarray:
         difference = self._points[: self._length] - point
         return np.einsum("ij,ij->i", difference, difference)
-
-
-def _grown(array: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """A copy with more rows; what it is not filled with is undefined."""
-    larger = np.empty((rows, columns), dtype=array.dtype)
-    if len(array):
-        larger[: len(array)] = array
-    return larger

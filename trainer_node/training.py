@@ -50,10 +50,6 @@ def pick_device(wanted: str) -> torch.device:
     return torch.device("cuda" if available and wanted != "cpu" else "cpu")
 
 
-class _Kept(Exception):
-    """A training that leaves the hidden layers as they are, and why."""
-
-
 @dataclass(frozen=True)
 class Draw:
     """A training that has begun: what to minimise, and the message it answers."""
@@ -103,16 +99,6 @@ class Trainer:
         self._step = 1
         self.resume(hidden, version)
 
-    @property
-    def hidden(self) -> list[np.ndarray]:
-        """The newest hidden layers, float32 values in float64, (1 + n_{i-1}, n_i) each."""
-        return [layer.copy() for layer in self._hidden]
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the newest hidden layers."""
-        return self._sha256
-
     def resume(self, hidden: list[np.ndarray], version: int = 0) -> None:
         """Go on from the controller's hidden layers, forgetting what was trained. Samples are kept.
 
@@ -144,17 +130,12 @@ class Trainer:
         try:
             new = self._add(run_id, batch)
         except ValueError:
-            # Some are bad: which ones, is found out one by one.
-            new, good = 0, 0
-            for sample in batch:
-                try:
-                    new += self._add(run_id, [sample])
-                    good += 1
-                except ValueError:
-                    self.counters["bad samples"] += 1
-            self.counters["samples met before"] += good - new
-        else:
-            self.counters["samples met before"] += len(batch) - new
+            if len(batch) > 1:
+                # Which ones are bad, is found out one by one.
+                return sum(self.add(run_id, [sample]) for sample in batch)
+            new, batch = 0, []
+            self.counters["bad samples"] += 1
+        self.counters["samples met before"] += len(batch) - new
         self.counters["samples"] += new
         self._fresh += new
         return new
@@ -196,48 +177,20 @@ class Trainer:
         """
         self._fresh = 0
         self.counters["trainings"] += 1
-        try:
-            return self._draw(output, for_run)
-        except _Kept as reason:
-            self.counters[f"kept: {reason}"] += 1
+        K = output.K.numpy()
+        if (why := self._unusable(K, output.hidden_sha256)) is not None:
+            self.counters[f"kept: {why}"] += 1
             return None
+        xu, h = self.buffer.sample(self.config.batch, self._draws)
+        self._network.load(self._bases[output.hidden_sha256])
+        return Draw(Problem(self._network, xu, h, K), output, for_run)
 
     def finish(self, draw: Draw, descent: Descent) -> HiddenWeights | None:
         """The last part of `train`: judge what the Adam steps found, and take it over or leave it."""
-        try:
-            return self._judge(draw, descent)
-        except _Kept as reason:
-            self.counters[f"kept: {reason}"] += 1
-            return None
-
-    def _draw(self, output: OutputWeights, for_run: str) -> Draw:
-        K = output.K.numpy()
-        if K.shape != (self.description.features, self.description.states):
-            raise _Kept("K has the wrong shape")
-        if not np.isfinite(K).all():
-            raise _Kept("K is not finite")
-        if np.abs(K).max() > np.finfo(np.float32).max:
-            raise _Kept("K is too large")
-        base = self._bases.get(output.hidden_sha256)
-        if base is None:
-            raise _Kept("K belongs to unknown hidden weights")
-        if not len(self.buffer):
-            raise _Kept("no samples")
-        xu, h = self.buffer.sample(self.config.batch, self._draws)
-        self._network.load(base)
-        return Draw(Problem(self._network, xu, h, K), output, for_run)
-
-    def _judge(self, draw: Draw, descent: Descent) -> HiddenWeights:
         output, trained = draw.output, descent.hidden
-        if not all(np.isfinite(layer).all() for layer in trained):
-            raise _Kept("not finite")
-        if why_unacceptable(self.description, trained) is not None:
-            # Their shapes are those of the network that was trained.
-            raise _Kept("norm bound")
-        if not math.isfinite(descent.after):
-            raise _Kept("not finite")
-        if not descent.after < descent.before:
-            raise _Kept("loss not lower")
+        if (why := self._unwanted(descent)) is not None:
+            self.counters[f"kept: {why}"] += 1
+            return None
         self._bases.move_to_end(output.hidden_sha256)
         self._take(trained)
         near = self.version < output.hidden_version + FARTHEST
@@ -253,14 +206,39 @@ class Trainer:
             loss_before=descent.before,
             loss_after=descent.after,
             network_sha256=self.description.sha256(),
-            sha256=self._sha256,
+            sha256=self.sha256,
             layers=[Array.of(layer, "<f4") for layer in trained],
         )
 
+    def _unusable(self, K: np.ndarray, base_sha256: str) -> str | None:
+        """Why no training can begin under this K; None: one can."""
+        if K.shape != (self.description.features, self.description.states):
+            return "K has the wrong shape"
+        if not np.isfinite(K).all():
+            return "K is not finite"
+        if np.abs(K).max() > np.finfo(np.float32).max:
+            return "K is too large"
+        if base_sha256 not in self._bases:
+            return "K belongs to unknown hidden weights"
+        return None if len(self.buffer) else "no samples"
+
+    def _unwanted(self, descent: Descent) -> str | None:
+        """Why the old hidden layers are kept; None: those that were found are better."""
+        if not all(np.isfinite(layer).all() for layer in descent.hidden):
+            return "not finite"
+        if why_unacceptable(self.description, descent.hidden) is not None:
+            # Their shapes are those of the network that was trained.
+            return "norm bound"
+        if not math.isfinite(descent.after):
+            return "not finite"
+        return None if descent.after < descent.before else "loss not lower"
+
     def _take(self, hidden: list[np.ndarray]) -> None:
-        self._hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]
-        self._sha256 = hash_layers(self._hidden)
-        self._bases[self._sha256] = self._hidden
-        self._bases.move_to_end(self._sha256)
+        self.hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]
+        """The newest hidden layers, float32 values in float64, (1 + n_{i-1}, n_i) each."""
+        self.sha256 = hash_layers(self.hidden)
+        """Their hash."""
+        self._bases[self.sha256] = self.hidden
+        self._bases.move_to_end(self.sha256)
         while len(self._bases) > BASES:
             self._bases.popitem(last=False)

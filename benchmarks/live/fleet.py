@@ -30,7 +30,7 @@ from network_model.description import NetworkDescription, hash_layers, initial_h
 from node_runtime import provenance
 from node_runtime.bus.session import session_config
 from node_runtime.config.sections import Config, TrainerConfig, override, to_toml
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 
@@ -178,7 +178,7 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = override(Config(), [f'bus.endpoint="{endpoint}"', f"trainer.batch={batch}"])
     controllers = {f"plant{k}": Simulated(f"plant{k}", k) for k in range(plants)}
-    with tempfile.TemporaryDirectory() as folder, Router(config):
+    with tempfile.TemporaryDirectory() as folder, open_router(config):
         file = Path(folder) / "fleet.toml"
         file.write_text(to_toml(config))
         words = ("trainer", "--plants", "plant*", "--config", str(file))

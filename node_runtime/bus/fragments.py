@@ -13,6 +13,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -72,24 +73,11 @@ class Fragmenter:
             yield MARK + _encoder.encode(Fragment(self._run_id, number, index, len(payload), crc32, data))
 
 
+@dataclass
 class _Incomplete:
-    def __init__(self, first: Fragment):
-        self.first = first
-        self.parts: dict[int, bytes] = {}
-        self.held = 0
-
-    def add(self, fragment: Fragment) -> int:
-        """How many bytes more are held now."""
-        new = 0 if fragment.index in self.parts else len(fragment.data)
-        self.parts.setdefault(fragment.index, fragment.data)
-        self.held += new
-        return new
-
-    def whole(self) -> bytes:
-        payload = b"".join(self.parts[index] for index in range(len(self.parts)))
-        if zlib.crc32(payload) != self.first.crc32:
-            raise BadFragmentError("pieces do not make the message")
-        return payload
+    first: Fragment
+    parts: dict[int, bytes] = field(default_factory=dict)
+    held: int = 0
 
 
 class Reassembler:
@@ -144,11 +132,17 @@ class Reassembler:
             raise BadFragmentError("late piece")
         if (fragment.size, fragment.crc32) != (first.size, first.crc32):
             raise BadFragmentError("pieces of two messages")
-        self.held += message.add(fragment)
+        if fragment.index not in message.parts:
+            message.parts[fragment.index] = fragment.data
+            message.held += len(fragment.data)
+            self.held += len(fragment.data)
         if message.held == first.size:
             self.held -= message.held
             del self._incomplete[at]
-            return message.whole()
+            payload = b"".join(message.parts[index] for index in range(len(message.parts)))
+            if zlib.crc32(payload) != first.crc32:
+                raise BadFragmentError("pieces do not make the message")
+            return payload
         while self.held > self.limit or len(self._incomplete) > INCOMPLETE:
             self._forget(next(iter(self._incomplete)))
         return None

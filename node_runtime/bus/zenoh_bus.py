@@ -155,7 +155,8 @@ class Bus:
 
     def queue(self, topic: Topic, capacity: int = 1000) -> Mailbox:
         """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
-        mailbox = self._remember(Mailbox(topic.name, capacity))
+        mailbox = Mailbox(topic.name, capacity)
+        self._boxes.append(mailbox)
         session, name = self._lanes.session(topic.lane), self.config.name
         self._subscribe(session, topic.key(name), mailbox, topic)
         if topic.lane == "control" and topic.batched_at(self.config.rate):
@@ -167,13 +168,9 @@ class Bus:
 
         What travelled in a `Batch` is here one by one, as if it had travelled alone.
         """
-        mailbox = self._remember(UnbatchingMailbox("everything", capacity, self.bad))
+        mailbox = UnbatchingMailbox("everything", capacity, self.bad)
+        self._boxes.append(mailbox)
         self._subscribe(self._lanes.session("bulk"), topics.everything(self.config.name), mailbox)
-        return mailbox
-
-    def _remember(self, mailbox: Mailbox) -> Mailbox:
-        with self._lock:
-            self._boxes.append(mailbox)
         return mailbox
 
     def _subscribe(
@@ -225,10 +222,9 @@ class Bus:
         """What was sent, what was lost here and why, bad messages included; for `Health`."""
         with self._lock:
             counts = dict(self._counts)
-            boxes = list(self._boxes)
         if self._outgoing.overflow:
             counts["bulk overflow"] = self._outgoing.overflow
-        for box in boxes:
+        for box in list(self._boxes):
             if box.overflow:
                 counts[f"overflow {box.name}"] = counts.get(f"overflow {box.name}", 0) + box.overflow
         return counts | self.bad.counters()

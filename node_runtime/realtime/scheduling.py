@@ -9,7 +9,7 @@ import os
 import struct
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import threadpoolctl
 
@@ -25,11 +25,9 @@ WAKE_LATENCY = "/dev/cpu_dma_latency"
 """Linux holds the wake-up latency, in microseconds, that was written here for as long as the file stays open."""
 
 
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> AbstractContextManager[object]:
     """Matrices here are small: more BLAS threads would only wait for each other, and may round otherwise."""
-    with threadpoolctl.threadpool_limits(limits=1):
-        yield
+    return threadpoolctl.threadpool_limits(limits=1)
 
 
 @contextmanager

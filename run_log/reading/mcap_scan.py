@@ -37,8 +37,7 @@ UNREADABLE = (
     UnicodeDecodeError,
     ValueError,
 )
-KINDS = (Header, Attachment, Metadata, Schema, Channel, Message)
-Record: TypeAlias = "Header | Attachment | Metadata | Schema | Channel | Message"
+Record: TypeAlias = Header | Attachment | Metadata | Schema | Channel | Message
 
 
 @dataclass
@@ -171,4 +170,4 @@ def _chunk(chunk: Chunk) -> list[Record]:
         chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) != size
     ):
         raise ValueError("its size is not the size it says")
-    return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, KINDS)]
+    return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, Record)]

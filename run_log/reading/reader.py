@@ -44,8 +44,6 @@ def read_run(path: str | Path) -> Run:
                 name = names.get(record.channel_id, "")
                 if name.startswith(RAW):
                     _take(run, name.removeprefix(RAW), record)
-            case _:
-                pass
     if header is None:
         raise LogError(f"{path}: ends before anything was written to it; there is nothing to recover")
     if scan.cut_at is not None:

@@ -60,8 +60,6 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
                 channels.setdefault(record.id, record)
             case Message():
                 stamps.append((record.channel_id, record.log_time))
-            case _:
-                pass
     times = [time for i, time in stamps if i in channels and channels[i].topic.startswith(RAW)]
     if header is None or (not times and not attachments):
         raise LogError(f"{path}: ends before anything was written to it; there is nothing to recover")
@@ -114,9 +112,7 @@ def _copy(
                     record.publish_time,
                     record.sequence,
                 )
-                sink.drain()
-            case _:
-                pass
+                sink.flush()
     writer.finish()
     if not sink.close():
         raise LogError(f"{sink.error}; {out} is not whole")

@@ -121,8 +121,6 @@ def _bits(value: Any) -> Any:
 
 
 def _shown(value: Any) -> Shown:
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float) and np.isfinite(value):
-        return value
-    return str(value) if isinstance(value, float) else type(value).__name__
+    if isinstance(value, float):
+        return value if np.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, bool | int | str) else type(value).__name__

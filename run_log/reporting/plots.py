@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,29 +25,32 @@ Draw = Callable[[Axes], None]
 
 def overview(data: Traces, title: str = "") -> Figure:
     """The whole run on one page: what is performed, commanded, learned, and what it costs."""
-    performed = [_state(data, i) for i in data.plant.performance]
-    commanded = [_input(data, j) for j in range(data.plant.m)]
-    learned = [_error(data), *([_weights(data)] if _learns(data) else [])]
-    return _figure(title, [*performed, *commanded, *learned, _timing(data)], height=1.9)
+    performed = [partial(_state, data, i) for i in data.plant.performance]
+    commanded = [partial(_input, data, j) for j in range(data.plant.m)]
+    learned = [partial(_error, data), *([partial(_weights, data)] if _learns(data) else [])]
+    return _figure(title, [*performed, *commanded, *learned, partial(_timing, data)], height=1.9)
 
 
 def pictures(data: Traces) -> dict[str, Figure]:
     """Every separate picture by name; what the run has not (hidden weights, timings) has no picture."""
     plant = data.plant
     drawn = {
-        "states": _figure("States", [_state(data, i) for i in range(plant.d)]),
-        "input": _figure("Input", [_input(data, j) for j in range(plant.m)], height=3.2),
-        "error": _figure("Prediction error", [_error(data)], height=3.2),
+        "states": _figure("States", [partial(_state, data, i) for i in range(plant.d)]),
+        "input": _figure("Input", [partial(_input, data, j) for j in range(plant.m)], height=3.2),
+        "error": _figure("Prediction error", [partial(_error, data)], height=3.2),
     }
     shown = _model_errors(data)
     if shown:
         drawn["model_error"] = _figure(
-            "Model error over one period, measured and estimated", [_model_error(data, i) for i in shown]
+            "Model error over one period, measured and estimated",
+            [partial(_model_error, data, i) for i in shown],
         )
     if np.isfinite(data.tick_ms).any():
-        drawn["timing"] = _figure("Time spent", [_timing(data)], height=3.2)
+        drawn["timing"] = _figure("Time spent", [partial(_timing, data)], height=3.2)
     if _learns(data):
-        drawn["weights"] = _figure("Hidden weights", [_weights(data), _losses(data)], height=2.4)
+        drawn["weights"] = _figure(
+            "Hidden weights", [partial(_weights, data), partial(_losses, data)], height=2.4
+        )
     return drawn
 
 
@@ -99,38 +103,28 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float)
     ax.plot([], [], " ", label=inside)
 
 
-def _state(data: Traces, i: int) -> Draw:
+def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
-
-    def draw(ax: Axes) -> None:
-        x = motion.x[:, i]
-        ax.plot(motion.t, x, color=BLUE, linewidth=1.6, label="true state")
-        ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-        _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
-        ax.set_ylabel(_label(plant, plant.states[i]))
-
-    return draw
+    x = motion.x[:, i]
+    ax.plot(motion.t, x, color=BLUE, linewidth=1.6, label="true state")
+    ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
+    ax.set_ylabel(_label(plant, plant.states[i]))
 
 
-def _input(data: Traces, j: int) -> Draw:
+def _input(data: Traces, j: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
-
-    def draw(ax: Axes) -> None:
-        u, applied = data.u[:, j], motion.applied[:, j]
-        ax.step(data.t, u, where="post", color=SKY, linewidth=3.0, label="commanded")
-        # `applied` is reported at the end of the period over which it is the mean.
-        ax.step(
-            motion.t, applied, where="pre", color=BLACK, linestyle="--", linewidth=1.0, label="applied (mean)"
-        )
-        if data.fallback.any():
-            ax.plot(
-                data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver"
-            )
-        ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-        _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied]), plant.u_e[j])
-        ax.set_ylabel(_label(plant, plant.inputs[j]))
-
-    return draw
+    u, applied = data.u[:, j], motion.applied[:, j]
+    ax.step(data.t, u, where="post", color=SKY, linewidth=3.0, label="commanded")
+    # `applied` is reported at the end of the period over which it is the mean.
+    ax.step(
+        motion.t, applied, where="pre", color=BLACK, linestyle="--", linewidth=1.0, label="applied (mean)"
+    )
+    if data.fallback.any():
+        ax.plot(data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver")
+    ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied]), plant.u_e[j])
+    ax.set_ylabel(_label(plant, plant.inputs[j]))
 
 
 def _model_errors(data: Traces) -> list[int]:
@@ -141,85 +135,62 @@ def _model_errors(data: Traces) -> list[int]:
     return [int(i) for i in np.flatnonzero(largest > MATTERS * largest.max())]
 
 
-def _model_error(data: Traces, i: int) -> Draw:
+def _model_error(data: Traces, i: int, ax: Axes) -> None:
     plant = data.plant
-
-    def draw(ax: Axes) -> None:
-        # The label of a step is known when the step has ended.
-        ax.plot(data.t, data.h[:, i], color=BLACK, linewidth=1.6, label="measured h")
-        ax.plot(data.t, data.h_hat[:, i], color=VERMILION, linestyle="--", linewidth=1.4, label="estimated ĥ")
-        ax.set_ylabel(_label(plant, plant.states[i], "h of "))
-        ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
-
-    return draw
+    # The label of a step is known when the step has ended.
+    ax.plot(data.t, data.h[:, i], color=BLACK, linewidth=1.6, label="measured h")
+    ax.plot(data.t, data.h_hat[:, i], color=VERMILION, linestyle="--", linewidth=1.4, label="estimated ĥ")
+    ax.set_ylabel(_label(plant, plant.states[i], "h of "))
+    ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
 
 
-def _error(data: Traces) -> Draw:
-    def draw(ax: Axes) -> None:
-        ax.semilogy(data.t, _positive(data.error), color=BLUE, linewidth=1.2, label="|ĥ − h|")
-        for mask, marker, colour, label in (
-            (data.adopted, "^", GREEN, "weights adopted"),
-            (data.refused, "x", VERMILION, "weights refused"),
-            (data.rolled_back, "v", VERMILION, "weights rolled back"),
-        ):
-            if mask.any():
-                level = np.nanmax(_positive(data.error)) * 1.5 if np.isfinite(data.error).any() else 1.0
-                at_top = np.full(mask.sum(), level)
-                ax.plot(data.t[mask], at_top, marker, color=colour, markersize=5, label=label)
-        ax.set_ylabel("prediction error\n(units of x)")
-
-    return draw
+def _error(data: Traces, ax: Axes) -> None:
+    error = _positive(data.error)
+    ax.semilogy(data.t, error, color=BLUE, linewidth=1.2, label="|ĥ − h|")
+    top = np.nanmax(error) * 1.5 if np.isfinite(error).any() else 1.0
+    _mark_weights(data, ax, np.full(len(data.t), top), 5, "weights ")
+    ax.set_ylabel("prediction error\n(units of x)")
 
 
-def _timing(data: Traces) -> Draw:
-    def draw(ax: Axes) -> None:
-        ax.semilogy(data.t, _positive(data.tick_ms), color=BLACK, linewidth=1.0, label="whole tick")
-        ax.semilogy(data.t, _positive(data.solve_ms), ".", color=BLUE, markersize=3, label="solver")
-        ax.axhline(data.period * 1e3, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label="period")
-        if data.late.any():
-            ax.plot(
-                data.t[data.late], data.tick_ms[data.late], "v", color=VERMILION, zorder=5, label="late tick"
-            )
-        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        ax.yaxis.set_major_formatter(lambda value, _position: f"{value:g}")
-        ax.yaxis.set_minor_locator(NullLocator())
-        ax.set_ylabel("time (ms)")
+def _timing(data: Traces, ax: Axes) -> None:
+    ax.semilogy(data.t, _positive(data.tick_ms), color=BLACK, linewidth=1.0, label="whole tick")
+    ax.semilogy(data.t, _positive(data.solve_ms), ".", color=BLUE, markersize=3, label="solver")
+    ax.axhline(data.period * 1e3, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label="period")
+    if data.late.any():
+        ax.plot(data.t[data.late], data.tick_ms[data.late], "v", color=VERMILION, zorder=5, label="late tick")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter(lambda value, _position: f"{value:g}")
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.set_ylabel("time (ms)")
 
-    return draw
+
+def _mark_weights(data: Traces, ax: Axes, heights: np.ndarray, size: int, what: str = "") -> None:
+    """The ticks at which something became of hidden weights; `heights`: (n,) where in the picture."""
+    for mask, marker, colour, fate in (
+        (data.adopted, "^", GREEN, "adopted"),
+        (data.refused, "x", VERMILION, "refused"),
+        (data.rolled_back, "v", VERMILION, "rolled back"),
+    ):
+        if mask.any():
+            ax.plot(data.t[mask], heights[mask], marker, color=colour, markersize=size, label=what + fate)
 
 
 def _learns(data: Traces) -> bool:
     return bool(len(data.losses) or data.adopted.any() or data.refused.any())
 
 
-def _weights(data: Traces) -> Draw:
-    def draw(ax: Axes) -> None:
-        ax.step(data.t, data.version, where="post", color=BLUE, linewidth=1.4, label="in force")
-        for mask, marker, colour, label in (
-            (data.adopted, "^", GREEN, "adopted"),
-            (data.refused, "x", VERMILION, "refused"),
-            (data.rolled_back, "v", VERMILION, "rolled back"),
-        ):
-            if mask.any():
-                ax.plot(data.t[mask], data.version[mask], marker, color=colour, markersize=6, label=label)
-        ax.set_ylabel("hidden weights\n(version)")
-        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-
-    return draw
+def _weights(data: Traces, ax: Axes) -> None:
+    ax.step(data.t, data.version, where="post", color=BLUE, linewidth=1.4, label="in force")
+    _mark_weights(data, ax, data.version, 6)
+    ax.set_ylabel("hidden weights\n(version)")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _losses(data: Traces) -> Draw:
-    def draw(ax: Axes) -> None:
-        t, before, after = data.losses.T if len(data.losses) else np.zeros((3, 0))
-        ax.semilogy(
-            t, _positive(before), "o-", color=BLACK, markersize=4, linewidth=0.8, label="before training"
-        )
-        ax.semilogy(
-            t, _positive(after), "s--", color=GREEN, markersize=4, linewidth=0.8, label="after training"
-        )
-        ax.set_ylabel("loss")
-
-    return draw
+def _losses(data: Traces, ax: Axes) -> None:
+    t, before, after = data.losses.T if len(data.losses) else np.zeros((3, 0))
+    ax.semilogy(t, _positive(before), "o-", color=BLACK, markersize=4, linewidth=0.8, label="before training")
+    ax.semilogy(t, _positive(after), "s--", color=GREEN, markersize=4, linewidth=0.8, label="after training")
+    ax.set_ylabel("loss")
 
 
 def _positive(values: np.ndarray) -> np.ndarray:

@@ -32,8 +32,6 @@ class Traces:
     """(n,) |h_hat - h|."""
     fallback: np.ndarray
     """(n,) whether the input did not come from the solver."""
-    soft: np.ndarray
-    """(n,) slack in the soft state constraints."""
     version: np.ndarray
     """(n,) hidden weights in force, -1 before the first."""
     adopted: np.ndarray
@@ -76,7 +74,6 @@ def traces(run: Run) -> Traces:
         h_hat=vectors([r.h_hat for r in results], plant.d),
         error=np.array([np.nan if r.prediction_error is None else r.prediction_error for r in results]),
         fallback=np.array([r.mode != "solver" for r in results]),
-        soft=np.array([r.slack for r in results]),
         version=np.array([r.hidden_version for r in results]),
         adopted=np.array([r.weights_outcome == "adopted" for r in results]),
         refused=np.array([r.weights_outcome == "refused" for r in results]),

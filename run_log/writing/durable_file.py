@@ -57,10 +57,7 @@ class Sink:
             self._pending.append(memoryview(data))
             self._length += len(data)
 
-    def flush(self) -> None:
-        self.drain()
-
-    def drain(self) -> bool:
+    def flush(self) -> bool:
         """Write all that waits, as far as the disk takes it; True when nothing waits any more."""
         if self._fd is None:
             try:
@@ -87,7 +84,7 @@ class Sink:
 
     def close(self) -> bool:
         """Write what can be written and close; True when the file holds everything."""
-        whole = self.drain()
+        whole = self.flush()
         if self._fd is not None:
             try:
                 os.fsync(self._fd)

@@ -83,12 +83,12 @@ class PartedLog:
     @property
     def path(self) -> Path:
         """The part that is written now."""
-        return self._writer.path
+        return self._writer.sink.path
 
     @property
     def error(self) -> str | None:
         """Why something cannot be written at the moment; None when all can."""
-        return self._writer.error or (self._old.error if self._old is not None else None)
+        return self._writer.sink.error or (self._old.sink.error if self._old is not None else None)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -129,7 +129,7 @@ class PartedLog:
             seen = now - OVERLAP_S if self._keyframe_at is None else self._keyframe_at
             waited = self._keyframe_at is not None or now - self._began > WITHOUT_KEYFRAME_S
             # What comes now must be safe in the new part before the old one ends.
-            if waited and now - seen >= OVERLAP_S and self._writer.error is None:
+            if waited and now - seen >= OVERLAP_S and self._writer.sink.error is None:
                 self._end_old()
         elif 0.0 < self._config.log.split_minutes * 60.0 <= now - self._began:
             self._begin_part(now, unix_ns)
@@ -183,7 +183,7 @@ class PartedLog:
         except LogError as error:
             log.error("%s", error)
             self._torn = str(error)
-        log.info("%s is complete; the log goes on in %s", old.path, self.path)
+        log.info("%s is complete; the log goes on in %s", old.sink.path, self.path)
         while 0 < self._config.log.keep < len(self._paths):
             oldest = self._paths.pop(0)
             try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from pathlib import Path
 
 from lbmpc.plants import get_plant
 from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
@@ -28,7 +27,6 @@ EXIT_NOTHING_WRITTEN = 4
 # After Ctrl-C the other processes still say their last words; listen for that long.
 QUIET_S = 0.25
 LAST_WORDS_S = 1.5
-Said = tuple[Path, str | None, bool]
 # Messages are fetched together: to wake for each costs more than to log it.
 GATHER_S = 0.02
 
@@ -78,7 +76,7 @@ def _record(
     to_unix = time.time_ns() - clock.now_ns()
     flush_s = config.log.flush_ms * 1e-3
     next_flush = clock.now()
-    said: Said | None = None
+    said: tuple[object, ...] = ()
     end: float | None = None
     last_arrival = clock.now()
     garbage = GarbageCollection()

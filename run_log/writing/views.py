@@ -1,16 +1,18 @@
 """The plottable view of each message: flat JSON with a JSON schema, vectors under the plant's own names.
 
-Each view is declared once, as a Struct; its JSON and its schema both follow from that. Weights are summarised by their
-norms, and a keyframe has no view. What a message lacks (no input was applied, no estimate yet) is left out rather than
-null, since plotting tools skip absent fields and choke on others.
+A view is a message's fields, by name, and what is made of others; its JSON and its schema both follow from the
+message's own Struct. Weights are summarised by their norms, and a keyframe has no view. What a message lacks (no input
+was applied, no estimate yet) is left out rather than null, since plotting tools skip absent fields and choke on others.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias, get_args, get_origin
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import inspect
 
 from lbmpc.plants import Plant
 from protocol import messages as m
@@ -19,178 +21,95 @@ from protocol.codec import BadMessage
 from protocol.topics import Topic
 
 Json = dict[str, Any]
-State: TypeAlias = Annotated[dict[str, float], "states"]
-"""A vector under the names of the plant's states; a view makes it of a plain list."""
-Input: TypeAlias = Annotated[dict[str, float], "inputs"]
-"""The same under the names of its inputs."""
-NAMED_AFTER = {State: "states", Input: "inputs"}
-"""The plant's attribute that has the names."""
-JSON_TYPES = {float: "number", int: "integer", str: "string", bool: "boolean"}
+Vector = list[float]
+NAMED_AFTER = dict.fromkeys(("x", "h", "h_hat", "oracle_norms", "column_norms"), "states") | dict.fromkeys(
+    ("u", "applied"), "inputs"
+)
+"""Of each vector, the plant's attribute that has the names of its entries."""
+JSON_TYPES: dict[type[inspect.Type], str] = {
+    inspect.FloatType: "number",
+    inspect.IntType: "integer",
+    inspect.StrType: "string",
+    inspect.LiteralType: "string",
+    inspect.BoolType: "boolean",
+}
 
 
-class MessageView(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is shown of one kind of message, in this order. What may be absent has the default None.
-
-    A field is the message's field of the same name, or what `derived` says.
-    """
-
-    run_id: str
-    seq: int
-
-    @staticmethod
-    def derived(message: Any) -> Json:
-        """The fields that the message does not have under their names, or has otherwise."""
-        return {}
+def _of_command(command: m.Command) -> Json:
+    return {"plan_entries": len(command.plan)}
 
 
-class PlantStateView(MessageView, frozen=True, kw_only=True):
-    t: float
-    x: State
-    applied: Input | None = None
-    source: str
-    command_seq: int
+def _of_tick(tick: m.Tick) -> Json:
+    state, weights = tick.state, tick.weights
+    shown: Json = {} if state is None else {"state_seq": state.seq, "x": state.x}
+    return shown if weights is None else {**shown, "weights_version": weights.seq}
 
 
-class CommandView(MessageView, frozen=True, kw_only=True):
-    state_run_id: str
-    state_seq: int
-    period: float
-    mode: str
-    u: Input
-    plan_entries: int
-
-    @staticmethod
-    def derived(message: m.Command) -> Json:
-        return {"plan_entries": len(message.plan)}
+def _of_result(result: m.TickResult) -> Json:
+    piece = None if result.set_margin is None else result.set_piece
+    return {"x": result.x or None, "oracle_norms": result.oracle_norms or None, "set_piece": piece}
 
 
-class TickView(MessageView, frozen=True, kw_only=True):
-    slot: int
-    t: float
-    skipped: int
-    lateness: float
-    late: bool
-    state_verdict: str
-    state_seq: int | None = None
-    x: State | None = None
-    weights_version: int | None = None
-
-    @staticmethod
-    def derived(message: m.Tick) -> Json:
-        state, weights = message.state, message.weights
-        shown = {} if state is None else {"state_seq": state.seq, "x": state.x}
-        return shown if weights is None else {**shown, "weights_version": weights.seq}
-
-
-class TickResultView(MessageView, frozen=True, kw_only=True):
-    x: State | None = None
-    u: Input
-    mode: str
-    status: str
-    iterations: int
-    slack: float
-    slack_row: str
-    h: State | None = None
-    h_hat: State | None = None
-    prediction_error: float | None = None
-    oracle_norms: State | None = None
-    hidden_version: int
-    hidden_sha256: str
-    weights_verdict: str
-    set_margin: float | None = None
-    set_piece: int | None = None
-
-    @staticmethod
-    def derived(message: m.TickResult) -> Json:
-        absent = {"set_piece": None} if message.set_margin is None else {}
-        return {"x": message.x or None, "oracle_norms": message.oracle_norms or None, **absent}
-
-
-class TickTimingView(MessageView, frozen=True, kw_only=True):
-    solve_ms: float
-    tick_ms: float
-    lateness_ms: float
-    state_age_ms: float
-
-
-class SamplesView(MessageView, frozen=True, kw_only=True):
+def _of_samples(samples: m.Samples) -> Json:
     """How many there are, and the last of them."""
-
-    count: int
-    x: State | None = None
-    u: Input | None = None
-    h: State | None = None
-
-    @staticmethod
-    def derived(message: m.Samples) -> Json:
-        count: Json = {"count": len(message.samples)}
-        return count | {
-            name: getattr(last, name) for last in message.samples[-1:] for name in ("x", "u", "h")
-        }
+    last = {name: getattr(sample, name) for sample in samples.samples[-1:] for name in ("x", "u", "h")}
+    return {"count": len(samples.samples), **last}
 
 
-class OutputWeightsView(MessageView, frozen=True, kw_only=True):
-    hidden_version: int
-    hidden_sha256: str
-    norm: float
-    column_norms: State
-
-    @staticmethod
-    def derived(message: m.OutputWeights) -> Json:
-        K = message.K.numpy()
-        # Of a K that is no matrix the norm along its first axis is a number: one entry, which is the wrong size.
-        columns = np.atleast_1d(np.linalg.norm(K, axis=0))
-        return {"norm": float(np.linalg.norm(K)), "column_norms": columns.tolist()}
+def _of_output_weights(weights: m.OutputWeights) -> Json:
+    K = weights.K.numpy()
+    # Of a K that is no matrix the norm along its first axis is a number: one entry, which is the wrong size.
+    columns = np.atleast_1d(np.linalg.norm(K, axis=0))
+    return {"norm": float(np.linalg.norm(K)), "column_norms": columns.tolist()}
 
 
-class HiddenWeightsView(MessageView, frozen=True, kw_only=True):
-    for_run: str
-    trained_on: int
-    base_sha256: str
-    samples: int
-    loss_before: float
-    loss_after: float
-    sha256: str
-    layer_norms: dict[str, float]
-
-    @staticmethod
-    def derived(message: m.HiddenWeights) -> Json:
-        norms = [float(np.linalg.norm(layer.numpy())) for layer in message.layers]
-        return {"layer_norms": {f"W_{i}": norm for i, norm in enumerate(norms, 1)}}
+def _of_hidden_weights(weights: m.HiddenWeights) -> Json:
+    norms = [float(np.linalg.norm(layer.numpy())) for layer in weights.layers]
+    return {"layer_norms": {f"W_{i}": norm for i, norm in enumerate(norms, 1)}}
 
 
-class CertifiedSetsView(MessageView, frozen=True, kw_only=True):
-    kind: str
-    sha256: str
+class Shown(NamedTuple):
+    """What is shown of one kind of message."""
+
+    fields: str
+    """Their names, in this order, after run_id and seq."""
+    made: Callable[[Any], Json] = lambda _message: {}
+    """The values of those that the message does not have, or has otherwise; None, or none at all, of what it lacks."""
+    types: Mapping[str, Any] = {}
+    """Of those, where the message's own are not right."""
 
 
-class RunInfoView(MessageView, frozen=True, kw_only=True):
-    process: str
-    versions: dict[str, str]
-    seed: int
-    units: dict[str, str]
-    unix_time: float
-
-
-class HealthView(MessageView, frozen=True, kw_only=True):
-    process: str
-    status: str
-    counters: dict[str, int]
-    note: str
-
-
-VIEW_OF: dict[Topic, type[MessageView]] = {
-    topics.PLANT_STATE: PlantStateView,
-    topics.COMMAND: CommandView,
-    topics.TICK: TickView,
-    topics.RESULT: TickResultView,
-    topics.TIMING: TickTimingView,
-    topics.SAMPLES: SamplesView,
-    topics.OUTPUT_WEIGHTS: OutputWeightsView,
-    topics.HIDDEN_WEIGHTS: HiddenWeightsView,
-    topics.SETS: CertifiedSetsView,
-    **dict.fromkeys(topics.RUN_INFO.values(), RunInfoView),
-    **dict.fromkeys(topics.HEALTH.values(), HealthView),
+SHOWN: dict[type[m.Message], Shown] = {
+    m.PlantState: Shown("t x applied source command_seq"),
+    m.Command: Shown("state_run_id state_seq period mode u plan_entries", _of_command, {"plan_entries": int}),
+    m.Tick: Shown(
+        "slot t skipped lateness late state_verdict state_seq x weights_version",
+        _of_tick,
+        {"state_seq": int | None, "x": Vector | None, "weights_version": int | None},
+    ),
+    m.TickResult: Shown(
+        "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
+        "hidden_sha256 weights_verdict set_margin set_piece",
+        _of_result,
+        {"x": Vector | None, "oracle_norms": Vector | None, "set_piece": int | None},
+    ),
+    m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),
+    m.Samples: Shown(
+        "count x u h", _of_samples, {"count": int, **dict.fromkeys(("x", "u", "h"), Vector | None)}
+    ),
+    m.OutputWeights: Shown(
+        "hidden_version hidden_sha256 norm column_norms",
+        _of_output_weights,
+        {"norm": float, "column_norms": Vector},
+    ),
+    m.HiddenWeights: Shown(
+        "for_run trained_on base_sha256 samples loss_before loss_after sha256 layer_norms",
+        _of_hidden_weights,
+        {"layer_norms": dict[str, float]},
+    ),
+    m.CertifiedSets: Shown("kind sha256"),
+    m.RunInfo: Shown("process versions seed units unix_time"),
+    m.Health: Shown("process status counters note"),
 }
 
 
@@ -199,18 +118,19 @@ class View:
 
     def __init__(self, topic: Topic, plant: Plant):
         self.topic = topic
-        self._kind = VIEW_OF[topic]
-        fields = msgspec.structs.fields(self._kind)
-        # What may be absent is declared as `kind | None`, and stands last in a schema.
-        kinds = {f.name: f.type if f.required else get_args(f.type)[0] for f in fields}
-        required = [field.name for field in fields if field.required]
-        schemas = {
-            name: _schema(kinds[name], plant) for name in sorted(kinds, key=lambda n: n not in required)
-        }
-        self._copied = [name for name in kinds if name in topic.type.__struct_fields__]
+        shown = SHOWN[topic.type]
+        own = {field.name: field.type for field in msgspec.structs.fields(topic.type)}
+        self._made = shown.made
+        self._names = ["run_id", "seq", *shown.fields.split()]
+        self._copied = [name for name in self._names if name in own]
         self._vectors = {
-            name: getattr(plant, NAMED_AFTER[kind]) for name, kind in kinds.items() if kind in NAMED_AFTER
+            name: getattr(plant, NAMED_AFTER[name]) for name in self._names if name in NAMED_AFTER
         }
+        kinds = {name: inspect.type_info({**own, **shown.types}[name]) for name in self._names}
+        # What may be absent stands last in a schema.
+        optional = [name for name, kind in kinds.items() if isinstance(kind, inspect.UnionType)]
+        required = [name for name in kinds if name not in optional]
+        schemas = {name: self._schema(name, kinds[name]) for name in (*required, *optional)}
         self.schema: Json = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             "title": f"{topic.type.__name__} (view)",
@@ -225,27 +145,30 @@ class View:
         """
         values: Json = {name: getattr(message, name) for name in self._copied}
         try:
-            values |= self._kind.derived(message)
+            values |= self._made(message)
             for name, names in self._vectors.items():
                 if (vector := values.get(name)) is not None:
                     values[name] = _named(names, vector)
         except ValueError as error:
             raise BadMessage(self.topic.name, "wrong size", str(error)) from error
-        return msgspec.json.encode(self._kind(**values))
+        shown = {name: values[name] for name in self._names if values.get(name) is not None}
+        return msgspec.json.encode(shown)
+
+    def _schema(self, name: str, kind: inspect.Type) -> Json:
+        if name in self._vectors:
+            entries = list(self._vectors[name])
+            return _object({entry: {"type": "number"} for entry in entries}, entries)
+        match kind:
+            case inspect.UnionType(types=types):
+                return self._schema(name, next(t for t in types if not isinstance(t, inspect.NoneType)))
+            case inspect.DictType(value_type=value):
+                return {"type": "object", "additionalProperties": self._schema("", value)}
+        return {"type": JSON_TYPES[type(kind)]}
 
 
 def views(plant: Plant) -> dict[str, View]:
     """The views of all topics that have one, by topic name."""
-    return {topic.name: View(topic, plant) for topic in VIEW_OF}
-
-
-def _schema(kind: Any, plant: Plant) -> Json:
-    if kind in NAMED_AFTER:
-        names = list(getattr(plant, NAMED_AFTER[kind]))
-        return _object(dict.fromkeys(names, _schema(float, plant)), names)
-    if get_origin(kind) is dict:
-        return {"type": "object", "additionalProperties": _schema(get_args(kind)[1], plant)}
-    return {"type": JSON_TYPES[kind]}
+    return {topic.name: View(topic, plant) for topic in topics.ALL if topic.type in SHOWN}
 
 
 def _object(properties: Json, required: list[str]) -> Json:

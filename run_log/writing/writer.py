@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from types import TracebackType
 
 import msgspec
 
@@ -88,20 +87,11 @@ class LogWriter:
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
 
-    @property
-    def path(self) -> Path:
-        return self.sink.path
-
-    @property
-    def error(self) -> str | None:
-        """Why the file does not grow at the moment; None when it does."""
-        return self.sink.error
-
     def write(self, name: str, payload: bytes, log_time: int) -> None:
         """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
 
         A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
-        raises for bad input or a full disk: see `counters`, `bad` and `error`.
+        raises for bad input or a full disk: see `counters`, `bad` and `sink.error`.
         """
         if len(payload) > MAX_MESSAGE or self.sink.pending > self.sink.limit:
             self.counters["dropped"] += 1
@@ -155,9 +145,7 @@ class LogWriter:
     def __enter__(self) -> LogWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _register_raw(self, name: str) -> int | None:

@@ -28,7 +28,7 @@ from network_model.description import hash_layers
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, load, override
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.replaying.replay import replay
@@ -299,7 +299,7 @@ def test_a_killed_controller_comes_back_with_its_memory(tmp_path: Path) -> None:
     belongs = ControllerCore(live, "x").memory.belongs()
     waiting = health_of("controller", note="no plant: waiting for its states")
     with (
-        Router(live),
+        open_router(live),
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):
@@ -351,7 +351,7 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
             writer.offer(Snapshot(5, other.memory.lasting(), {"ticks": 1000}))
     states: list[m.PlantState] = simulate(live, 3).plant_states
     with (
-        Router(live),
+        open_router(live),
         Bus(live, "recorder", "recorder-a") as bus,
         Bus(live, "plant", "plant-simulated") as plant,
     ):

@@ -20,7 +20,7 @@ from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import one_blas_thread
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
@@ -119,7 +119,7 @@ def tick_with_weights(message: m.Message) -> bool:
 def run() -> Iterator[Run]:
     config = live_config(*SETTINGS)
     with (
-        Router(config),
+        open_router(config),
         Bus(config, "trainer", "trainer-a") as trainer,
         Process("plant_sim.node", config),
     ):
@@ -283,7 +283,7 @@ class Script:
 @pytest.mark.live
 def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
     config = live_config(*SETTINGS)
-    with Router(config), Bus(config, "recorder", "recorder-a") as bus:
+    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
         ear = BusListener(bus)
         script = Script(config)
         with Process("controller_node.node", config) as process:
@@ -342,7 +342,7 @@ def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
 def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None:
     """The plant's clock has lost five seconds: no ticks without a state meanwhile, and control afterwards."""
     config = live_config(*SETTINGS)
-    with Router(config), Bus(config, "recorder", "recorder-a") as bus:
+    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
         ear = BusListener(bus)
         script = Script(config)
 
@@ -377,7 +377,7 @@ def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None
 @pytest.mark.live
 def test_another_plant_is_followed_after_silence() -> None:
     config = live_config(*SETTINGS, "bus.follow_silence=0.3")
-    with Router(config), Bus(config, "recorder", "recorder-a") as bus:
+    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
         ear = BusListener(bus)
 
         def fresh_from(run_id: str) -> m.Tick:

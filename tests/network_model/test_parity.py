@@ -16,6 +16,7 @@ from network_model.description import NetworkDescription
 from network_model.operations import BOUNDED, Activation
 from network_model.registry import architecture_names, get_architecture
 from tests.helpers.science import function
+from tests.helpers.torch_network import h_hat_of, phi_of
 from trainer_node.network import Network
 
 ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
@@ -71,7 +72,7 @@ def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) 
     network = Network(description, torch.float64)
     network.load(hidden)
     rows = network.tensor(windows.reshape(points, -1)).requires_grad_()
-    values = network(rows, network.tensor(K))
+    values = h_hat_of(network, rows, network.tensor(K))
     slopes = [torch.autograd.grad(values[:, i].sum(), rows, retain_graph=True)[0].numpy() for i in range(d)]
 
     oracle = DnnOracle(description)
@@ -91,7 +92,7 @@ def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) 
         bound = 1e-12 * (1 + np.abs(found * per_unit).max())
         assert (np.abs(along_window - found) * per_unit).max() < bound
 
-    phi = network.features(rows)
+    phi = phi_of(network, rows)
     assert phi.shape == (points, description.features)
     assert bool((phi[:, 0] == 1.0).all())
     assert bool((phi.square().sum(dim=1) <= description.features).all())
@@ -111,7 +112,7 @@ def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> N
     network.load(hidden)
     expressions, theta = function(oracle), oracle.pack(hidden, K)
     for x in (-60.0, -5.0, 0.0, 19.9, 20.1, 21.0, 30.0, 49.0, 51.0, 600.0):
-        ours = network(network.tensor([[x, 0.0]]), network.tensor(K)).item()
+        ours = h_hat_of(network, network.tensor([[x, 0.0]]), network.tensor(K)).item()
         assert abs(ours - float(expressions([x], [0.0], theta)[0])) < 1e-12
 
 

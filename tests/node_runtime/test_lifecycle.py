@@ -28,7 +28,7 @@ from node_runtime.realtime.scheduling import (
     punctual,
     quick_handover,
 )
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import messages as m
 from protocol import topics
 from tests.helpers.live import HANG_S, BusListener, health_of, live_config, matched, wait_for
@@ -256,7 +256,11 @@ def test_garbage_is_collected_between_steps_only() -> None:
 @pytest.mark.live
 def test_health_is_heard_regularly_and_at_every_change() -> None:
     config = live_config()
-    with Router(config), Bus(config, "recorder", "r") as listener, Bus(config, "plant", "plant-a") as bus:
+    with (
+        open_router(config),
+        Bus(config, "recorder", "r") as listener,
+        Bus(config, "plant", "plant-a") as bus,
+    ):
         ear = BusListener(listener)
         wait_for(lambda: matched(bus, topics.HEALTH["plant"]) and matched(bus, topics.RUN_INFO["plant"]))
         info = run_info(config, "plant", "plant-a", {"z": "1"})

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lbmpc.plants import Plant, PlantError, Truth, get_plant
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from plant_sim import node
 from plant_sim.simulator import PlantSim
 from plant_sim.watchdog import Orders, Standby
@@ -316,7 +316,7 @@ def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
 def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
     # The stranger must stay one, however slow this machine is.
     config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]", "bus.follow_silence=60.0")
-    with Router(config), Bus(config, "controller", "controller-a") as bus:
+    with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
@@ -355,7 +355,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
 def test_a_plant_whose_motion_ends_says_why() -> None:
     config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
     high = float(PLANT.u_max[0])
-    with Router(config), Bus(config, "controller", "controller-a") as bus:
+    with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             failed = health_of("plant", status="failed")

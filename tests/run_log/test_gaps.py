@@ -13,7 +13,7 @@ from node_runtime.bus.session import PATIENT_LEASE_MS, lease_ms
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import override
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.reading.gaps import lost_ticks, stretches
@@ -39,7 +39,7 @@ def test_a_recorder_without_a_core_for_longer_than_the_lease_loses_nothing(tmp_p
     """Real-time loops that need both cores did that: the router cut the recorder's link, and seconds were lost."""
     path = tmp_path / "run.mcap"
     config = live_config(f"bus.lease_ms={LEASE_S * 1e3:.0f}", f'log.path="{path}"', f"rate={rate}")
-    with Router(config), Process("run_log.writing.recorder", config) as recorder:
+    with open_router(config), Process("run_log.writing.recorder", config) as recorder:
         # The lease in question is the recorder's: the other side's link holds, however late this process is.
         with Bus(override(config, ["bus.lease_ms=60000"]), "controller", "controller-a") as bus:
             wait_for(lambda: matched(bus, topics.TIMING) and matched(bus, topics.BATCH["controller"]))

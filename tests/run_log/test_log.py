@@ -226,10 +226,10 @@ def test_an_unwritable_place_is_an_error_or_is_waited_for(tmp_path: Path, config
     writer = LogWriter(path, config, PLANT, patient=True)
     writer.write("plant/state", b"early", 1)
     assert not writer.flush()
-    assert writer.error is not None
+    assert writer.sink.error is not None
     (tmp_path / "file").unlink()
     assert writer.flush()
-    assert writer.error is None
+    assert writer.sink.error is None
     writer.close()
     assert read_run(path).bad == {"plant/state: malformed": 1}
 
@@ -256,8 +256,8 @@ def test_after_a_full_disk_the_log_goes_on_where_it_stopped(
         for topic, message, log_time in messages[: 2 * third]:
             writer.write(topic.name, codec.encode(message), log_time)
         assert not writer.flush()
-        assert writer.error is not None
-        assert "cannot be written" in writer.error
+        assert writer.sink.error is not None
+        assert "cannot be written" in writer.sink.error
         assert path.stat().st_size == limit
         assert read_run(path).truncated
     for topic, message, log_time in messages[2 * third :]:
@@ -290,7 +290,7 @@ def test_sink_keeps_its_place_in_a_torn_write(tmp_path: Path) -> None:
     with file_size_limit(1500):
         for piece in data:
             sink.write(piece)
-        assert not sink.drain()
+        assert not sink.flush()
         assert (sink.written, sink.pending, sink.tell()) == (1500, 3500, 5000)
     assert sink.close()
     assert (tmp_path / "file").read_bytes() == b"".join(data)

@@ -16,7 +16,7 @@ import zenoh
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config, override
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.live
 @pytest.fixture(scope="module")
 def base() -> Iterator[Config]:
     config = live_config("controller.horizon=20", "controller.keyframe_every=20", "controller.oracle=linear")
-    with Router(config):
+    with open_router(config):
         yield config
 
 

@@ -27,7 +27,7 @@ from node_runtime.config.sections import BusConfig, Config, TrainerConfig, to_js
 from node_runtime.health import HealthPublisher
 from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol.messages import Array, Health, HiddenSnapshot, HiddenWeights, OutputWeights, Sample, Samples
 from tests.helpers.live import PROGRAM
@@ -56,7 +56,7 @@ def config() -> Iterator[Config]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     config = Config(trainer=TRAINING, bus=BusConfig(endpoint=f"tcp/127.0.0.1:{port}", follow_silence=0.2))
-    with Router(config):
+    with open_router(config):
         yield config
 
 

@@ -17,6 +17,7 @@ from network_model.description import NetworkDescription, hash_layers, initial_h
 from node_runtime.config.sections import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
 from tests.helpers.paths import ROOT
+from tests.helpers.torch_network import h_hat_of
 from trainer_node import training
 from trainer_node.network import DenseLoss, Network
 from trainer_node.training import Trainer, TrainerError, pick_device
@@ -282,7 +283,9 @@ def test_the_gradient_written_out_is_that_of_autograd(activations: Any) -> None:
     network.load([rng.normal(size=shape) for shape in description.layer_shapes])
     weights, xu, h = rng.normal(size=(6, 4)), rng.normal(size=(50, 5)), 0.01 * rng.normal(size=(50, 4))
     by_hand = DenseLoss(network, xu, h, weights)
-    error = network.scaled_targets(network(network.tensor(xu), network.tensor(weights)) - network.tensor(h))
+    error = network.scaled_targets(
+        h_hat_of(network, network.tensor(xu), network.tensor(weights)) - network.tensor(h)
+    )
     loss = error.square().sum(dim=1).mean()
     loss.backward()
     assert by_hand.value() == pytest.approx(loss.item(), rel=1e-12)

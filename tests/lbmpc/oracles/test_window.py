@@ -20,6 +20,7 @@ from node_runtime.config.sections import TrainerConfig
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.science import compressor, describe, features
+from tests.helpers.torch_network import phi_of
 from trainer_node.network import Network
 from trainer_node.training import Trainer
 
@@ -119,7 +120,7 @@ def test_the_trainer_sees_the_window_that_the_controller_saw() -> None:
     network = Network(ORACLE.description, torch.float64)
     network.load(trainer.hidden)
     with torch.no_grad():
-        theirs = network.features(network.tensor(trainer.buffer.contents()[0])).numpy()
+        theirs = phi_of(network, network.tensor(trainer.buffer.contents()[0])).numpy()
     np.testing.assert_allclose(theirs, phis, atol=1e-12)
     assert trainer.counters["bad samples"] == 0
     short = m.Sample(99, [0.0] * D, [0.0] * M, [0.0] * D, [[0.0] * (D + M)] * 2)

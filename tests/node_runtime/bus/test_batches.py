@@ -13,7 +13,7 @@ from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config, override
 from node_runtime.rejected import RejectedMessages
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
@@ -110,7 +110,7 @@ def test_only_a_fast_loop_sends_batches(rate: float, together: bool) -> None:
 @pytest.fixture(scope="module")
 def config() -> Iterator[Config]:
     config = override(live_config(), ["rate=1000"])
-    with Router(config):
+    with open_router(config):
         yield config
 
 

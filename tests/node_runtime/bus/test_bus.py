@@ -16,7 +16,7 @@ from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted, session_config
 from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, Process, connected, free_endpoint, live_config, matched, wait_for
@@ -39,7 +39,7 @@ def keyframe(seq: int, size: int) -> m.Keyframe:
 @pytest.fixture(scope="module")
 def config() -> Iterator[Config]:
     config = live_config()
-    with Router(config):
+    with open_router(config):
         yield config
 
 
@@ -277,7 +277,7 @@ def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controlle
 def test_a_router_restart_is_survived() -> None:
     config = live_config()
     with (
-        Router(config) as first,
+        open_router(config) as first,
         Bus(config, "plant", "plant-a") as plant,
         Bus(config, "controller", "controller-a") as controller,
     ):
@@ -287,7 +287,7 @@ def test_a_router_restart_is_survived() -> None:
         first.close()
         wait_for(lambda: not connected(plant) and not connected(controller))
         plant.publish(topics.PLANT_STATE, state(0))
-        with Router(config):
+        with open_router(config):
             wait_for(
                 lambda: connected(plant) and connected(controller) and matched(plant, topics.PLANT_STATE)
             )
@@ -303,7 +303,7 @@ def test_opening_waits_for_the_router() -> None:
     opening.start()
     opening.join(0.3)
     assert opening.is_alive()
-    with Router(config):
+    with open_router(config):
         opening.join(HANG_S)
         assert not opening.is_alive()
         assert connected(bus)

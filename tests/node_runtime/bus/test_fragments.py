@@ -22,7 +22,7 @@ from node_runtime.bus.fragments import (
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.config.sections import Config
 from node_runtime.rejected import RejectedMessages
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, live_config, matched, wait_for
@@ -145,7 +145,7 @@ def test_strangers_cannot_fill_the_memory() -> None:
 @pytest.fixture(scope="module")
 def config() -> Iterator[Config]:
     config = live_config()
-    with Router(config):
+    with open_router(config):
         yield config
 
 

@@ -17,7 +17,7 @@ from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus, session_config
 from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, live_config, wait_for
@@ -137,7 +137,7 @@ def test_the_kinds_of_bad_messages_are_bounded() -> None:
 def buses() -> Iterator[tuple[Bus, zenoh.Session]]:
     """A bus, and a stranger's session that may send any bytes."""
     config = live_config("bus.follow_silence=30.0")
-    with Router(config), Bus(config, "controller", "controller-x") as bus:
+    with open_router(config), Bus(config, "controller", "controller-x") as bus:
         stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
         yield bus, stranger
         stranger.close()

@@ -20,7 +20,7 @@ from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
-from node_runtime.router import Router, open_to_all
+from node_runtime.router import open_router, open_to_all
 from node_runtime.tls import access_control, credentials
 from node_runtime.tls.client import refusal
 from node_runtime.tls.zenoh_log import MAX_NAMES, Refusals
@@ -354,7 +354,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
     far = override(site.far("trainer", "jet1"), [f'bus.endpoint="{remote}"'])
     short = override(far, [f'bus.tls.keys="{site.folder / "jet1" / place}"'])
     with (
-        Router(local),
+        open_router(local),
         Bus(local, "controller", "c-1") as controller,
         Bus(far, "trainer", "t-1") as trainer,
         Bus(short, "trainer", "t-2") as brief,
@@ -407,7 +407,7 @@ def test_a_router_lets_other_machines_in_with_certificates_only():
         ('bus.remote="tls/0.0.0.0:7448"', r"bus\.tls\.keys is missing"),
     ):
         with ExitStack() as stack, pytest.raises(ConfigError, match=says):
-            stack.enter_context(Router(live_config(assignment)))
+            stack.enter_context(open_router(live_config(assignment)))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from node_runtime.config.sections import Config
 from node_runtime.health import HealthPublisher, HealthThread
 from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import topics
 from protocol.messages import ProcessStatus
 from tandem.commands import health
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.live
 def config() -> Iterator[Config]:
     """Of a bus with a router on it and nobody else."""
     config = live_config()
-    with Router(config):
+    with open_router(config):
         yield config
 
 
