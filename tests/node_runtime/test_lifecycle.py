@@ -220,7 +220,7 @@ def test_everything_is_as_before_after_a_punctual_loop() -> None:
 def test_a_child_does_not_inherit_its_supervisors_priority() -> None:
     program = (
         "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1));"
-        "from tandem.live import child; sys.argv = ['child', str(os.getppid()), 'config', 'show', '--json'];"
+        "from tandem import child; sys.argv = ['child', str(os.getppid()), 'config', 'show', '--json'];"
         "child.main(); print(os.sched_getscheduler(0), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
