@@ -39,7 +39,7 @@ def build(config: Config, run_id: str) -> PlantSim:
     """The plant that the configuration names. Raises `ConfigError`."""
     try:
         plant = get_plant(config.plant.model)
-    except KeyError as error:
+    except LookupError as error:
         raise ConfigError(f"plant.model: {error.args[0]}") from None
     x0 = plant.x0 if config.plant.x0 is None else np.array(config.plant.x0, dtype=float)
     if x0.shape != plant.x0.shape:

@@ -11,11 +11,12 @@ def plant_of(config: Config) -> Plant:
     """The plant that `config` names, with every length in `config` checked against it.
 
     Raises:
-        ConfigError: unknown plant or variable, or a vector of the wrong length; names the key and the rule.
+        ConfigError: a plant that is unknown or cannot be used, an unknown variable, or a vector of the wrong length;
+            names the key and the rule.
     """
     try:
         plant = get_plant(config.plant.model)
-    except KeyError as error:
+    except LookupError as error:
         raise ConfigError(f"plant.model = {config.plant.model!r}: {error.args[0]}") from error
     states, inputs = ", ".join(plant.states), ", ".join(plant.inputs)
     vectors = [

@@ -47,7 +47,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         try:
             plant = get_plant(config.plant.model)
             writer = PartedLog(config, plant, now=clock.now(), start_ns=time.time_ns())
-        except (LogError, KeyError) as error:
+        except (LogError, LookupError) as error:
             log.error("%s", error.args[0])
             return EXIT_CANNOT
         if writer.error is not None:

@@ -42,6 +42,8 @@ class Gauge:
     low: float
     high: float
     target: float
+    scale: float
+    """What counts as 1: the half-width where both bounds are finite."""
 
 
 @dataclass(frozen=True)
@@ -326,8 +328,11 @@ class Monitor:
                 plant.x_min,
                 plant.x_max,
                 plant.x_e,
+                plant.x_scale,
             ),
-            inputs=_gauges(plant.inputs, plant.units, self._input, plant.u_min, plant.u_max, plant.u_e),
+            inputs=_gauges(
+                plant.inputs, plant.units, self._input, plant.u_min, plant.u_max, plant.u_e, plant.u_scale
+            ),
             source=self._state.source if self._state else "",
             ticks=self._ticks,
             measured_rate=_rate(self._tick_times, now),
@@ -375,6 +380,7 @@ def _gauges(
     low: np.ndarray,
     high: np.ndarray,
     target: np.ndarray,
+    scale: np.ndarray,
 ) -> tuple[Gauge, ...]:
     return tuple(
         Gauge(
@@ -384,6 +390,7 @@ def _gauges(
             float(low[i]),
             float(high[i]),
             float(target[i]),
+            float(scale[i]),
         )
         for i, name in enumerate(names)
     )

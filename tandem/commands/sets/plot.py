@@ -34,7 +34,7 @@ def run(file: Path, log: Path | None, out: Path | None, as_json: bool) -> int:
     except (CertificateError, ModelError) as error:
         terminal.complain(f"refused: {error}", as_json)
         return REFUSED
-    except KeyError as error:
+    except LookupError as error:
         raise Refused(f"{file}: {error.args[0]}") from error
     states, x0 = None, plant.x0
     if log is not None:
