@@ -100,7 +100,7 @@ def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:
     else:
         # A bound may be infinite.
         unusable = np.isnan(value) if field.endswith(("_min", "_max")) else ~np.isfinite(value)
-        for i in np.flatnonzero(unusable):
+        for i in np.flatnonzero(unusable).tolist():
             yield f"{field} of {names[i]} is {value[i]:g}: give a finite number"
 
 
@@ -128,10 +128,11 @@ def _bounds(plant: Plant) -> Iterator[str]:
                     f"{between}: give both bounds, or scale={{{name!r}: ...}}, the half-width that counts as 1 where "
                     "there is no bound"
                 )
-    for i in np.flatnonzero(plant.W < 0.0):
+    for i in np.flatnonzero(plant.W < 0.0).tolist():
         yield f"W of {plant.states[i]} is {plant.W[i]:g}: a half-width is at least 0"
     ordered = plant.u_min < plant.u_max
-    for i in np.flatnonzero(ordered & ((plant.safe_input < plant.u_min) | (plant.safe_input > plant.u_max))):
+    outside = (plant.safe_input < plant.u_min) | (plant.safe_input > plant.u_max)
+    for i in np.flatnonzero(ordered & outside).tolist():
         yield (
             f"safe_input of {plant.inputs[i]} is {plant.safe_input[i]:g}, outside u_min = {plant.u_min[i]:g} and "
             f"u_max = {plant.u_max[i]:g}: the plant cannot apply it"
@@ -267,7 +268,7 @@ def _numeric(value: Any) -> bool:
 
 
 def _is_index(value: Any, length: int) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= value < length
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) < length
 
 
 def _indices(plant: Plant) -> str:
