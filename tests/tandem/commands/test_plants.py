@@ -1,4 +1,4 @@
-"""A plant of one's own at the command line: one that cannot be used is refused by all alike, one without bounds works."""
+"""A plant of one's own at the command line: a faulty one is refused by all alike, one without bounds works."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from controller_node.build import build_backup, build_controller, build_model
 from lbmpc.controller.signals import Observation
 from lbmpc.plants import PLANTS, Plant
+from lbmpc.solver.rows import Rows
 from node_runtime.config.sections import Config, override
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
@@ -118,6 +119,9 @@ def test_without_bounds_there_is_a_policy_for_the_controllers_silence(
     config = override(Config(), ON_TRACK)
     controller, _ = build_controller(config, build_model(config))
     seen = Observation(np.array([-0.9, 0.0]), None, 1, 0, None)
+    # A state's rows count violations in its half-widths, and in the plant's own scale where it has a bound on one side.
+    weighed = Rows(controller.problem).penalty.scale
+    np.testing.assert_array_equal(weighed[-2:], controller.model.plant.x_scale)
     state, _ = controller.step(controller.initial_state(0), seen)
     policy = controller.backup(build_backup(config, controller.problem), state)
     assert policy is not None
