@@ -40,12 +40,11 @@ def build_plant(config: Config) -> Plant:
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
-    """The network of the configuration for this plant; inputs are scaled by the half-widths of X and U.
+    """The network of the configuration for this plant; inputs are scaled by its half-widths.
 
     Raises:
         ValueError: the sizes or the options do not fit the architecture, or there is none of that name.
     """
-    half_widths = np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
     network = config.network
     architecture = get_architecture(network.architecture)
     return NetworkDescription(
@@ -53,7 +52,7 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
         inputs=plant.m,
         hidden=network.hidden,
         activations=[network.activation] * len(network.hidden),
-        input_scale=half_widths.tolist(),
+        input_scale=[*plant.x_scale.tolist(), *plant.u_scale.tolist()],
         output_scale=[network.output_scale * config.period] * plant.d,
         max_layer_norm=network.max_layer_norm,
         architecture=network.architecture,

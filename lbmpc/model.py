@@ -15,6 +15,7 @@ from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
 
 from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.base import Plant
+from lbmpc.plants.inspection import PlantDefinitionError, require_model
 from lbmpc.pole_placement import place
 
 Pieces = tuple[tuple[float, np.ndarray], ...]
@@ -130,15 +131,7 @@ class Model:
 
 def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     """Continuous-time Jacobians of the plant's own equations at (x_e, u_e): (d, d) and (d, m)."""
-    f = plant.function()
-    x, u = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m)
-    dx = f(x, u)
-    jacobian = ca.Function("jacobian", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
-    residual, a, b = (np.array(value) for value in jacobian(plant.x_e, plant.u_e))
-    if np.abs(residual).max() > 1e-5:
-        raise ModelError(
-            f"{plant.name}: (x_e, u_e) is not an equilibrium: dx/dt there is {residual.ravel().tolist()}"
-        )
+    _rest, a, b = plant.linearised()
     return a, b
 
 
@@ -160,8 +153,12 @@ def build_model(
     (A+BK)' P (A+BK) - P = -(Q + K'RK).
 
     Raises:
-        ModelError: no equilibrium, not stabilisable, or weights of the wrong length.
+        ModelError: the plant cannot be used as it is described, is not stabilisable, or weights of the wrong length.
     """
+    try:
+        require_model(plant)
+    except PlantDefinitionError as error:
+        raise ModelError(str(error)) from error
     a_c, b_c = linearise(plant)
     a, b = discretise(a_c, b_c, period)
     q = np.diag(_weights("Q", Q, plant.d))

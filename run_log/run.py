@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from lbmpc.plants import Plant, get_plant
+from lbmpc.plants import Plant, PlantDefinitionError, get_plant
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
@@ -127,10 +127,12 @@ def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], pat
 
 
 def plant_of(run: Run) -> Plant:
-    """The plant that the run is about. Raises `LogError` when this Tandem does not have it."""
+    """The plant that the run is about. Raises `LogError` when this Tandem does not have it, or cannot use it."""
     try:
         return get_plant(run.config.plant.model)
     except KeyError as error:
         raise LogError(
             f"{run.path}: {error.args[0]} The log needs the plant that it was made with."
         ) from error
+    except PlantDefinitionError as error:
+        raise LogError(f"{run.path}: {error}") from error

@@ -91,7 +91,7 @@ def _silence(
     sim.command(msgspec.structs.replace(command, state_seq=0), delay)
     if backup is not None:
         sim.backup(backup)
-    half = 0.5 * (plant.x_max - plant.x_min)
+    half = plant.x_scale
     depths: list[float] = []
     for k in range(1, round(LONG * config.rate) + 1):
         try:

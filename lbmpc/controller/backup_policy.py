@@ -173,7 +173,7 @@ class BackupPlanner:
 def _rows(problem: Problem, margin: float) -> Rows:
     """The rows of the learned states inside (1 - margin) X."""
     plain = state_set(problem.model)
-    inside = margin * 0.5 * (plain.upper - plain.lower)
+    inside = margin * problem.model.plant.x_scale
     shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
     states = tuple(plain.minus(share * inside, share * inside) for share in shares)
     return Rows(replace(problem, states=states, soft=True, guard=None))
@@ -202,8 +202,8 @@ def tracking_gain(model: Model) -> np.ndarray:
     plant = model.plant
     weights = np.full(model.d, 1e-6)
     weights[list(plant.performance)] = STIFFNESS
-    Q = np.diag(weights / (0.5 * (plant.x_max - plant.x_min)) ** 2)
-    R = np.diag(1.0 / (0.5 * (plant.u_max - plant.u_min)) ** 2)
+    Q = np.diag(weights / plant.x_scale**2)
+    R = np.diag(1.0 / plant.u_scale**2)
     try:
         P = solve_discrete_are(model.A, model.B, Q, R)
     except np.linalg.LinAlgError:

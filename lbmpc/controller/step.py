@@ -45,8 +45,8 @@ class Solves(Protocol):
 
 
 ABSURD = 1e6
-"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Its square,
-in plant units, where X has no bounds. Finite alone is not enough: what is learned from 1e307 is not."""
+"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Finite
+alone is not enough: what is learned from 1e307 is not."""
 
 
 class Controller:
@@ -63,9 +63,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self.oracle = problem.oracle
-        plant = self.model.plant
-        half = 0.5 * (plant.x_max - plant.x_min)
-        self._absurd = np.where(np.isfinite(half), ABSURD * half, ABSURD**2)
+        self._absurd = ABSURD * self.model.plant.x_scale
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""

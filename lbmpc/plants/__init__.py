@@ -5,17 +5,24 @@ from __future__ import annotations
 import difflib
 
 from lbmpc.plants.base import Plant, PlantError, Truth
+from lbmpc.plants.inspection import PlantDefinitionError, require_sound
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 
 PLANTS: dict[str, Plant] = {plant.name: plant for plant in (MOORE_GREITZER,)}
 
-__all__ = ["PLANTS", "Plant", "PlantError", "Truth", "get_plant"]
+__all__ = ["PLANTS", "Plant", "PlantDefinitionError", "PlantError", "Truth", "get_plant"]
 
 
 def get_plant(name: str) -> Plant:
-    """The plant of that name. Raises `KeyError` with the nearest known name."""
+    """The plant of that name, looked at.
+
+    Raises:
+        LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with what is wrong with it.
+    """
     try:
-        return PLANTS[name]
+        plant = PLANTS[name]
     except KeyError:
         near = difflib.get_close_matches(name, PLANTS, n=1, cutoff=0.0)
         raise KeyError(f"no plant is called {name!r}; did you mean {near[0]!r}?") from None
+    require_sound(plant)
+    return plant

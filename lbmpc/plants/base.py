@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -16,6 +17,9 @@ import numpy as np
 from lbmpc.casadi_buffers import Bound
 
 INTEGRATION_TOLERANCE = 1e-12
+STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
+INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
+TUPLES = ("states", "inputs", "performance", "kernel", "poles", "positive")
 Rhs = Callable[[Any, Any], list[Any]]
 
 
@@ -36,7 +40,8 @@ class Domain:
 class Plant:
     """A continuous-time plant dx/dt = f(x, u) with box constraints, in its own units.
 
-    Shapes: d states, m inputs; `x_*` are (d,), `u_*` are (m,), `W` is (d,).
+    Shapes: d states, m inputs; `x_*` are (d,), `u_*` are (m,), `W` is (d,). Lists are accepted for arrays and tuples.
+    Nothing is checked here: `lbmpc.plants.get_plant` and `lbmpc.model.build_model` refuse a plant that cannot be used.
     """
 
     name: str
@@ -50,6 +55,7 @@ class Plant:
     """Equilibrium about which the model is linearised."""
     u_e: np.ndarray
     x_min: np.ndarray
+    """Bounds of X; infinite where there is none, and then `scale` has this state. As for `u_min` and `u_max`."""
     x_max: np.ndarray
     u_min: np.ndarray
     u_max: np.ndarray
@@ -68,12 +74,21 @@ class Plant:
     poles: tuple[complex, ...] | None = None
     """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
     positive: tuple[Domain, ...] = ()
+    scale: Mapping[str, float] = field(default_factory=dict)
+    """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What states and inputs are called in a person's words, by name."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """What the equations are built with, by name; empty where they cannot be varied."""
     equations: Callable[..., Rhs] | None = None
     """`rhs` from `parameters`, given by name."""
+
+    def __post_init__(self) -> None:
+        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
+            object.__setattr__(self, name, _array(getattr(self, name)))
+        for name in TUPLES:
+            value = getattr(self, name)
+            object.__setattr__(self, name, tuple(value) if isinstance(value, list) else value)
 
     def varied(self, **changes: float) -> Plant:
         """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
@@ -96,10 +111,44 @@ class Plant:
     def m(self) -> int:
         return len(self.inputs)
 
+    @cached_property
+    def x_scale(self) -> np.ndarray:
+        """What counts as 1 in each state, (d,): X's half-width where it is finite, else what `scale` says."""
+        return self._half_widths(self.states, self.x_min, self.x_max)
+
+    @cached_property
+    def u_scale(self) -> np.ndarray:
+        """What counts as 1 in each input, (m,), as for `x_scale`."""
+        return self._half_widths(self.inputs, self.u_min, self.u_max)
+
+    def _half_widths(self, names: tuple[str, ...], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            half = 0.5 * (high - low)
+        for i in np.flatnonzero(~np.isfinite(half)):
+            half[i] = self.scale[names[i]]
+        return half
+
     def function(self) -> ca.Function:
         """f as a CasADi function (x, u) -> dx/dt."""
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
         return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
+
+    def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
+        f = self.function()
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        dx = f(x, u)
+        jacobian = ca.Function("jacobian", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
+        residual, a, b = (np.array(value) for value in jacobian(self.x_e, self.u_e))
+        return residual[:, 0], a, b
+
+
+def _array(value: Any) -> Any:
+    """Numbers as an array; what are none stays as it is, for whoever looks at the plant to name."""
+    try:
+        return None if value is None else np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return value
 
 
 class Truth:

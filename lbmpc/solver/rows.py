@@ -36,8 +36,10 @@ class Rows:
             b[: self.count_inputs].reshape(n, m) for b in (self.lower, self.upper)
         )
         self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
-        width = self.upper - self.lower
-        scale = np.where(np.isfinite(width), 0.5 * width, np.maximum(np.abs(self.upper), 1e-3))
+        half, plant = 0.5 * (self.upper - self.lower), problem.model.plant
+        terminal = np.maximum(np.abs(self.upper[len(half) - len(self.terminal_rows) :]), 1e-3)
+        unbounded = np.concatenate([np.tile(plant.u_scale, n), np.tile(plant.x_scale, n), terminal])
+        scale = np.where(np.isfinite(half), half, unbounded)
         # The scale of a row is that of its plain set: tightening must not make a violation weigh more.
         plain = np.tile(scale[self.count_inputs + common :][:common] if n > 1 else scale[-common:], n)
         scale[self.count_inputs : self.count_inputs + common * n] = plain

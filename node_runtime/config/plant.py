@@ -34,14 +34,15 @@ def plant_of(config: Config, find: Callable[[str], P]) -> P:
     """The plant that `config` names, with every length in `config` checked against it.
 
     Args:
-        find: `lbmpc.plants.get_plant`; raises KeyError with a text for a name that it does not know.
+        find: `lbmpc.plants.get_plant`; raises LookupError with a text for a plant that is unknown or cannot be used.
 
     Raises:
-        ConfigError: unknown plant or variable, or a vector of the wrong length; names the key and the rule.
+        ConfigError: a plant that is unknown or cannot be used, an unknown variable, or a vector of the wrong length;
+            names the key and the rule.
     """
     try:
         plant = find(config.plant.model)
-    except KeyError as error:
+    except LookupError as error:
         raise ConfigError(f"plant.model = {config.plant.model!r}: {error.args[0]}") from error
     for key, values, what, names in (
         ("plant.x0", config.plant.x0, "states", plant.states),

@@ -93,10 +93,13 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float)
         ax.axhline(bound, color=VERMILION, linestyle=(0, (6, 2)), linewidth=1.2, label=label)
         beyond = bottom - margin if bound == low else top + margin
         ax.axhspan(bound, beyond, color=VERMILION, alpha=0.08, linewidth=0)
-    hidden = ", ".join(f"{bound:g}" for bound in (low, high) if bound not in drawn)
+    hidden = ", ".join(f"{bound:g}" for bound in (low, high) if bound not in drawn and np.isfinite(bound))
     if hidden:
         ax.plot([], [], " ", label=f"bounds beyond the\naxis: {hidden}")
     distance = float(min((values - low).min(), (high - values).min()))
+    if not np.isfinite(distance):
+        # No bounds on either side.
+        return
     inside = (
         f"inside by {max(distance, 0.0):.2g}" if distance >= -TOLERANCE else f"OUTSIDE by {-distance:.2g}"
     )
@@ -131,7 +134,7 @@ def _model_errors(data: Traces) -> list[int]:
     """States whose measured model error is not negligible beside the largest, in units of its bounds."""
     if not np.isfinite(data.h).any():
         return []
-    largest = np.nanmax(np.abs(data.h), axis=0) / (data.plant.x_max - data.plant.x_min)
+    largest = np.nanmax(np.abs(data.h), axis=0) / data.plant.x_scale
     return [int(i) for i in np.flatnonzero(largest > MATTERS * largest.max())]
 
 

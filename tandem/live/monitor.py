@@ -42,6 +42,8 @@ class Gauge:
     low: float
     high: float
     target: float
+    scale: float
+    """What counts as 1: the half-width where both bounds are finite."""
 
 
 @dataclass(frozen=True)
@@ -299,8 +301,8 @@ class Monitor:
             self._seen,
             phase=self.phase,
             elapsed=None if self.first_command is None else now - self.first_command,
-            states=_gauges(plant.states, self._x, plant.x_min, plant.x_max, plant.x_e),
-            inputs=_gauges(plant.inputs, self._u, plant.u_min, plant.u_max, plant.u_e),
+            states=_gauges(plant.states, self._x, plant.x_min, plant.x_max, plant.x_e, plant.x_scale),
+            inputs=_gauges(plant.inputs, self._u, plant.u_min, plant.u_max, plant.u_e, plant.u_scale),
             measured_rate=_rate(self._tick_times, now),
             solve_ms=_percentiles(self._solve_ms),
             tick_ms=_percentiles(self._tick_ms),
@@ -325,8 +327,9 @@ def _gauges(
     low: np.ndarray,
     high: np.ndarray,
     target: np.ndarray,
+    scale: np.ndarray,
 ) -> tuple[Gauge, ...]:
-    rows = zip(names, values or [None] * len(names), low, high, target, strict=True)
+    rows = zip(names, values or [None] * len(names), low, high, target, scale, strict=True)
     return tuple(Gauge(*row) for row in rows)
 
 

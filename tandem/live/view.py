@@ -140,22 +140,25 @@ def _number(gauge: Gauge) -> str:
 def _gauge_style(gauge: Gauge) -> str:
     if gauge.value is None:
         return "dim"
-    margin = min(gauge.value - gauge.low, gauge.high - gauge.value) / (gauge.high - gauge.low)
+    margin = min(gauge.value - gauge.low, gauge.high - gauge.value) / (2 * gauge.scale)
     if margin < -1e-6:
         return "bold red"
     if margin < 0.05:
         return "bold yellow"
-    return "green" if abs(gauge.value - gauge.target) <= 0.02 * (gauge.high - gauge.low) else "default"
+    return "green" if abs(gauge.value - gauge.target) <= 0.04 * gauge.scale else "default"
 
 
 def _bar(gauge: Gauge, cells: int) -> Text:
-    """low ├────┼───●───┤ high; ┼ is where it should come to rest."""
+    """low ├────┼───●───┤ high; ┼ is where it should come to rest, and an end without a bound is ╌."""
+    bounded = math.isfinite(gauge.low), math.isfinite(gauge.high)
+    low = gauge.low if bounded[0] else gauge.target - gauge.scale
+    high = gauge.high if bounded[1] else gauge.target + gauge.scale
 
     def cell(value: float) -> int:
-        return round((cells - 1) * (value - gauge.low) / (gauge.high - gauge.low))
+        return round((cells - 1) * (value - low) / (high - low))
 
     marks = ["─"] * cells
-    marks[0], marks[-1] = "├", "┤"
+    marks[0], marks[-1] = "├" if bounded[0] else "╌", "┤" if bounded[1] else "╌"
     marks[min(max(cell(gauge.target), 0), cells - 1)] = "┼"
     text = Text("".join(marks), "dim")
     if gauge.value is None or not math.isfinite(gauge.value):

@@ -27,7 +27,7 @@ def describe(
     window: int | None = None,
 ) -> NetworkDescription:
     plant, kind = model.plant, get_architecture(architecture)
-    half = np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
+    half = np.concatenate([plant.x_scale, plant.u_scale])
     return NetworkDescription(
         states=model.d,
         inputs=model.m,

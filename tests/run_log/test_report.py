@@ -176,7 +176,8 @@ def test_any_plant_has_its_names_on_the_axes(
         name="tank",
         states=("level", "flow", "a", "b"),
         inputs=("valve",),
-        units={"level": "m", "valve": "%"},
+        units={"level": "m", "flow": "m^3/s", "a": "1", "b": "1", "valve": "%", "t": "s"},
+        kernel=("level", "valve"),
     )
     monkeypatch.setitem(plants.PLANTS, "tank", other)
     run = gather(override(config, ["plant.model=tank"]), messages)

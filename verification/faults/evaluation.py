@@ -99,9 +99,8 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
 
 
 def _deepest(x: np.ndarray, applied: np.ndarray, plant: Plant) -> float:
-    half_x, half_u = (plant.x_max - plant.x_min) / 2, (plant.u_max - plant.u_min) / 2
-    state = np.maximum(plant.x_min - x, x - plant.x_max) / half_x
-    given = np.maximum(plant.u_min - applied, applied - plant.u_max) / half_u
+    state = np.maximum(plant.x_min - x, x - plant.x_max) / plant.x_scale
+    given = np.maximum(plant.u_min - applied, applied - plant.u_max) / plant.u_scale
     return max(0.0, float(state.max()), float(np.nanmax(given, initial=0.0)))
 
 

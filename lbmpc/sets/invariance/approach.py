@@ -48,7 +48,7 @@ def find_trajectory(model: Model, start: np.ndarray, goal: Body) -> Trajectory |
 
 def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Trajectory | None:
     plant = model.plant
-    half = (plant.x_max - plant.x_min) / 2
+    half = plant.x_scale
     X, U = state_set(model), input_set(model)
     spare = 0.02 * (U.upper - U.lower)
     move = one_period(model)

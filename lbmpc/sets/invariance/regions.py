@@ -128,5 +128,4 @@ def _region(model: Model, x: np.ndarray, u: np.ndarray, size: np.ndarray) -> Reg
 
 
 def _half_widths(model: Model) -> np.ndarray:
-    plant = model.plant
-    return np.concatenate([plant.x_max - plant.x_min, plant.u_max - plant.u_min]) / 2
+    return np.concatenate([model.plant.x_scale, model.plant.u_scale])

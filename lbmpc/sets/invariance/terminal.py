@@ -23,6 +23,9 @@ def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps:
     rows_u, bounds_u = U.one_sided()
     rows = np.vstack([rows_x, rows_u @ model.K])
     bounds = np.concatenate([bounds_x, bounds_u])
+    if not len(rows):
+        # Nothing is bounded: the whole space.
+        return Polytope(rows, bounds, bounds, ())
     names = _names(X) + _names(U)
     closed = model.closed_loop
     kept_rows, kept_bounds = rows.copy(), bounds.copy()

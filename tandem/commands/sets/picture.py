@@ -42,7 +42,7 @@ class Drawn:
 def picture(drawn: Drawn, title: str) -> Figure:
     """Rows: projections, slices through x_e, slices through x0, W and R_i; columns: pairs of states."""
     plant = drawn.model.plant
-    half = (plant.x_max - plant.x_min) / 2
+    half = plant.x_scale
     pieces = [body(np.array(p.G), np.array(p.g), p.name, half) for p in drawn.certificate.pieces]
     planes = _planes(drawn)
     sliced = plant.d > 2
@@ -97,7 +97,7 @@ def _slices(ax: Axes, drawn: Drawn, pieces: list[Body], plane: Plane, through: n
     """What the sets hold of the plane through a state; a projection shows what they hold for some other states."""
     point, kept = through - drawn.model.plant.x_e, list(plane)
     rest = [i for i in range(len(point)) if i not in plane]
-    scale = ((drawn.model.plant.x_max - drawn.model.plant.x_min) / 2)[kept]
+    scale = drawn.model.plant.x_scale[kept]
     for piece, style in _styled(pieces):
         try:
             cut = body(piece.G[:, kept], piece.g - piece.G[:, rest] @ point[rest], "a slice", scale)

@@ -53,7 +53,7 @@ class SetsPlot(Command):
         except (CertificateError, ModelError) as error:
             terminal.complain(f"refused: {error}", self.json)
             return NO_SETS
-        except KeyError as error:
+        except LookupError as error:
             raise Refused(f"{file}: {error.args[0]}") from error
         states, x0 = None, plant.x0
         if log is not None:

@@ -29,7 +29,7 @@ class Sampled:
 def sample(certificate: Certificate, model: Model, samples: int, seed: int = 0) -> Sampled:
     """Random states and inputs of every piece: does h lie in its W, in the directions of its target's rows?"""
     rng, move = np.random.default_rng(seed), one_period(model)
-    half = (model.plant.x_max - model.plant.x_min) / 2
+    half = model.plant.x_scale
     worst, where, asked = -math.inf, "", 0
     for piece in certificate.pieces:
         inside = body(np.array(piece.G), np.array(piece.g), piece.name, half)

@@ -100,8 +100,8 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
                 ax.plot(z, y, "o", markerfacecolor="white", markeredgecolor=VERMILION, markersize=11)
                 ax.text(z, y, f"{sum(kept)}", ha="center", va="center", fontsize=7.5)
         ax.plot(plant.x_e[first], plant.x_e[second], "+", color=GREY, markersize=14, zorder=0)
-        ax.set_xlim(plant.x_min[first], plant.x_max[first])
-        ax.set_ylim(plant.x_min[second], plant.x_max[second])
+        ax.set_xlim(*_frame(plant, first))
+        ax.set_ylim(*_frame(plant, second))
         ax.set_title(f"{result.label}: {result.kept:.0%} keep all", fontsize=9)
     for ax in axes[-columns:]:
         ax.set_xlabel(full_name(plant, first))
@@ -112,6 +112,12 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
         "The frame is the bounds, the plus in the middle the equilibrium."
     )
     return [Picture(made, caption, "initial states that are kept, by controller")]
+
+
+def _frame(plant: Plant, i: int) -> tuple[float | None, float | None]:
+    """A state's bounds; None where the axis is free, because there is none."""
+    low, high = (float(bound[i]) if np.isfinite(bound[i]) else None for bound in (plant.x_min, plant.x_max))
+    return low, high
 
 
 def survival(results: list[CaseResult]) -> list[Picture]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -15,6 +17,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 from tandem.live import view
 from tandem.live.monitor import Monitor, Snapshot
+from tests.helpers.integrator import INTEGRATOR
 
 CONFIG = Config()
 PLANT = get_plant(CONFIG.plant.model)
@@ -251,3 +254,21 @@ def test_the_first_command_is_not_overlooked_among_others() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(k), START + 0.001 * k) for k in range(5)])
     assert seen.first_command == pytest.approx(START)
+
+
+def test_a_state_without_bounds_has_an_axis_as_long_as_its_scale() -> None:
+    plant = replace(INTEGRATOR, u_max=[math.inf], scale={"speed": 2.0, "push": 2.0})
+    monitor = Monitor(CONFIG, plant, 10.0)
+    message = m.PlantState(
+        run_id="p", seq=0, t=0.0, x=[0.0, 1.0], applied=[9.0], source="command", command_seq=0
+    )
+    monitor.feed(delivery(topics.PLANT_STATE, message, START))
+    gauge = monitor.snapshot(START).states[1]
+    assert view._gauge_style(gauge) == "default"
+    drawn = view._bar(gauge, 41).plain
+    assert (drawn[0], drawn.index("┼"), drawn.index("●"), drawn[-1]) == ("╌", 20, 30, "╌")
+    far = replace(gauge, value=1e9)
+    assert view._bar(far, 41).plain[-1] == "▶"
+    push = monitor.snapshot(START).inputs[0]
+    assert view._bar(push, 41).plain[0] == "├"
+    assert view._bar(push, 41).plain[-1] == "╌"

@@ -1,0 +1,194 @@
+"""A plant that cannot be used is refused where it is looked up: what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from lbmpc.model import ModelError, build_model
+from lbmpc.plants import PLANTS, Plant, PlantDefinitionError, get_plant
+from lbmpc.plants.base import Domain
+from lbmpc.plants.inspection import faults
+from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from tests.helpers.integrator import INTEGRATOR
+from tests.helpers.pendulum import PENDULUM
+
+INF, NAN = float("inf"), float("nan")
+
+
+def changed(**fields: object) -> Plant:
+    return replace(PENDULUM, **fields)
+
+
+def one_state() -> Plant:
+    """A level that follows a flow, in a unit far too large for it."""
+    return Plant(
+        name="slow",
+        states=("level",),
+        inputs=("flow",),
+        units={"level": "nm", "flow": "nm/s", "t": "s"},
+        rhs=lambda x, u: [u[0] - x[0]],
+        **{name: [0.0] for name in ("x_e", "u_e", "x0", "safe_input")},
+        **{name: [-1e-9] for name in ("x_min", "u_min")},
+        **{name: [1e-9] for name in ("x_max", "u_max", "W")},
+        performance=(0,),
+        kernel=("level",),
+    )
+
+
+FAULTY: dict[str, tuple[Plant, str]] = {
+    "bounds of an input that cross": (changed(u_min=[4.0]), "u_min of torque is 4 and u_max is 3"),
+    "bounds of a state that touch": (changed(x_min=[1.0, -2.0]), "x_min of angle is 1 and x_max is 1"),
+    "NaN in a bound": (changed(x_max=[NAN, 2.0]), "x_max of angle is nan"),
+    "NaN in W": (changed(W=[0.01, NAN]), "W of rate is nan: give a finite"),
+    "infinite W": (changed(W=[INF, 0.1]), "W of angle is inf"),
+    "negative W": (changed(W=[0.01, -0.1]), "W of rate is -0.1: a half-width is at least 0"),
+    "x0 too short": (changed(x0=[0.5]), r"x0 is \[0.5\]: it needs 2 entries, one for each of angle, rate"),
+    "x_e as a column": (changed(x_e=[[0.0], [0.0]]), "x_e is .* needs 2 entries"),
+    "words for numbers": (changed(x0="here"), "x0 is 'here': give numbers"),
+    "a gain on its side": (changed(safe_gain=[[1.0], [2.0]]), "safe_gain is .* a row for each input"),
+    "rhs too short": (changed(rhs=lambda x, u: [x[1]]), "rhs returns 1 entries: it needs 2"),
+    "rhs of nothing": (changed(rhs=lambda x, u: None), "rhs returns None: it must return a list"),
+    "rhs of words": (changed(rhs=lambda x, u: ["a", 0]), "rhs returns what CasADi cannot take"),
+    "a symbol from elsewhere": (changed(rhs=lambda x, u: [ca.SX.sym("q"), 0]), r"variables \[q\] are free"),
+    "rhs that fails": (changed(rhs=lambda x, u: [x[1], 1 / 0]), r"rhs fails in line \d+: ZeroDivisionError"),
+    "a condition on a state": (
+        changed(rhs=lambda x, u: [x[1] if x[0] > 0 else 0, u[0]]),
+        "ca.if_else, not if",
+    ),
+    "math.sin": (changed(rhs=lambda x, u: [x[1], math.sin(x[0]) + u[0]]), "ca.sin, not math.sin"),
+    "no performance state": (changed(performance=()), "performance is .* at least one state"),
+    "performance out of range": (
+        changed(performance=(0, 2)),
+        r"performance has 2: .* 0 \(angle\) to 1 \(rate\)",
+    ),
+    "performance counted backwards": (changed(performance=(-1,)), "performance has -1"),
+    "performance by name": (changed(performance=("angle",)), "performance has 'angle': a state's index"),
+    "an unknown kernel variable": (
+        changed(kernel=("angle", "rat")),
+        "kernel has 'rat', .* choose from angle, rate",
+    ),
+    "no unit of time": (
+        changed(units={"angle": "rad", "rate": "1/s", "torque": "1"}),
+        "units has none for t",
+    ),
+    "an equilibrium outside X": (
+        changed(x_e=[math.pi, 0.0]),
+        "x_e of angle is 3.14159, but x_min of angle is -1 and x_max is 1: the equilibrium must lie",
+    ),
+    "an equilibrium outside U": (changed(u_e=[5.0]), "u_e of torque is 5, but u_min of torque is -3"),
+    "an equilibrium that is none": (changed(x_e=[0.5, 0.0]), "not an equilibrium: drate/dt is 1.92"),
+    "no equilibrium in small units": (
+        replace(one_state(), x_e=[5e-10]),
+        "not an equilibrium: dlevel/dt is -5e-10",
+    ),
+    "an equilibrium without a slope": (
+        changed(rhs=lambda x, u: [x[1], ca.sqrt(x[0]) + u[0]]),
+        "slopes of dx/dt are not finite",
+    ),
+    "a start where nothing holds": (
+        changed(rhs=lambda x, u: [x[1], ca.log(1 - 3 * x[0]) + u[0]]),
+        "drate/dt is nan at x0",
+    ),
+    "a safe input outside U": (changed(safe_input=[-4.0]), "safe_input of torque is -4, outside u_min = -3"),
+    "two states of one name": (changed(states=("angle", "angle")), "2 states or inputs are called 'angle'"),
+    "a state named as an input": (changed(inputs=("rate",)), "2 states or inputs are called 'rate'"),
+    "a state named as time": (changed(states=("angle", "t")), "called 't', the name of time"),
+    "a forgotten comma": (changed(inputs="u"), r"inputs is the text 'u': write \('u',\), with the comma"),
+    "no inputs": (changed(inputs=()), "inputs is empty"),
+    "a domain of no state": (changed(positive=(Domain(2, "pressure", "bar"),)), "pressure names state 2"),
+    "x0 outside its domain": (
+        replace(MOORE_GREITZER, x0=[0.15, -1.0, 1.0, 0.0]),
+        "x0 of y is -1: pressure y must be positive there",
+    ),
+    "poles that grow": (changed(poles=(-1.0, 2.0)), "a stable pole has a negative real part"),
+    "one pole of a pair": (changed(poles=(-1.0 + 1j, -1.0)), "conjugate pairs"),
+    "no scale without a bound": (
+        replace(INTEGRATOR, scale={}),
+        r"x_min of speed is -inf and x_max is inf: give both bounds, or scale=\{'speed': ...\}",
+    ),
+    "no scale on one side": (
+        changed(u_max=[INF]),
+        r"u_min of torque is -3 and u_max is inf: .*scale=\{'torque'",
+    ),
+    "a scale of nothing": (replace(INTEGRATOR, scale={"speed": 2.0, "spede": 2.0}), "scale has 'spede'"),
+    "a scale of 0": (
+        replace(INTEGRATOR, scale={"speed": 0.0}),
+        "scale of speed is 0.0: .* a positive number",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAULTY)
+def test_a_faulty_plant_is_refused_and_the_fault_named(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, message = FAULTY[case]
+    monkeypatch.setitem(PLANTS, "faulty", plant)
+    with pytest.raises(PlantDefinitionError, match=message) as caught:
+        get_plant("faulty")
+    text = str(caught.value)
+    assert text.startswith(f"the plant {plant.name!r} cannot be used")
+    # One fault is one sentence: nothing else is blamed for it.
+    assert len(faults(plant)) == 1
+    assert f"{plant.rhs.__code__.co_filename}, line" in text
+
+
+def test_all_faults_of_a_plant_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = changed(u_min=[4.0], W=[-1.0, 0.1], performance=(5,), kernel=("x",), rhs=lambda x, u: [])
+    monkeypatch.setitem(PLANTS, "bad", bad)
+    with pytest.raises(PlantDefinitionError) as caught:
+        get_plant("bad")
+    lines = [line.strip(" -") for line in str(caught.value).splitlines()[1:]]
+    assert [line.split()[0] for line in lines] == ["u_min", "W", "rhs", "performance", "kernel"]
+
+
+def test_a_model_of_a_faulty_plant_is_refused_as_well() -> None:
+    with pytest.raises(ModelError, match="u_min of torque is 4"):
+        build_model(changed(u_min=[4.0]), 0.1)
+
+
+@pytest.mark.parametrize("plant", [MOORE_GREITZER, PENDULUM, INTEGRATOR, one_state()], ids=lambda p: p.name)
+def test_a_sound_plant_has_no_faults(plant: Plant) -> None:
+    assert faults(plant) == ()
+
+
+def test_lists_are_as_good_as_arrays_and_tuples() -> None:
+    fields = ("x_e", "u_e", "x_min", "x_max", "u_min", "u_max", "W", "x0", "safe_input", "safe_gain")
+    names = ("states", "inputs", "performance", "kernel", "positive", "poles")
+    lists = {name: getattr(MOORE_GREITZER, name).tolist() for name in fields}
+    plant = replace(MOORE_GREITZER, **lists, **{name: list(getattr(MOORE_GREITZER, name)) for name in names})
+    assert faults(plant) == ()
+    for name in fields:
+        np.testing.assert_array_equal(getattr(plant, name), getattr(MOORE_GREITZER, name), strict=True)
+    assert all(getattr(plant, name) == getattr(MOORE_GREITZER, name) for name in names)
+
+
+def test_rounding_of_an_equilibrium_is_judged_by_the_plants_own_units() -> None:
+    """A pressure in pascal: digits that are right to a millionth leave a residual of 0.1 Pa/s."""
+    in_pascal = replace(
+        one_state(),
+        rhs=lambda x, u: [2.0 * (u[0] - x[0])],
+        x_e=[1e5 / 3],
+        u_e=[33333.3],
+        **{name: [0.0] for name in ("x_min", "u_min")},
+        **{name: [1e5] for name in ("x_max", "u_max")},
+    )
+    assert faults(in_pascal) == ()
+
+
+def test_half_widths_are_the_bounds_where_there_are_two_and_else_the_scale() -> None:
+    np.testing.assert_array_equal(INTEGRATOR.x_scale, [1.0, 2.0])
+    np.testing.assert_array_equal(INTEGRATOR.u_scale, [2.0])
+    # A scale for what is bounded changes nothing.
+    np.testing.assert_array_equal(replace(INTEGRATOR, scale={"speed": 2.0, "push": 9.0}).u_scale, [2.0])
+    half = replace(INTEGRATOR, x_min=[-1.0, -1.0])
+    np.testing.assert_array_equal(half.x_scale, [1.0, 2.0])
+
+
+def test_half_widths_of_the_compressor_are_to_the_bit_what_they_were() -> None:
+    plant = MOORE_GREITZER
+    np.testing.assert_array_equal(plant.x_scale, (plant.x_max - plant.x_min) / 2)
+    np.testing.assert_array_equal(plant.u_scale, (plant.u_max - plant.u_min) / 2)
