@@ -10,6 +10,8 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from controller_node.checkpoint import CheckpointWriter, Snapshot, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
@@ -119,10 +121,9 @@ class ControllerNode:
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
-        self._hidden: list[bytes] = []
-        self._remember_hidden()
+        self._hidden = core.memory.hidden_snapshot(-1)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
-        bus.serve(topics.HIDDEN_QUERY, lambda _parameters: self._hidden)
+        bus.serve(topics.HIDDEN_QUERY, self._answer_hidden)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
@@ -264,11 +265,17 @@ class ControllerNode:
         self._bus.publish(topics.TICK, tick)
         self._bus.publish(topics.RESULT, outputs.result)
         self._bus.publish(topics.TIMING, timing)
-        self._publish_learning(outputs)
+        self._publish_learning(tick.weights, outputs)
         self._count(tick, outputs, overrun=sent > slot.time + self._period)
 
-    def _publish_learning(self, outputs: Outputs) -> None:
-        """Everything else that a tick leaves: samples, output weights, keyframes."""
+    def _publish_learning(self, judged: m.HiddenWeights | None, outputs: Outputs) -> None:
+        """Everything else that a tick leaves: samples, output weights, keyframes.
+
+        judged: what the tick adopted or refused.
+        """
+        # Before the output weights that make a trainer ask.
+        if outputs.new_network or judged is not None:
+            self._remember_hidden(judged, outputs.new_network)
         if outputs.sample is not None:
             self._outbox.add(outputs.sample)
             self._unsent.append(outputs.sample)
@@ -277,8 +284,6 @@ class ControllerNode:
         due = outputs.new_network or self._seq % self._weights_every == 0
         if due and outputs.output_weights is not None:
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if outputs.new_network:
-            self._remember_hidden()
         if (self._seq + 1) % self._settings.keyframe_every == 0:
             self._keyframe_seq = self._seq
             self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
@@ -308,9 +313,20 @@ class ControllerNode:
     def _save(self, checkpoint: CheckpointWriter) -> None:
         checkpoint.offer(Snapshot(self._seq, self._core.memory.lasting(), dict(self._counts)))
 
-    def _remember_hidden(self) -> None:
-        snapshot = self._core.memory.hidden_snapshot(self._seq)
-        self._hidden = [] if snapshot is None else [codec.encode(snapshot)]
+    def _remember_hidden(self, judged: m.HiddenWeights | None, new_network: bool) -> None:
+        before = self._hidden
+        after = self._core.memory.hidden_snapshot(self._seq) if new_network else before
+        if before is None or after is None:
+            return
+        if judged is None:
+            version, sha256 = before.judged_version, before.judged_sha256
+        else:
+            version, sha256 = judged.seq, judged.sha256
+        self._hidden = msgspec.structs.replace(after, judged_version=version, judged_sha256=sha256)
+
+    def _answer_hidden(self, _parameters: dict[str, str]) -> list[bytes]:
+        hidden = self._hidden
+        return [] if hidden is None else [codec.encode(hidden)]
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
