@@ -125,10 +125,11 @@ def simulate(config: Config, steps: int, adapt_only: bool, log: Path | None, as_
 
 
 def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: bool) -> int:
-    """0 when every command and keyframe is equal, 1 when one differs or the log lacks some."""
+    """0 when every command and keyframe is equal to the byte; 1 when one differs, if only by rounding, or is lost."""
     with log_packages():
         from run_log.errors import LogError
         from run_log.reading.reader import read_run
+        from run_log.replaying.replay import ROUNDING
         from run_log.replaying.replay import replay as replay_run
 
     console = terminal.console(as_json)
@@ -144,8 +145,18 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
     if found.equal:
         text = f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
         console.print(text, style="yellow" if found.lost_ticks else "green", markup=False, soft_wrap=True)
+    elif found.rounding and found.elsewhere is not False:
+        whose = "as promised for" if found.elsewhere else "which is promised for"
+        text = (
+            f"{found.differing_ticks} of {found.ticks} ticks differ by rounding, {found.largest_difference:.3g} at "
+            f"most in any input: within {ROUNDING:g}, {whose} a log of another machine or build; not equal to the byte"
+        )
+        console.print(text, style="yellow", markup=False, soft_wrap=True)
     else:
         console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+        if found.rounding:
+            text = "by rounding alone, but log and machine name the same processor, kernels and versions"
+            console.print(text, style="bold red", markup=False, soft_wrap=True)
     if found.lost_ticks:
         console.print(
             f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps", style="bold red"
@@ -156,7 +167,7 @@ def replay(file: Path, from_tick: int | None, assignments: list[str], as_json: b
             f"first at tick {first.tick}: {first.field} recorded {first.recorded}, replayed {first.replayed}"
         )
         console.print(text, markup=False, soft_wrap=True)
-    if not found.equal and found.largest_difference is not None:
+    if not (found.equal or found.rounding) and found.largest_difference is not None:
         console.print(f"largest difference of an input: {found.largest_difference:.3g}", markup=False)
     for note in found.notes:
         console.print(f"note: {note}", style="yellow", markup=False, soft_wrap=True)
