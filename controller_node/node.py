@@ -15,6 +15,7 @@ import msgspec
 from controller_node.checkpoint import CheckpointWriter, Snapshot, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
+from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
@@ -116,12 +117,12 @@ class ControllerNode:
         self._began: float | None = None
         self._seq = -1
         self._missing = 0
-        self._keyframe_seq = -1
         self._weights: m.HiddenWeights | None = None
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
         self._hidden = core.memory.hidden_snapshot(-1)
+        self._keyframes = Keyframes(bus, core.memory, self._settings.keyframe_every)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
         bus.serve(topics.HIDDEN_QUERY, self._answer_hidden)
 
@@ -132,22 +133,23 @@ class ControllerNode:
         garbage.begin()
         if (sets := self._core.certified_sets()) is not None:
             self._bus.publish(topics.SETS, sets)
-        self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(-1))
+        self._keyframes.send(-1)
         while self._find_plant(stop):
+            self._keyframes.greet(self._seq, clock.now())
             while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:
                 slot, lateness = turn
                 latched = self._latch(slot)
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
+                self._keyframes.greet(self._seq, clock.now())
                 if self._checkpoint is not None and self._checkpoint.wanted:
                     self._save(self._checkpoint)
                 garbage.idle()
         self._send_samples()
         if self._checkpoint is not None and self._seq >= 0:
             self._save(self._checkpoint)
-        if self._keyframe_seq < self._seq:
-            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
+        self._keyframes.send_last(self._seq)
 
     # -- before the step ---------------------------------------------------------------------------------
 
@@ -231,6 +233,7 @@ class ControllerNode:
     def _tick(self, slot: Slot, lateness: float, latched: Latched) -> None:
         woken = slot.time + lateness
         self._began = slot.time if self._began is None else self._began
+        self._keyframes.remember(self._seq)
         self._seq += 1
         tick = m.Tick(
             run_id=self._run_id,
@@ -284,9 +287,7 @@ class ControllerNode:
         due = outputs.new_network or self._seq % self._weights_every == 0
         if due and outputs.output_weights is not None:
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if (self._seq + 1) % self._settings.keyframe_every == 0:
-            self._keyframe_seq = self._seq
-            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
+        self._keyframes.send_due(self._seq)
 
     def _count(self, tick: m.Tick, outputs: Outputs, overrun: bool) -> None:
         self._missing = 0 if tick.state_verdict == "fresh" else self._missing + 1

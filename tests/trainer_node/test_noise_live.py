@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -47,5 +49,5 @@ def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
         assert versions == list(range(1, len(versions) + 1))
         ticks = [tick for tick in ear.of(topics.TICK) if tick.weights is not None]
         # The median: other work may take this machine's cores away for seconds.
-        waits = [(b.slot - a.slot) * config.period for a, b in zip(ticks, ticks[1:], strict=False)]
+        waits = [(b.slot - a.slot) * config.period for a, b in itertools.pairwise(ticks)]
         assert float(np.median(waits)) < 0.5 * ADOPTION_PATIENCE
