@@ -37,8 +37,13 @@ class Keyframes:
         """Tick `seq` is over and the next one begins."""
         self._states.append((seq, self._memory.state))
 
+    def begin(self) -> None:
+        """Before the first tick. Who is heard by now needs no greeting."""
+        self._heard = None
+        self.send(-1)
+
     def send(self, seq: int) -> None:
-        """The memory as it is, after tick `seq`; -1 before the first."""
+        """The memory as it is, after tick `seq`."""
         self._last = seq
         self._bus.publish(topics.KEYFRAME, self._memory.keyframe(seq))
 

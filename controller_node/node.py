@@ -133,7 +133,7 @@ class ControllerNode:
         garbage.begin()
         if (sets := self._core.certified_sets()) is not None:
             self._bus.publish(topics.SETS, sets)
-        self._keyframes.send(-1)
+        self._keyframes.begin()
         while self._find_plant(stop):
             self._keyframes.greet(self._seq, clock.now())
             while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:
