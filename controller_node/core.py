@@ -95,9 +95,13 @@ class ControllerCore:
             content=self.sets.to_bytes(),
         )
 
+    def arithmetic(self) -> dict[str, str]:
+        """What may make another machine's numbers differ from these in the last digits, by name."""
+        return {"machine": platform.machine(), "kernels": self.kernels, **provenance.arithmetic()}
+
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
-        facts = {"machine": platform.machine(), "kernels": self.kernels}
+        facts = self.arithmetic()
         if self.sets is not None:
             facts |= {"certified sets": self.sets.sha256}
         return provenance.run_info(

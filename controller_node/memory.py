@@ -41,11 +41,13 @@ class Memory:
         network = self._controller.oracle.network(self.state.oracle)
         self.hidden_sha256 = "" if network is None else hash_layers(network.hidden)
 
-    def keyframe(self, seq: int) -> m.Keyframe:
-        """The whole memory after tick `seq`, -1 before the first."""
-        arrays = {
-            name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in self.state.to_arrays().items()
-        }
+    def keyframe(self, seq: int, state: ControllerState | None = None) -> m.Keyframe:
+        """The whole memory after tick `seq`, -1 before the first.
+
+        state: what `self.state` was after that tick; None: as it is now.
+        """
+        of = self.state if state is None else state
+        arrays = {name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in of.to_arrays().items()}
         return m.Keyframe(
             run_id=self._run_id, seq=seq, arrays=arrays, resumed=self._resumed if seq == -1 else ""
         )

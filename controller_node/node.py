@@ -10,9 +10,12 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from controller_node.checkpoint import CheckpointWriter, Snapshot, resume
 from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
+from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
@@ -114,15 +117,14 @@ class ControllerNode:
         self._began: float | None = None
         self._seq = -1
         self._missing = 0
-        self._keyframe_seq = -1
         self._weights: m.HiddenWeights | None = None
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
-        self._hidden: list[bytes] = []
-        self._remember_hidden()
+        self._hidden = core.memory.hidden_snapshot(-1)
+        self._keyframes = Keyframes(bus, core.memory, self._settings.keyframe_every)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
-        bus.serve(topics.HIDDEN_QUERY, lambda _parameters: self._hidden)
+        bus.serve(topics.HIDDEN_QUERY, self._answer_hidden)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
@@ -131,22 +133,23 @@ class ControllerNode:
         garbage.begin()
         if (sets := self._core.certified_sets()) is not None:
             self._bus.publish(topics.SETS, sets)
-        self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(-1))
+        self._keyframes.begin()
         while self._find_plant(stop):
+            self._keyframes.greet(self._seq, clock.now())
             while self._missing < self._settings.horizon and (turn := pacer.next()) is not None:
                 slot, lateness = turn
                 latched = self._latch(slot)
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
+                self._keyframes.greet(self._seq, clock.now())
                 if self._checkpoint is not None and self._checkpoint.wanted:
                     self._save(self._checkpoint)
                 garbage.idle()
         self._send_samples()
         if self._checkpoint is not None and self._seq >= 0:
             self._save(self._checkpoint)
-        if self._keyframe_seq < self._seq:
-            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
+        self._keyframes.send_last(self._seq)
 
     # -- before the step ---------------------------------------------------------------------------------
 
@@ -230,6 +233,7 @@ class ControllerNode:
     def _tick(self, slot: Slot, lateness: float, latched: Latched) -> None:
         woken = slot.time + lateness
         self._began = slot.time if self._began is None else self._began
+        self._keyframes.remember(self._seq)
         self._seq += 1
         tick = m.Tick(
             run_id=self._run_id,
@@ -264,11 +268,17 @@ class ControllerNode:
         self._bus.publish(topics.TICK, tick)
         self._bus.publish(topics.RESULT, outputs.result)
         self._bus.publish(topics.TIMING, timing)
-        self._publish_learning(outputs)
+        self._publish_learning(tick.weights, outputs)
         self._count(tick, outputs, overrun=sent > slot.time + self._period)
 
-    def _publish_learning(self, outputs: Outputs) -> None:
-        """Everything else that a tick leaves: samples, output weights, keyframes."""
+    def _publish_learning(self, judged: m.HiddenWeights | None, outputs: Outputs) -> None:
+        """Everything else that a tick leaves: samples, output weights, keyframes.
+
+        judged: what the tick adopted or refused.
+        """
+        # Before the output weights that make a trainer ask.
+        if outputs.new_network or judged is not None:
+            self._remember_hidden(judged, outputs.new_network)
         if outputs.sample is not None:
             self._outbox.add(outputs.sample)
             self._unsent.append(outputs.sample)
@@ -277,11 +287,7 @@ class ControllerNode:
         due = outputs.new_network or self._seq % self._weights_every == 0
         if due and outputs.output_weights is not None:
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
-        if outputs.new_network:
-            self._remember_hidden()
-        if (self._seq + 1) % self._settings.keyframe_every == 0:
-            self._keyframe_seq = self._seq
-            self._bus.publish(topics.KEYFRAME, self._core.memory.keyframe(self._seq))
+        self._keyframes.send_due(self._seq)
 
     def _count(self, tick: m.Tick, outputs: Outputs, overrun: bool) -> None:
         self._missing = 0 if tick.state_verdict == "fresh" else self._missing + 1
@@ -308,9 +314,20 @@ class ControllerNode:
     def _save(self, checkpoint: CheckpointWriter) -> None:
         checkpoint.offer(Snapshot(self._seq, self._core.memory.lasting(), dict(self._counts)))
 
-    def _remember_hidden(self) -> None:
-        snapshot = self._core.memory.hidden_snapshot(self._seq)
-        self._hidden = [] if snapshot is None else [codec.encode(snapshot)]
+    def _remember_hidden(self, judged: m.HiddenWeights | None, new_network: bool) -> None:
+        before = self._hidden
+        after = self._core.memory.hidden_snapshot(self._seq) if new_network else before
+        if before is None or after is None:
+            return
+        if judged is None:
+            version, sha256 = before.judged_version, before.judged_sha256
+        else:
+            version, sha256 = judged.seq, judged.sha256
+        self._hidden = msgspec.structs.replace(after, judged_version=version, judged_sha256=sha256)
+
+    def _answer_hidden(self, _parameters: dict[str, str]) -> list[bytes]:
+        hidden = self._hidden
+        return [] if hidden is None else [codec.encode(hidden)]
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import time
 from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+
+import threadpoolctl
 
 from node_runtime.config.sections import Config, to_json
 from protocol.messages import RunInfo
@@ -70,6 +73,18 @@ def describe() -> dict[str, str]:
         "cores": str(cores),
         "system": f"{platform.system()} {platform.machine()}",
     }
+
+
+def arithmetic() -> dict[str, str]:
+    """What rounds on this machine, beside compiled functions: its processor, and the kernels that its BLAS chose."""
+    found = [library for library in threadpoolctl.threadpool_info() if library["user_api"] == "blas"]
+    # Torch may bring its own, which no controller uses.
+    ours = [library for library in found if re.search(r"[/\\](numpy|scipy)\b", library["filepath"])] or found
+    kernels = {
+        f"{library['internal_api']} {library['version']} {library.get('architecture', '')}"
+        for library in ours
+    }
+    return {"processor": _processor(), "blas": ", ".join(sorted(kernels)).strip() or "unknown"}
 
 
 def load() -> float:

@@ -10,6 +10,7 @@ import contextlib
 import ipaddress
 import logging
 import os
+import re
 import threading
 
 import zenoh
@@ -34,6 +35,27 @@ that does waits in it for up to 10 s (eclipse-zenoh/zenoh #1101, #2718). A clien
 a trainer whose link was cut stopped every state and command for that long, as soon as its lease was over."""
 
 
+_CAUSES = {
+    "in use": (
+        "{place} is taken: another router may be running, or another program has the port (`ss -ltnp` names it). "
+        "Stop it, or set bus.endpoint or bus.remote to another port."
+    ),
+    "Permission denied": (
+        "the router may not listen on {place}: a port below 1024 needs a privilege (CAP_NET_BIND_SERVICE). "
+        "Set bus.endpoint or bus.remote to a port from 1024 on."
+    ),
+    "Cannot assign requested address": (
+        "the router cannot listen on {place}: this machine does not have that address. "
+        "Write one that it has; 0.0.0.0 stands for all of them."
+    ),
+    "lookup address information": (
+        "the router cannot listen on {place}: the name is not known here. Write an address of this machine."
+    ),
+    "invalid port value": "{place}: a port is a number from 1 to 65535.",
+}
+"""By what Zenoh says: what it means for a person."""
+
+
 class RouterError(RuntimeError):
     """The router cannot listen; the text says where and what to do."""
 
@@ -46,7 +68,6 @@ def open_router(config: Config) -> zenoh.Session:
         ConfigError: an endpoint is none, or the router's certificate cannot be used.
     """
     bus = config.bus
-    places = " and ".join(filter(None, (bus.endpoint, bus.remote)))
     if bus.remote and not secure(bus.remote):
         raise ConfigError(
             f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
@@ -61,12 +82,18 @@ def open_router(config: Config) -> zenoh.Session:
     try:
         return zenoh.open(routing)
     except zenoh.ZError as error:
-        if "in use" in str(error):
-            raise RouterError(
-                f"{places} is taken: another router may be running. "
-                "Stop it, or set bus.endpoint or bus.remote to another port."
-            ) from error
-        raise RouterError(f"the router cannot listen on {places}: {error}") from error
+        raise RouterError(_why_not_listening(str(error), bus.endpoint, bus.remote)) from error
+
+
+def _why_not_listening(said: str, endpoint: str, other: str | None) -> str:
+    """The plain cause and what to do, from what Zenoh said of the first endpoint that failed."""
+    failed = [place for place in (endpoint, other) if place and place.partition("/")[2] in said]
+    place = failed[0] if len(failed) == 1 else " or ".join(filter(None, (endpoint, other)))
+    for words, text in _CAUSES.items():
+        if words in said:
+            return text.format(place=place)
+    # Where in Zenoh's sources it was said helps nobody.
+    return f"the router cannot listen on {place}: {re.sub(r' at /[^ ]*[.]rs:[0-9]+[.]?', '', said)}"
 
 
 def remote(config: Config) -> bool:

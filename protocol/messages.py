@@ -243,7 +243,10 @@ class OutputWeights(Message, frozen=True):
 
 
 class HiddenSnapshot(Message, frozen=True):
-    """The hidden weights that the controller holds, for a trainer that joins late; `run_id` is the controller's."""
+    """The hidden weights that the controller holds, for a trainer that joins late or hears nothing of what it sent.
+
+    `run_id` is the controller's.
+    """
 
     hidden_version: Sequence
     """Highest that was adopted so far."""
@@ -251,6 +254,10 @@ class HiddenSnapshot(Message, frozen=True):
     description: str
     """The `NetworkDescription`, as JSON."""
     layers: list[Array]
+    judged_version: Sequence = -1
+    """Of the hidden weights that this run adopted or refused last, as their sender numbered them; -1: none yet."""
+    judged_sha256: Digest = ""
+    """As their sender gave it."""
 
 
 class Keyframe(Message, frozen=True):

@@ -168,7 +168,8 @@ def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
     names: dict[str, x509.GeneralName] = {}
     for host in hosts:
         try:
-            address = ipaddress.ip_address(host)
+            # An IPv6 address is written [::1] in an endpoint.
+            address = ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
         except ValueError:
             if not host.isascii() or not host or any(sign in host for sign in "/: "):
                 raise Refused(f"--host {host}: neither a name nor an address; no port, no protocol") from None

@@ -7,6 +7,7 @@ controller gives the hidden layers in force, another one the samples that were m
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Executor
 
@@ -38,8 +39,12 @@ TRAIN_EVERY = 0.4
 and it is the loop that needs it."""
 SHARE = 0.5
 """Of the time, at most, is spent training: a network that takes long to train is trained less often."""
+VERDICT_PERIODS, VERDICT_PATIENCE = 3, 0.1
+"""A controller that has not adopted a set after so many periods, and seconds, is asked what it judged."""
 ADOPTION_PATIENCE = 2.0
-"""Seconds that a controller may go on with other hidden layers than those it was sent."""
+"""Seconds after which a set that was not judged either is taken for lost, or for kept out by somebody else's."""
+SENT_KNOWN = 64
+"""Sets that were sent last, known again when the controller says what it judged."""
 OUTBOX = 20_000
 """Samples to ask for when the buffer can make use of more than it holds."""
 
@@ -50,6 +55,8 @@ COUNTERS = (
     "published",
     "adopted",
     "not adopted",
+    "rolled back",
+    "others' sets",
     "gaps filled",
     "joined",
     "samples of other runs",
@@ -57,6 +64,10 @@ COUNTERS = (
 """Of a node, beside those of its `Trainer`."""
 WAITING = "waiting for a controller with a network"
 DISABLED = "trainer.enabled is false: hidden layers are not trained"
+
+
+Judged = tuple[int, str]
+"""Version and sha256 of hidden weights that a controller adopted or refused."""
 
 
 class TrainerNode:
@@ -79,16 +90,18 @@ class TrainerNode:
         self._health = health
         self._counts = counts
         self._patience = max(ADOPTION_PATIENCE, 5 * config.period)
+        self._verdict_patience = max(VERDICT_PATIENCE, VERDICT_PERIODS * config.period)
         self._samples: Inbox[m.Samples] = Inbox(bus, topics.SAMPLES, capacity=5000)
         self._outputs: Inbox[m.OutputWeights] = Inbox(bus, topics.OUTPUT_WEIGHTS, capacity=32)
         self._trainer: Trainer | None = None
         self._run = ""
         self._output: m.OutputWeights | None = None
-        self._resync = False
+        self._asks = False
         self._join_at = 0.0
         self._gap: int | None = None
         self._refill_at = 0.0
-        self._unadopted_since: float | None = None
+        self._sent_at: float | None = None
+        self._explained: deque[Judged] = deque(maxlen=SENT_KNOWN)
         self._train_at = 0.0
         self._waits_since: float | None = None
 
@@ -150,28 +163,18 @@ class TrainerNode:
         if self._trainer is None or output.run_id != self._run:
             return
         if output.hidden_sha256 == self._trainer.sha256:
-            if self._unadopted_since is not None:
+            if self._sent_at is not None:
                 self._count("adopted")
-            self._unadopted_since = None
+            self._asks, self._sent_at = False, None
             return
-        if self._unadopted_since is None:
-            self._unadopted_since = now
-        # Refused, lost on the way, or another's were adopted: what the controller holds is right. Of another's it need
-        # not be thought that ours are only under way.
-        elsewhere = output.hidden_version > self._trainer.version
-        if (elsewhere or now - self._unadopted_since > self._patience) and not self._resync:
-            self._count("not adopted")
-            log.warning(
-                "the controller holds hidden weights version %d and not %d; going on from its own",
-                output.hidden_version,
-                self._trainer.version,
-            )
-            self._trainer.leap()
-            self._resync = True
+        # Refused, rolled back, still on the way, or another's were adopted: the controller knows which.
+        under_way = self._sent_at is not None and output.hidden_version < self._trainer.version
+        if not under_way or now - (self._sent_at or 0.0) > self._verdict_patience:
+            self._asks = True
 
     def _must_join(self) -> bool:
         """Whether the hidden layers here are not, or may not be, those of the controller that sends K."""
-        if self._trainer is None or self._resync:
+        if self._trainer is None or self._asks:
             return True
         return self._output is not None and self._output.run_id != self._run
 
@@ -183,19 +186,63 @@ class TrainerNode:
 
     def _take_over(self, snapshot: m.HiddenSnapshot) -> bool:
         """Follow the controller that holds these hidden layers; whether they can be used."""
+        judged = (snapshot.judged_version, snapshot.judged_sha256)
+        followed = self._trainer is not None and snapshot.run_id == self._run
+        if followed and not self._is_settled(snapshot, judged):
+            return True
         try:
             trainer = self._trainer_from(snapshot)
         except ValueError as error:
             self._bus.bad.count(topics.HIDDEN_QUERY, "unusable", str(error))
             return False
+        self._asks, self._sent_at = False, None
+        if judged not in self._explained:
+            # Whoever sent it: from now on it says nothing new.
+            self._explained.append(judged)
+        if followed and trainer is self._trainer:
+            return True
         self._trainer, self._run = trainer, snapshot.run_id
         if self._output is not None and self._output.run_id != self._run:
             self._output = None
-        self._resync, self._unadopted_since = False, None
         self._gap, self._refill_at = trainer.buffer.last(self._run), 0.0
         self._count("joined")
         log.info("following %s, hidden weights version %d", self._run, snapshot.hidden_version)
         self._health.set("ready", f"following {self._run}")
+        return True
+
+    def _is_settled(self, snapshot: m.HiddenSnapshot, judged: Judged) -> bool:
+        """Why the controller that is followed holds other hidden layers than those it was sent.
+
+        Returns:
+            Whether to go on from its own; not where those it was sent are in use by now, or may be on their way.
+        """
+        assert self._trainer is not None
+        ours, held = self._trainer.version, snapshot.hidden_version
+        sent = self._explained[-1] if self._sent_at is not None else None
+        if snapshot.hidden_sha256 == self._trainer.sha256:
+            # What it says of K will count it.
+            self._asks = False
+            return False
+        if held > ours or judged not in self._explained:
+            text = "the controller was sent hidden weights version %d by another trainer; it holds version %d"
+            log.warning(text, judged[0] if judged not in self._explained else held, held)
+            self._count("others' sets")
+            # A version that a controller would not take must not become ours.
+            self._trainer.leap(judged[0])
+        elif sent is None or (judged == sent and held >= ours):
+            self._count("rolled back")
+            log.info("the controller went back from hidden weights version %d; going on from there", ours)
+            self._join_at = 0.0
+        elif judged == sent:
+            self._count("not adopted")
+            log.info("the controller refused hidden weights version %d; going on from version %d", ours, held)
+            self._join_at = 0.0
+        elif clock.now() - (self._sent_at or 0.0) > self._patience:
+            self._count("not adopted")
+            log.warning("hidden weights version %d were never judged; going on from version %d", ours, held)
+            self._trainer.leap()
+        else:
+            return False
         return True
 
     def _trainer_from(self, snapshot: m.HiddenSnapshot) -> Trainer:
@@ -301,7 +348,8 @@ class TrainerNode:
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)
-        self._unadopted_since = clock.now()
+        self._sent_at = clock.now()
+        self._explained.append((weights.seq, weights.sha256))
         self._count("published")
         self._health.set("running", f"following {self._run}")
 

@@ -116,13 +116,18 @@ class Trainer:
         self._take(hidden)
         self.version = max(self.version, version)
 
-    def leap(self) -> None:
-        """From now on leave gaps between versions: what was sent last did not come to be used.
+    def leap(self, heard: int = 0) -> None:
+        """From now on leave gaps between versions: somebody else sends weights under this trainer's name.
 
-        Who else sends weights under this trainer's name is ahead of it by a few versions, and a controller takes none
-        that is behind what it heard.
+        He is ahead by a few versions, and a controller takes none that is behind what it heard.
+
+        Args:
+            heard: the version that the controller judged last; what is trained next is above it, unless it lies so far
+                ahead that no controller would follow.
         """
         self._step = LEAP
+        if heard <= self.version + FARTHEST:
+            self.version = max(self.version, heard)
 
     def add(self, run_id: str, samples: Iterable[Sample]) -> int:
         """Offer samples of one controller run; bad ones are counted, left out. Returns how many are new."""

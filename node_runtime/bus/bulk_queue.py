@@ -52,6 +52,12 @@ class BulkQueue:
             if waited_ns >= topics.BATCH_S * 1e9 or self._waiting_bytes > topics.BATCH_BYTES:
                 self._put_batch()
 
+    @property
+    def unsent(self) -> int:
+        """Messages that are here, or on their way out."""
+        with self._empty:
+            return self._messages + len(self._waiting)
+
     def flush(self, timeout_s: float) -> bool:
         """Wait until everything is sent; False when it is not after `timeout_s`."""
         with self._empty:

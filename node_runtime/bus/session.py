@@ -78,7 +78,7 @@ def session_config(
     if mode == "client":
         settings |= {
             "listen/endpoints": [],
-            "connect/endpoints": [endpoint],
+            "connect/endpoints": [_place(endpoint)],
             "connect/timeout_ms": -1,
             "connect/retry": {
                 "period_init_ms": RETRY_MS,
@@ -100,6 +100,25 @@ def session_config(
         except zenoh.ZError as error:
             raise ConfigError(f"bus.endpoint = {endpoint!r} cannot be used: {error}") from error
     return config
+
+
+def _place(endpoint: str) -> str:
+    """Where Zenoh is to connect. For certificates it takes the brackets of an IPv6 address for a part of the name.
+
+    Without them it finds the port behind the last colon, and compares the address with those in the certificate.
+
+    Raises:
+        ConfigError: certificates and an address with a zone, which no certificate can name.
+    """
+    if not secure(endpoint) or "[" not in endpoint:
+        return endpoint
+    if "%" in endpoint:
+        raise ConfigError(
+            f"bus.endpoint = {endpoint!r}: no certificate can name an address with a zone; write another address of "
+            "the router, or a name, that its certificate has (`tandem keys renew --role router --host HOST`)"
+        )
+    protocol, _, place = endpoint.partition("/")
+    return f"{protocol}/{place.replace('[', '', 1).replace(']', '', 1)}"
 
 
 def secure(endpoint: str) -> bool:

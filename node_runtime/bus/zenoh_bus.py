@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -114,6 +115,19 @@ class Bus:
             self._outgoing.put_batched(topic, payload, clock.now_ns())
         elif topic.lane == "bulk":
             self._outgoing.put(topic, payload)
+
+    def when_heard(self, topic: Topic, call: Callable[[int], None]) -> None:
+        """Whenever `topic`, which nobody heard, is heard again: `call`, in a thread of the bus, so it must be short.
+
+        A link that was cut and is back is one such time: what was sent meanwhile reached nobody. `call` is told how
+        many messages of the bulk lane still wait to be sent: these will be heard.
+        """
+
+        def matching(status: zenoh.MatchingStatus) -> None:
+            if status.matching:
+                call(self._outgoing.unsent)
+
+        self._declared.append(self._publisher(topic).declare_matching_listener(matching))
 
     def flush(self, timeout_s: float) -> bool:
         """Wait until the bulk lane is empty; False when it is not after `timeout_s`."""

@@ -19,6 +19,10 @@ from run_log.replaying.recorded import RecordedController, recorded_controllers
 from run_log.replaying.segments import replayable
 from run_log.run import Run
 
+ROUNDING = 1e-7
+"""Units of u: the inputs of a log from another machine or build come out as near as this."""
+SAID = ("machine", "processor", "kernels", "blas")
+"""What a log says of the arithmetic that it was made with, beside versions; older logs lack some."""
 Progress = Callable[[int, int], None]
 
 
@@ -37,6 +41,11 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     first_tick: int
     """Where the replay began: the tick after a keyframe."""
     run_ids: list[str]
+    rounding: bool
+    """Not equal, and no input of a plan differs by more than `ROUNDING`."""
+    elsewhere: bool | None
+    """Recorded with another processor, BLAS kernel, compiler or version than this replay has; None: a log does not say
+    all of that, and what it says is the same."""
     lost_ticks: int
     """Ticks that could not be replayed, or not compared whole: the log lacks them, or the memory they began with."""
     notes: list[str]
@@ -78,27 +87,32 @@ def replay(
     total = sum(end - begin for found in segments for begin, end in found.ranges)
     if not total:
         raise LogError(f"{run.path}: no tick can be replayed: {'; '.join(gaps)}{run.unreadable}")
-    comparison = Comparison()
+    comparison, arithmetic = Comparison(), versions()
     for r, found in zip(recorded, segments, strict=True):
         with one_blas_thread():
             core = _core(run, r, overrides)
+            arithmetic |= core.arithmetic()
             for begin, end in found.ranges:
                 _restore(run, r, core, begin, comparison)
                 for seq in range(begin + 1, end + 1):
                     _replay_tick(run, r, core, seq, comparison)
                     if progress is not None:
                         progress(comparison.ticks, total)
+    differs, unsaid = _foreign(run, recorded, arithmetic)
+    equal, largest = comparison.first is None, comparison.largest
     return ReplayResult(
         ticks=comparison.ticks,
-        equal=comparison.first is None,
+        equal=equal,
         first_difference=comparison.first,
         differing_ticks=len(comparison.differing),
-        largest_difference=comparison.largest,
+        largest_difference=largest,
         keyframes=comparison.keyframes,
         first_tick=segments[0].start + 1,
         run_ids=[r.run_id for r in recorded],
+        rounding=not equal and largest is not None and largest <= ROUNDING,
+        elsewhere=True if differs else None if unsaid else False,
         lost_ticks=sum(found.lost for found in segments),
-        notes=_notes(run, recorded, overrides) + gaps,
+        notes=_notes(run, recorded, overrides) + _where(differs, unsaid, equal) + gaps,
     )
 
 
@@ -171,18 +185,6 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
     notes = [f"changed: {' '.join(overrides)}"] if overrides else []
     if run.note:
         notes.append(run.note)
-    here = versions()
-    for info in run.run_infos:
-        if info.run_id in {r.run_id for r in recorded}:
-            other = [
-                f"{name} {then} (here {here[name]})"
-                for name, then in info.versions.items()
-                if name in here and here[name] != then
-            ]
-            if other:
-                notes.append(
-                    f"recorded with {', '.join(other)}: equal to about 1e-7 at best, not to the byte"
-                )
     strangers = {tick.run_id for tick in run.ticks} - set(run.controllers)
     if strangers:
         notes.append(
@@ -196,4 +198,34 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
             notes.append(
                 f"{r.run_id}: the log does not hold the run to its end; replayed up to tick {r.last}"
             )
+    return notes
+
+
+def _foreign(
+    run: Run, recorded: list[RecordedController], here: dict[str, str]
+) -> tuple[list[str], list[str]]:
+    """What the log says of its versions and arithmetic and is otherwise here, and what of `SAID` it does not say."""
+    differs: list[str] = []
+    said: set[str] = set()
+    runs = {r.run_id for r in recorded}
+    for info in run.run_infos:
+        if info.run_id in runs:
+            said |= info.versions.keys()
+            differs += [
+                f"{name} {then} (here {here[name]})"
+                for name, then in info.versions.items()
+                if name in here and here[name] != then
+            ]
+    return list(dict.fromkeys(differs)), [name for name in SAID if name not in said]
+
+
+def _where(differs: list[str], unsaid: list[str], equal: bool) -> list[str]:
+    notes = []
+    if differs:
+        end = "equal all the same" if equal else f"equal to about {ROUNDING:g} at best, not to the byte"
+        notes.append(f"recorded with {', '.join(differs)}: {end}")
+    if unsaid and not equal:
+        notes.append(
+            f"the log does not say its {', '.join(unsaid)}: whether it was recorded here cannot be known from it"
+        )
     return notes

@@ -40,7 +40,7 @@ def replayable(run: Run, recorded: RecordedController, from_tick: int | None) ->
             continue
         if gap > begin + 1:
             segments.ranges.append((begin, gap - 1))
-        later = [seq for seq in recorded.keyframes if gap < seq < last and seq + 1 in recorded.ticks]
+        later = [seq for seq in recorded.keyframes if gap <= seq < last and seq + 1 in recorded.ticks]
         begin = min(later, default=last)
         segments.lost += begin - gap + 1
         way = (
@@ -64,7 +64,9 @@ def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Seg
     before = [seq for seq in recorded.keyframes if seq < wanted]
     if before:
         return Segments(max(before))
-    later = min((seq for seq in recorded.keyframes if seq < recorded.last), default=None)
+    inside = [seq for seq in recorded.keyframes if seq < recorded.last]
+    # Those with their next tick first: a recorder that comes late is sent some of ticks that it never heard.
+    later = min((seq for seq in inside if seq + 1 in recorded.ticks), default=min(inside, default=None))
     missing = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log"
     unknown = f"{missing}: the controller's memory is not known there"
     if from_tick is not None:

@@ -26,11 +26,11 @@ class Replay(Command):
     """Replay with another value than the log's configuration has."""
 
     def run(self) -> int:
-        """0 when every command and keyframe is equal, 1 when one differs or the log lacks some."""
+        """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
         import msgspec
 
         from run_log.reading.reader import read_run
-        from run_log.replaying.replay import replay
+        from run_log.replaying.replay import ROUNDING, replay
 
         ran = read_run(self.file)
         with terminal.progress_bar(self.console) as bar:
@@ -46,8 +46,19 @@ class Replay(Command):
                 f"{found.ticks} of {found.ticks} ticks equal, byte for byte, and {found.keyframes} keyframes"
             )
             self.say(text, style="yellow" if found.lost_ticks else "green")
+        elif found.rounding and found.elsewhere is not False:
+            whose = "as promised for" if found.elsewhere else "which is promised for"
+            text = (
+                f"{found.differing_ticks} of {found.ticks} ticks differ by rounding, "
+                f"{found.largest_difference:.3g} at most in any input: within {ROUNDING:g}, {whose} a log of another "
+                "machine or build; not equal to the byte"
+            )
+            self.say(text, style="yellow")
         else:
             self.console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
+            if found.rounding:
+                text = "by rounding alone, but log and machine name the same processor, kernels and versions"
+                self.console.print(text, style="bold red")
         if found.lost_ticks:
             text = f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps"
             self.console.print(text, style="bold red")
@@ -55,7 +66,7 @@ class Replay(Command):
         if first is not None:
             values = f"recorded {first.recorded}, replayed {first.replayed}"
             self.say(f"first at tick {first.tick}: {first.field} {values}")
-        if not found.equal and found.largest_difference is not None:
+        if not (found.equal or found.rounding) and found.largest_difference is not None:
             self.console.print(
                 f"largest difference of an input: {found.largest_difference:.3g}", markup=False
             )

@@ -22,7 +22,7 @@ from node_runtime.realtime import clock
 from protocol import messages as m
 from protocol import topics
 from tandem import certificate_authority
-from tests.compose.project import BASE, Project, docker, limits
+from tests.compose.project import BASE, Project, bridge_address, docker, limits
 from tests.helpers.live import BusListener, health_of, wait_for
 
 MAIN, TEST = "docker-compose.yml", "tests/compose/docker-compose.test.yml"
@@ -322,8 +322,11 @@ def test_it_ends_cleanly_with_a_readable_log(project: Project, watch: Watch) -> 
 
 @pytest.fixture
 def gateway() -> str:
-    """An address of this machine that containers reach."""
-    return str(json.loads(docker("network", "inspect", "bridge"))[0]["IPAM"]["Config"][0]["Gateway"])
+    """An address of this machine that containers reach: that of the engine's own bridge."""
+    options = json.loads(docker("network", "inspect", "bridge"))[0].get("Options") or {}
+    bridge = options.get("com.docker.network.bridge.name", "docker0")
+    show = ["ip", "-json", "addr", "show", "dev", bridge]
+    return bridge_address(subprocess.run(show, capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.fixture

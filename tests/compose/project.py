@@ -126,6 +126,22 @@ def docker(*arguments: str) -> str:
     return subprocess.run(["docker", *arguments], capture_output=True, text=True, check=True).stdout
 
 
+def bridge_address(addresses: str) -> str:
+    """The IPv4 address of a bridge on this machine, out of `ip -json addr show dev BRIDGE`.
+
+    Not every engine's `docker network inspect bridge` names a gateway.
+    """
+    found = [
+        address["local"]
+        for device in json.loads(addresses)
+        for address in device.get("addr_info", [])
+        if address.get("family") == "inet"
+    ]
+    if not found:
+        raise AssertionError(f"the engine's bridge has no IPv4 address on this machine: {addresses.strip()}")
+    return str(found[0])
+
+
 @functools.cache
 def limits() -> dict[str, str]:
     """The environment for an engine that may not raise limits, as in a sandbox; else {}."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import cast
 
@@ -41,6 +42,9 @@ class BusThatWritesDown:
 
     def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
         return []
+
+    def when_heard(self, topic: Topic, call: Callable[[int], None]) -> None:
+        self.heard = call
 
     def publish(self, topic: Topic, message: m.Message) -> None:
         self.said.append((topic.name, message))
@@ -99,6 +103,32 @@ def test_at_twenty_hertz_every_tick_says_everything() -> None:
     loop.tick(11)
     assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == list(range(11))
     assert loop.bus.seqs(topics.SAMPLES) == [4, 9]
+
+
+def test_who_begins_to_hear_gets_the_memory_before_each_tick_still_to_come() -> None:
+    loop = Loop("rate=20")
+    keyframes = loop.node._keyframes
+    loop.bus.heard(0)
+    keyframes.begin()
+    loop.tick(6)
+    keyframes.greet(5, now=1.0)
+    # He heard it begin.
+    assert loop.bus.seqs(topics.KEYFRAME) == [-1]
+    # Two ticks and a half were not sent yet, and one more may have followed.
+    loop.bus.heard(7)
+    keyframes.greet(5, now=2.0)
+    assert loop.bus.seqs(topics.KEYFRAME) == [-1, 1, 2, 3, 4, 5]
+    kept = {frame.seq: frame for name, frame in loop.bus.said if name == topics.KEYFRAME.name}
+    again = ControllerCore(loop.core.config, "controller-a")
+    again.memory.restore(kept[2])
+    for tick in [message for name, message in loop.bus.said if name == topics.TICK.name][3:]:
+        again.step(tick)
+    assert codec.encode(again.memory.keyframe(5)) == codec.encode(kept[5])
+    loop.tick()
+    keyframes.greet(6, now=2.5)
+    keyframes.greet(6, now=3.0)
+    keyframes.greet(6, now=4.0)
+    assert loop.bus.seqs(topics.KEYFRAME)[6:] == [6]
 
 
 def test_the_trainer_hears_of_an_adoption_at_once() -> None:

@@ -75,6 +75,7 @@ class Run:
     run_id: str
     outbox: list[m.Sample]
     snapshot: m.HiddenSnapshot
+    after_refusal: m.HiddenSnapshot
     said: str
 
     def of(self, topic: topics.Topic) -> list:
@@ -132,6 +133,8 @@ def run() -> Iterator[Run]:
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 1, for_run="controller-other"))
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 2, sha256="0" * 64))
             ear.until(tick_with_weights)
+            wait_for(lambda: snapshot_of(trainer).judged_version == 2)
+            after_refusal = snapshot_of(trainer)
             # Nothing is adopted before there are samples to try it on.
             ear.until(lambda message: isinstance(message, m.Samples) and message.seq >= 15)
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 3))
@@ -144,7 +147,7 @@ def run() -> Iterator[Run]:
             assert process.end() == 0
         batches = [codec.decode_as(m.Samples, payload) for payload in answer]
         outbox = [one for batch in batches for one in batch.samples]
-        yield Run(config, ear, snapshot.run_id, outbox, snapshot, process.said)
+        yield Run(config, ear, snapshot.run_id, outbox, snapshot, after_refusal, process.said)
 
 
 @pytest.mark.live
@@ -218,6 +221,14 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     assert run.counters["bad trainer/hidden_weights: refused"] == 1
     assert run.said.count("for another run") == 1
     assert run.snapshot.hidden_version == 3
+
+
+@pytest.mark.live
+def test_who_asks_is_told_which_weights_were_judged_last(run: Run) -> None:
+    refused, adopted = run.after_refusal, run.snapshot
+    assert (refused.judged_version, refused.judged_sha256) == (2, "0" * 64)
+    assert (refused.hidden_version, refused.hidden_sha256 != "0" * 64) == (0, True)
+    assert (adopted.judged_version, adopted.judged_sha256) == (3, adopted.hidden_sha256)
 
 
 @pytest.mark.live

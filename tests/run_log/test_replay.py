@@ -460,6 +460,72 @@ def test_a_controller_that_died_may_leave_half_a_tick(run: Run) -> None:
     assert any("result of tick 89" in note for note in replay(died).notes)
 
 
+def said(run: Run, **facts: str | None) -> Run:
+    """A copy whose controller says other things of where it ran; None: nothing."""
+
+    def change(info: m.RunInfo) -> m.RunInfo:
+        versions = {name: then for name, then in {**info.versions, **facts}.items() if then is not None}
+        return msgspec.structs.replace(info, versions=versions)
+
+    return edited(run, topics.RUN_INFO["controller"], 0, change)
+
+
+def rounded(run: Run, by: float) -> Run:
+    """A copy with one input of a plan that is off by so much, in units of u."""
+
+    def change(command: m.Command) -> m.Command:
+        plan = [*command.plan[:-1], [command.plan[-1][0] + by]]
+        return msgspec.structs.replace(command, plan=plan)
+
+    return edited(run, topics.COMMAND, 7, change)
+
+
+def test_a_log_says_what_its_arithmetic_depended_on(run: Run) -> None:
+    (info,) = run.run_infos
+    assert info.versions.keys() >= {"machine", "processor", "kernels", "blas", "numpy", "casadi"}
+    assert info.versions["blas"] != "unknown"
+    found = replay(run)
+    assert (found.equal, found.rounding, found.elsewhere, found.notes) == (True, False, False, [])
+
+
+@pytest.mark.parametrize(
+    ("facts", "by", "rounding", "elsewhere", "note"),
+    [
+        (
+            {"blas": "openblas 0.3 Prescott"},
+            1e-12,
+            True,
+            True,
+            "recorded with blas openblas 0.3 Prescott (here ",
+        ),
+        (
+            {"kernels": "not compiled: no C compiler"},
+            9e-8,
+            True,
+            True,
+            "kernels not compiled: no C compiler (here ",
+        ),
+        ({"processor": "another"}, 2e-7, False, True, "equal to about 1e-07 at best, not to the byte"),
+        ({"blas": None, "processor": None}, 1e-12, True, None, "the log does not say its processor, blas: "),
+        ({}, 1e-12, True, False, ""),
+    ],
+    ids=["other kernel", "no compiler", "too far", "an older log", "this machine"],
+)
+def test_a_difference_by_rounding_is_called_that_and_explained(
+    run: Run, facts: dict[str, str | None], by: float, rounding: bool, elsewhere: bool | None, note: str
+) -> None:
+    found = replay(rounded(said(run, **facts), by))
+    assert not found.equal
+    assert (found.rounding, found.elsewhere) == (rounding, elsewhere)
+    assert note in " ".join(found.notes)
+
+
+def test_a_log_of_another_machine_that_is_equal_all_the_same_says_so(run: Run) -> None:
+    found = replay(said(run, processor="another"))
+    assert found.equal
+    assert any("(here " in note and note.endswith("equal all the same") for note in found.notes)
+
+
 def test_other_versions_are_mentioned(run: Run) -> None:
     topic = topics.RUN_INFO["controller"]
     changed = edited(

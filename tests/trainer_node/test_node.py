@@ -71,7 +71,8 @@ class Controller:
         self.description = description
         self.hidden = initial_hidden(description, np.random.default_rng(seed))
         self.version, self.heard = 0, -1
-        self.adopts = True
+        self.adopts, self.judges = True, True
+        self.judged = (-1, "")
         self.claimed = ""
         self.adopted: list[HiddenWeights] = []
         self.questions: list[float] = []
@@ -102,7 +103,13 @@ class Controller:
             hidden_sha256=self.claimed or hash_layers(self.hidden),
             description=msgspec.json.encode(self.description).decode(),
             layers=[Array.of(layer, "<f4") for layer in self.hidden],
+            judged_version=self.judged[0],
+            judged_sha256=self.judged[1],
         )
+
+    def roll_back(self, hidden: list[np.ndarray]) -> None:
+        """The highest version stays what it was."""
+        self.hidden = [layer.astype(np.float32).astype(float) for layer in hidden]
 
     def tick(self, times: int = 1, lost: bool = False, miss: int = 0) -> None:
         """Samples whose h tells which it is, and K. `lost`: they do not arrive. `miss`: ticks left out."""
@@ -118,6 +125,8 @@ class Controller:
             self.bus.publish(topics.SAMPLES, Samples(run_id=self.run_id, seq=self.seq, samples=batch))
         received = self._weights.take()
         self.heard = max(self.heard, received.message.seq if received else -1)
+        if received is not None and self.judges:
+            self.judged = (received.message.seq, received.message.sha256)
         if self.adopts and received is not None and received.message.seq > self.version:
             self.adopted.append(received.message)
             self.version = received.message.seq
@@ -286,7 +295,7 @@ def test_a_restarted_controller_is_followed_and_its_predecessors_samples_stay(co
 def test_a_controller_that_refuses_is_asked_what_it_holds(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 0.3)
+    monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         controller.adopts = False
         controller.until(lambda h: h.counters["not adopted"] >= 1, tick=True)
@@ -297,11 +306,54 @@ def test_a_controller_that_refuses_is_asked_what_it_holds(
         assert controller.adopted[0].seq >= 2
 
 
-@pytest.mark.parametrize(("patience", "lead"), [(2 * PATIENCE, 0), (0.3, 400)], ids=["adopted", "heard"])
-def test_a_thief_under_its_name_does_not_silence_a_trainer(
-    config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int
+def test_after_every_refusal_training_goes_on_from_what_is_in_use(
+    config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stranger's sets are adopted, which is known at once; or one is only heard, and versions must pass it."""
+    monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
+    with Controller(config, "controller-1") as controller, RunningTrainer(config):
+        for refused in range(1, 4):
+            controller.adopts = False
+            controller.until(lambda h, n=refused: h.counters["not adopted"] >= n, tick=True)  # type: ignore[misc]
+            controller.adopts = True
+            done = len(controller.adopted)
+            health = controller.until(lambda _, n=done: len(controller.adopted) > n, tick=True)  # type: ignore[misc]
+        bases = [hash_layers(initial_hidden(DESCRIPTION, np.random.default_rng(0)))]
+        bases += [weights.sha256 for weights in controller.adopted]
+        assert [weights.base_sha256 for weights in controller.adopted] == bases[:-1]
+        # Not one version was left out, and nobody was suspected.
+        assert controller.heard <= health.counters["published"] + 1
+        assert health.counters["others' sets"] == 0
+
+
+@pytest.mark.parametrize("joined_before", [True, False], ids=["its own", "from before it came"])
+def test_after_a_rollback_training_goes_on_at_once_with_the_next_version(
+    config: Config, monkeypatch: pytest.MonkeyPatch, joined_before: bool
+) -> None:
+    monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
+    with Controller(config, "controller-1") as controller, RunningTrainer(config):
+        first = controller.hidden
+        controller.until(lambda _: len(controller.adopted) >= 2, tick=True)
+        controller.until(lambda h: h.counters["adopted"] >= len(controller.adopted), tick=True)
+        before = [layer.numpy().astype(float) for layer in controller.adopted[-2].layers]
+        # What this trainer may never have seen is known by what was judged last.
+        controller.roll_back(before if joined_before else [1.01 * layer for layer in first])
+        back, newest = controller.snapshot().hidden_sha256, controller.version
+        controller.until(lambda _: controller.version > newest, tick=True)
+        assert controller.adopted[-1].seq == newest + 1
+        assert controller.adopted[-1].base_sha256 == back
+        health = controller.until(lambda h: h.counters["rolled back"] >= 1)
+        assert (health.counters["others' sets"], health.counters["not adopted"]) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("patience", "lead", "judged"),
+    [(2 * PATIENCE, 0, True), (2 * PATIENCE, 400, True), (0.3, 400, False)],
+    ids=["adopted", "refused", "heard"],
+)
+def test_a_thief_under_its_name_does_not_silence_a_trainer(
+    config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int, judged: bool
+) -> None:
+    """A stranger's sets are judged, which is known at once; or one is only heard, and versions must pass it."""
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", patience)
     patient = msgspec.structs.replace(
         config, bus=msgspec.structs.replace(config.bus, follow_silence=2 * PATIENCE)
@@ -339,10 +391,10 @@ def test_a_thief_under_its_name_does_not_silence_a_trainer(
             controller.until(lambda _: in_use() not in ("", *forged), tick=True)
             controller.until(stolen, tick=True)
             if lead:
-                controller.adopts = False
+                controller.adopts, controller.judges = False, judged
                 steal(lead)
                 controller.until(lambda _: controller.heard >= controller.adopted[-1].seq + lead, tick=True)
-                controller.adopts = True
+                controller.adopts = controller.judges = True
         controller.until(lambda _: in_use() not in forged, tick=True)
 
 

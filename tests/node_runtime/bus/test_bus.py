@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import signal
+import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgpack
 import pytest
@@ -19,6 +21,7 @@ from node_runtime.realtime import clock
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
+from tandem import certificate_authority
 from tests.helpers.live import HANG_S, Process, connected, free_endpoint, live_config, matched, wait_for
 
 pytestmark = pytest.mark.live
@@ -331,6 +334,33 @@ def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.Lo
     assert router.main(config) == 1
     assert "is taken: another router may be running" in caplog.text
     assert config.bus.endpoint in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "says"),
+    [
+        ("tcp/203.0.113.9:7447", "tcp/203.0.113.9:7447: this machine does not have that address"),
+        ("tcp/nosuch.invalid:7447", "tcp/nosuch.invalid:7447: the name is not known here"),
+        ("tcp/127.0.0.1:99999", "tcp/127.0.0.1:99999: a port is a number from 1 to 65535"),
+    ],
+)
+def test_where_no_router_can_listen_the_plain_cause_is_said(
+    endpoint: str, says: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert router.main(override(Config(), [f'bus.endpoint="{endpoint}"', "bus.insecure=true"])) == 1
+    assert says in caplog.text
+    assert ".rs:" not in caplog.text
+
+
+def test_of_two_endpoints_the_taken_one_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    certificate_authority.create("jet1", [], tmp_path / "keys", 30)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"tls/127.0.0.1:{other.getsockname()[1]}"
+        keys = f'bus.tls.keys="{tmp_path}/keys/router"'
+        assert router.main(live_config(f'bus.remote="{taken}"', keys)) == 1
+    assert f"{taken} is taken: another router may be running, or another program" in caplog.text
 
 
 def test_the_router_process_ends_cleanly() -> None:

@@ -121,6 +121,19 @@ def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes):
         load(file)
 
 
+def test_a_byte_order_mark_before_a_file_is_no_part_of_it(tmp_path: Path):
+    path = tmp_path / "mine.toml"
+    path.write_bytes(b"\xef\xbb\xbfrate = 50.0\n")
+    assert load(path).rate == 50.0
+
+
+def test_a_file_in_another_encoding_is_named_as_such(tmp_path: Path):
+    path = tmp_path / "mine.toml"
+    path.write_bytes("rate = 50.0\n".encode("utf-16"))
+    with pytest.raises(ConfigError, match=r"mine\.toml: .*save it as UTF-8"):
+        load(path)
+
+
 def test_a_file_that_is_not_there(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"none\.toml: cannot be read: No such file"):
         load(tmp_path / "none.toml")

@@ -149,6 +149,49 @@ def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site
         assert commands.get(HANG_S)
 
 
+def _loopback6() -> str | None:
+    """A free port on ::1; None where this machine has no such address."""
+    try:
+        with socket.socket(socket.AF_INET6) as probe:
+            probe.bind(("::1", 0))
+            return f"[::1]:{probe.getsockname()[1]}"
+    except OSError:
+        return None
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+@pytest.mark.parametrize("written", ["[::1]", "[0:0::1]"])
+def test_a_router_at_an_ipv6_address_is_reached_by_certificates(
+    tmp_path: Path, protocol: str, written: str
+) -> None:
+    place = _loopback6()
+    if place is None:
+        pytest.skip("this machine has no IPv6 loopback address")
+    certificate_authority.create("jet1", ["[::1]"], tmp_path / "keys", 30)
+    endpoint = f"{protocol}/{place}"
+    router = live_config(f'bus.endpoint="{endpoint}"', f'bus.tls.keys="{tmp_path}/keys/router"')
+    there = endpoint.replace("[::1]", written)
+    controller = override(router, [f'bus.endpoint="{there}"', f'bus.tls.keys="{tmp_path}/keys/controller"'])
+    with open_router(router), Bus(controller, "controller", "c-1") as bus:
+        assert connected(bus)
+
+
+def test_an_ipv6_router_that_its_certificate_does_not_name_is_refused(tmp_path: Path) -> None:
+    place = _loopback6()
+    if place is None:
+        pytest.skip("this machine has no IPv6 loopback address")
+    certificate_authority.create("jet1", [], tmp_path / "keys", 30)
+    router = live_config(f'bus.endpoint="tls/{place}"', f'bus.tls.keys="{tmp_path}/keys/router"')
+    with open_router(router), pytest.raises(ConfigError, match=r"not for ::1: `tandem keys renew .* --host ::1`"):
+        Bus(override(router, [f'bus.tls.keys="{tmp_path}/keys/trainer"']), "trainer", "t-1").open()
+
+
+def test_an_address_with_a_zone_is_refused_where_certificates_are_needed() -> None:
+    with pytest.raises(ConfigError, match="no certificate can name an address with a zone"):
+        session_config("client", "tls/[fe80::1%2]:7448", 1000)
+    session_config("client", "tcp/[fe80::1%2]:7447", 1000)
+
+
 @pytest.mark.parametrize(
     ("role", "authority", "says"),
     [

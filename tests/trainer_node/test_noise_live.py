@@ -1,0 +1,53 @@
+"""The real processes under measurement noise: sets are refused and rolled back, and training goes on."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.router import Router
+from protocol import messages as m
+from protocol import topics
+from tests.helpers.live import BusListener, Process, live_config
+from trainer_node.node import ADOPTION_PATIENCE
+
+SETTINGS = (
+    "rate=50",
+    "controller.horizon=20",
+    "controller.solver.compile=never",
+    "network.hidden=[8, 8]",
+    "trainer.steps=20",
+    "trainer.train_every=5",
+)
+
+
+@pytest.mark.live
+def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
+    config = live_config(*SETTINGS)
+    with (
+        Router(config),
+        Bus(config, "recorder", "recorder-a") as bus,
+        Process("trainer_node.main", config),
+        Process("tests.helpers.noisy_plant", config),
+    ):
+        ear = BusListener(bus)
+        with Process("controller_node.node", config):
+            refused, adopted = 0, 0
+
+            def enough(message: m.Message) -> bool:
+                nonlocal refused, adopted
+                if isinstance(message, m.TickResult):
+                    refused += message.weights_outcome == "refused" or message.weights_rolled_back != ""
+                    adopted += message.weights_outcome == "adopted"
+                return refused >= 2 and adopted >= 3
+
+            ear.until(enough)
+        versions = [weights.seq for weights in ear.of(topics.HIDDEN_WEIGHTS)]
+        assert versions == list(range(1, len(versions) + 1))
+        ticks = [tick for tick in ear.of(topics.TICK) if tick.weights is not None]
+        # The median: other work may take this machine's cores away for seconds.
+        waits = [(b.slot - a.slot) * config.period for a, b in itertools.pairwise(ticks)]
+        assert float(np.median(waits)) < 0.5 * ADOPTION_PATIENCE
