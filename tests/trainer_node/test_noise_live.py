@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.router import Router
+from node_runtime.router import open_router
 from protocol import messages as m
 from protocol import topics
 from tests.helpers.live import BusListener, Process, live_config
@@ -28,7 +28,7 @@ SETTINGS = (
 def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
     config = live_config(*SETTINGS)
     with (
-        Router(config),
+        open_router(config),
         Bus(config, "recorder", "recorder-a") as bus,
         Process("trainer_node.main", config),
         Process("tests.helpers.noisy_plant", config),
