@@ -10,6 +10,7 @@ it and its folder belong to this user and nobody else can write there, and its c
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -110,10 +111,8 @@ class Compiler:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         wanted = self._cache or Path(home) / "tandem" / "kernels"
         directory = wanted
-        try:
+        with contextlib.suppress(OSError):  # said below, by what is there or not
             make_private(wanted)
-        except OSError:
-            pass  # said below, by what is there or not
         if not (wanted.is_dir() and os.access(wanted, os.W_OK)):
             directory = Path(tempfile.gettempdir()) / f"tandem-kernels-{os.geteuid()}"
             make_private(directory)

@@ -87,7 +87,7 @@ def run(
     made = Finished(
         out / "report.html",
         out / "summary.json",
-        sum(want.log is not None for want in wants.values()),
+        sum(len(want.logs) for want in wants.values()),
         [row for result in found for row in result.rows],
     )
     told = results.summary(found, header(declared, plant, command, code, processes, quick))

@@ -50,12 +50,12 @@ def command_line(command: str, config: Path) -> list[str]:
 class Child:
     """A process of the table, running in a process group of its own, its output in a file."""
 
-    def __init__(self, process: Process, config: Path, folder: Path):
-        """config: the TOML file it reads; folder: where its output goes."""
+    def __init__(self, process: Process, config: Path, folder: Path, *options: str):
+        """config: the TOML file it reads; folder: where its output goes; options: more of its command line."""
         self.process = process
         self.output = folder / f"{process.name}.txt"
         self.starts = 0
-        self._command = command_line(process.command, config)
+        self._command = [*command_line(process.command, config), *options]
         self._running: subprocess.Popen[bytes] | None = None
 
     @property

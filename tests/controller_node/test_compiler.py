@@ -247,12 +247,12 @@ def test_one_library_under_the_name_of_another_is_not_loaded(
 def test_several_damaged_libraries_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     x = ca.MX.sym("x")
     functions = [ca.Function("f", [x], [factor * x]) for factor in (2, 3)]
-    for function in functions:
-        Compiler(tmp_path)(function)
+    for one in functions:
+        Compiler(tmp_path)(one)
     for library in tmp_path.iterdir():
         replaced(library, b"")
     compiler = Compiler(tmp_path)
-    assert [float(compiler(function)(1)) for function in functions] == [2, 3]
+    assert [float(compiler(one)(1)) for one in functions] == [2, 3]
     assert len(caplog.records) == 1
 
 
