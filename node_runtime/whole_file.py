@@ -42,8 +42,13 @@ def open_regular(path: Path) -> Iterator[IO[bytes]]:
     Raises:
         OSError: it cannot be opened, or is no regular file. It never waits for one who writes into a pipe.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        _require(path, os.fstat(file.fileno()).st_mode)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _require(path, os.fstat(descriptor).st_mode)
+    except OSError:
+        os.close(descriptor)
+        raise
+    with open(descriptor, "rb") as file:
         yield file
 
 
