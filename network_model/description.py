@@ -33,8 +33,6 @@ Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 Length = Annotated[int, msgspec.Meta(ge=1, le=128)]
 Window = Annotated[int, msgspec.Meta(ge=1, le=64)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-WEIGHTS = 4 * 1024 * 1024
-"""Hidden weights at most, float32: a message carries 16 MiB."""
 LAYERS = 32
 """Hidden layers at most: a description comes from elsewhere, and memory is taken by it."""
 # Fields that came later are left out of the hash at these values: weights in older logs keep their network's hash.
@@ -83,11 +81,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
             raise ValueError(
                 f"the options of {self.architecture} are {sorted(known) or 'none'}, not {sorted(self.options)}"
             )
-        weights = sum(rows * columns for rows, columns in self.layer_shapes)
-        if weights > WEIGHTS:
-            raise ValueError(
-                f"{weights} hidden weights, and {WEIGHTS} is the most: they travel in one message"
-            )
+        _ = self.layer_shapes
 
     @property
     def pair(self) -> int:

@@ -67,7 +67,7 @@ def test_a_small_log_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(
     assert path.stat().st_size < 2**20
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for read in (lambda: read_run(path), lambda: recover(path, tmp_path / "whole.mcap")):
-        with pytest.raises(LogError, match="unpack to more than .* not read"):
+        with pytest.raises(LogError, match=r"unpack to more than .* not read"):
             read()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300 * 1024
     assert list(tmp_path.iterdir()) == [path]
