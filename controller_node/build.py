@@ -29,7 +29,10 @@ from network_model.registry import get_architecture
 from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
+from protocol.topics import WEIGHTS_LIMIT
 
+WEIGHTS = WEIGHTS_LIMIT // 4
+"""Hidden weights at most, float32 each."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
@@ -43,11 +46,12 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
     """The network of the configuration for this plant; inputs are scaled by its half-widths.
 
     Raises:
-        ValueError: the sizes or the options do not fit the architecture, or there is none of that name.
+        ValueError: the sizes or the options do not fit the architecture, there is none of that name, or the network
+            is larger than a message.
     """
     network = config.network
     architecture = get_architecture(network.architecture)
-    return NetworkDescription(
+    description = NetworkDescription(
         states=plant.d,
         inputs=plant.m,
         hidden=network.hidden,
@@ -59,6 +63,10 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
         window=architecture.window if network.window is None else network.window,
         options={**architecture.options, **network.options},
     )
+    weights = sum(rows * columns for rows, columns in description.layer_shapes)
+    if weights > WEIGHTS:
+        raise ValueError(f"{weights} hidden weights, and {WEIGHTS} is the most: they travel in one message")
+    return description
 
 
 def build_oracle(config: Config, model: Model) -> Oracle:

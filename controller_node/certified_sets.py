@@ -28,7 +28,7 @@ from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
-from node_runtime.whole_file import write_whole
+from node_runtime.whole_file import read_regular, write_whole
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
@@ -116,7 +116,10 @@ def _hash(found: Found, certificate: bytes) -> str:
 def read_sets(path: Path) -> CertifiedSets:
     """Raises `CertificateError`, naming the file."""
     try:
-        return CertifiedSets.from_bytes(path.read_bytes())
+        data = read_regular(path, LARGEST + 1)
+        if len(data) > LARGEST:
+            raise CertificateError(f"more than {LARGEST / 1e6:.0f} MB; no such sets are known")
+        return CertifiedSets.from_bytes(data)
     except OSError as error:
         raise CertificateError(f"{path}: cannot be read: {error.strerror}") from error
     except CertificateError as error:
@@ -177,7 +180,7 @@ class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
 
     def __getitem__(self, name: str) -> dict[str, np.ndarray]:
         try:
-            with np.load(self._path(name), allow_pickle=False) as saved:
+            with np.load(io.BytesIO(read_regular(self._path(name))), allow_pickle=False) as saved:
                 return {key: saved[key] for key in saved.files}
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise KeyError(name) from error

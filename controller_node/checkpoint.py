@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from controller_node.outbox import Outbox
-from node_runtime.whole_file import write_whole
+from node_runtime.whole_file import read_regular, require_regular, write_whole
 from protocol import codec, topics
 from protocol import messages as m
 
@@ -119,8 +119,7 @@ def read(path: Path, belongs: Mapping[str, str]) -> Checkpoint:
         OSError: it cannot be read.
         CheckpointError: it is damaged, or belongs to another controller.
     """
-    with path.open("rb") as file:
-        content = file.read(LARGEST + 1)
+    content = read_regular(path, LARGEST + 1)
     if len(content) > LARGEST:
         raise CheckpointError(f"more than {LARGEST} bytes: not a checkpoint")
     if not content.startswith(MAGIC):
@@ -151,6 +150,8 @@ def keep_aside(path: Path, error: CheckpointError) -> str:
     """Rename a file that cannot be used; says so, for the end of a sentence."""
     aside = path.with_name(path.name + error.aside)
     try:
+        require_regular(path)
+        require_regular(aside)
         path.replace(aside)
     except OSError as failed:
         return f"; it could not be kept aside ({failed.strerror})"

@@ -9,6 +9,7 @@ from types import TracebackType
 import msgspec
 
 from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.strict import readable
 from protocol import topics
 from protocol.messages import Health, ProcessStatus, RunInfo
 
@@ -111,7 +112,7 @@ class HealthPublisher:
                 process=self._bus.process,
                 status=self._status,
                 counters=counters,
-                note="; ".join(filter(None, (self._standing_note, self._note))),
+                note=readable("; ".join(filter(None, (self._standing_note, self._note)))),
             )
             self._seq += 1
             # Inside the lock, so that the order on the wire is the order of seq.

@@ -10,6 +10,7 @@ the controller no torch.
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -52,6 +53,9 @@ AnyCommand = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, do, and say what is wrong in one message; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A file's name may be any bytes, and a terminal may know few letters: what it cannot show ends no command.
+        sys.stdout.reconfigure(errors="backslashreplace")
     if list(argv) == ["--version"]:
         from importlib.metadata import version
 

@@ -32,10 +32,14 @@ def say(console: Console, *lines: str, style: str | None = None) -> None:
 
 
 def emit(result: Mapping[str, Any]) -> None:
-    """One JSON object on standard output; NaN becomes null, which JSON has."""
+    """One JSON object on standard output; NaN becomes null, which JSON has, and so is what UTF-8 can say."""
     import msgspec
 
-    sys.stdout.write(msgspec.json.encode(result, enc_hook=_plain).decode() + "\n")
+    try:
+        text = msgspec.json.encode(result, enc_hook=_plain)
+    except UnicodeEncodeError:  # the name of a file that is no text
+        text = msgspec.json.encode(_readable(msgspec.to_builtins(result, enc_hook=_plain)))
+    sys.stdout.write(text.decode() + "\n")
     sys.stdout.flush()
 
 
@@ -73,6 +77,16 @@ def _bar(console: Console, *columns: ProgressColumn) -> Progress:
         disable=not console.is_terminal,
         transient=True,
     )
+
+
+def _readable(value: Any) -> Any:
+    from node_runtime.config.strict import readable
+
+    if isinstance(value, dict):
+        return {key: _readable(below) for key, below in value.items()}
+    if isinstance(value, list | tuple):
+        return [_readable(below) for below in value]
+    return readable(value) if isinstance(value, str) else value
 
 
 def _plain(value: object) -> Any:

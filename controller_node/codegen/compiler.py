@@ -3,21 +3,29 @@
 The cache is keyed by the content of the generated C, the compiler and its flags. The key is in the library's *name*,
 because the loader caches by path and would silently go on running old code. Concurrent starts are safe: a library
 appears under its name by an atomic rename, whole or not at all.
+
+What is loaded runs, and what is damaged may end the process while it is loaded. So a library is looked at before:
+it and its folder belong to this user and nobody else can write there, and its content is what was written.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
 import shutil
+import stat
 import subprocess
 import tempfile
+from itertools import count
 from pathlib import Path
 
 import casadi as ca
 
 from controller_node.codegen.fast_loops import with_fast_loops
+from node_runtime.private_folder import make_private, why_not_ours, why_not_private
+from node_runtime.whole_file import read_regular, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +41,11 @@ FLAGS = (
 )
 TIMEOUT = 300.0
 COST = "solves in CasADi's virtual machine instead, about 4 times slower"
+REMEDY = "XDG_CACHE_HOME names another folder for the cache"
+SEAL = b"\ntandem kernel, sha256 of name and content: "
+"""Behind it, at the end of a library, is the checksum. The loader reads what an ELF file's headers name, no further."""
+LARGEST = 256 * 1024 * 1024
+"""Bytes of a library that is read at all."""
 
 
 class Compiler:
@@ -47,7 +60,7 @@ class Compiler:
     def __init__(self, cache: Path | None = None, command: str | None = None):
         self._cache = cache
         self._command = command or shutil.which("cc") or shutil.which("gcc")
-        self._complained = False
+        self._complained = self._mended = False
         self.note = ""
         """Which compiler made the functions, or why none did; for the log of a run."""
 
@@ -55,7 +68,12 @@ class Compiler:
         """The compiled function, or the function itself where it cannot be compiled, with one warning."""
         try:
             library = self._library(function)
-            compiled = ca.external(function.name(), str(library))
+            try:
+                compiled = ca.external(function.name(), str(library))
+            except RuntimeError:
+                # What a broken compiler made must not be found again when there is a better one.
+                library.unlink()
+                raise
         except (OSError, subprocess.SubprocessError, RuntimeError, CannotCompile) as error:
             self._complain(_reason(error))
             return function
@@ -70,9 +88,11 @@ class Compiler:
         name = f"{function.name()}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
         self.note = self.note or f"compiled with {version}"
         directory = self._directory()
-        library = directory / name
-        if library.is_file():
-            return library
+        library = _place(directory, name)
+        if (data := _read(library)) is not None:
+            if is_sealed(data, library.name):
+                return library
+            self._mend(library)
         with tempfile.TemporaryDirectory(dir=directory) as work:
             text, built = Path(work) / "kernel.c", Path(work) / name
             text.write_text(source)
@@ -81,26 +101,35 @@ class Compiler:
                 check=True,
                 capture_output=True,
                 text=True,
+                errors="replace",
                 timeout=TIMEOUT,
             )
-            built.replace(library)
+            write_whole(library, sealed(built.read_bytes(), library.name), mode=0o600)
         return library
 
     def _directory(self) -> Path:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         wanted = self._cache or Path(home) / "tandem" / "kernels"
-        try:
-            wanted.mkdir(parents=True, exist_ok=True)
-            if os.access(wanted, os.W_OK):
-                return wanted
-        except OSError:
-            pass
-        fallback = Path(tempfile.gettempdir()) / f"tandem-kernels-{os.getuid()}"
-        fallback.mkdir(mode=0o700, exist_ok=True)
-        # Someone else's directory of that name must not decide what code runs here.
-        if fallback.stat().st_uid != os.getuid():
-            raise CannotCompile(f"{wanted} cannot be written and {fallback} belongs to somebody else")
-        return fallback
+        directory = wanted
+        with contextlib.suppress(OSError):  # said below, by what is there or not
+            make_private(wanted)
+        if not (wanted.is_dir() and os.access(wanted, os.W_OK)):
+            directory = Path(tempfile.gettempdir()) / f"tandem-kernels-{os.geteuid()}"
+            make_private(directory)
+        # Whoever can write there decides what code runs here.
+        if (reason := why_not_private(directory)) is not None:
+            elsewhere = "" if directory == wanted else f"{wanted} cannot be written, and "
+            raise CannotCompile(f"no place for compiled code: {elsewhere}{reason}; {REMEDY}")
+        if os.statvfs(directory).f_flag & os.ST_NOEXEC:
+            raise CannotCompile(
+                f"{directory} is on a file system mounted noexec, where no code may run; {REMEDY}"
+            )
+        return directory
+
+    def _mend(self, library: Path) -> None:
+        if not self._mended:
+            self._mended = True
+            log.warning("%s: is not as it was written, and is not loaded; compiled again", library)
 
     def _complain(self, reason: str) -> None:
         self.note = f"not compiled: {reason}"
@@ -113,6 +142,42 @@ class CannotCompile(Exception):
     """Why functions stay in the virtual machine."""
 
 
+def sealed(content: bytes, name: str) -> bytes:
+    """What is written for the library `name`: its content, and the checksum of both."""
+    return content + SEAL + _checksum(content, name)
+
+
+def is_sealed(data: bytes, name: str) -> bool:
+    """Whether a file holds exactly what was once written for the library `name`."""
+    content, mark, checksum = data.rpartition(SEAL)
+    return bool(mark) and checksum == _checksum(content, name)
+
+
+def _checksum(content: bytes, name: str) -> bytes:
+    return hashlib.sha256(name.encode() + b"\0" + content).hexdigest().encode()
+
+
+def _place(directory: Path, name: str) -> Path:
+    """Where the library goes: beside whatever else than a file has its name."""
+    path = directory / name
+    for number in count(2):
+        if not os.path.lexists(path) or stat.S_ISREG(path.lstat().st_mode):
+            break
+        path = (directory / name).with_suffix(f".{number}.so")
+    return path
+
+
+def _read(library: Path) -> bytes | None:
+    """A library in a folder of ours; None where there is none. Raises `CannotCompile`: others may have written it."""
+    try:
+        status = library.lstat()
+    except FileNotFoundError:
+        return None
+    if (reason := why_not_ours(library, status)) is not None:
+        raise CannotCompile(f"compiled code that is not trusted: {reason}; remove it")
+    return read_regular(library, LARGEST)
+
+
 def _source(function: ca.Function) -> str:
     generator = ca.CodeGenerator("kernel.c", {"with_header": False})
     generator.add(function)
@@ -120,7 +185,9 @@ def _source(function: ca.Function) -> str:
 
 
 def _version(command: str) -> str:
-    answer = subprocess.run([command, "--version"], check=True, capture_output=True, text=True, timeout=20)
+    answer = subprocess.run(
+        [command, "--version"], check=True, capture_output=True, text=True, errors="replace", timeout=20
+    )
     if not answer.stdout:
         raise CannotCompile(f"{command} does not say its version")
     return answer.stdout.splitlines()[0]

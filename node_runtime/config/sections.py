@@ -7,6 +7,7 @@ the paper leaves out.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,6 +25,8 @@ from protocol.codec import first_non_finite
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
+Window = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+"""Samples that are held in memory at once: a log that is replayed says how many, too."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
@@ -112,7 +115,7 @@ class NetworkConfig(Section, frozen=True):
 class RefitConfig(Section, frozen=True):
     """Of K at an adoption; used where `adaptation.at_adoption` is "refit"."""
 
-    window: PositiveInt = 200
+    window: Window = 200
     """Newest samples that the controller remembers for it."""
     ridge: Positive = 1e-4
     """Weight that holds K where it was."""
@@ -154,7 +157,7 @@ class AdaptationConfig(Section, frozen=True):
 
 
 class L2nwConfig(Section, frozen=True):
-    window: PositiveInt = 100
+    window: Window = 100
     bandwidth: Positive = 0.5
     regularisation: Positive = 1e-3
     variables: list[str] | None = None
@@ -289,11 +292,17 @@ def from_tree(
 ) -> Config:
     """Convert a plain tree to a `Config`. Raises `ConfigError`.
 
-    where: the file, for messages; origins: for keys that come from elsewhere (`trainer.batch`), from where.
+    `~` at the beginning of a path is the home folder. where: the file, for messages; origins: for keys that come from
+    elsewhere (`trainer.batch`), from where.
     """
+    return _at_home(_checked(tree, where, origins), strict.failing(where, origins))
 
+
+def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
+    """The tree as a `Config`, its paths as they were written."""
     fail = strict.failing(where, origins)
     config = strict.convert(tree, Config, fail)
+    _check_texts(tree, fail)
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
@@ -317,6 +326,40 @@ def from_tree(
     return config
 
 
+def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
+    """Every text must be UTF-8, for it travels and is logged; the log's own name may be any bytes."""
+    if isinstance(value, dict):
+        for name, below in value.items():
+            _check_texts(below, fail, f"{key}.{name}".lstrip("."))
+    elif isinstance(value, list):
+        for i, below in enumerate(value):
+            _check_texts(below, fail, f"{key}[{i}]")
+    elif isinstance(value, str) and value != (said := strict.readable(value)) and key != "log.path":
+        fail(key, f"{key} = '{said}' is not UTF-8, as a configuration is; choose another name")
+
+
+def _at_home(config: Config, fail: Fail) -> Config:
+    """With the home folder for the `~` that a shell would have replaced."""
+
+    def found(key: str, section: Section) -> Any:
+        *_, last = key.split(".")
+        path = getattr(section, last)
+        user = (path or "").partition("/")
+        if not user[0].startswith("~") or (not user[1] and path != "~"):
+            return section
+        there = os.path.expanduser(path)
+        if there.startswith("~"):
+            fail(key, f"{key} = {path!r}: no home folder of {user[0]} is known; write the folder out")
+        return msgspec.structs.replace(section, **{last: there})
+
+    controller = found("controller.sets", found("controller.checkpoint", config.controller))
+    bus = msgspec.structs.replace(config.bus, tls=found("bus.tls.keys", config.bus.tls))
+    fleet = [found(f"trainer.fleet[{i}].keys", place) for i, place in enumerate(config.trainer.fleet)]
+    trainer = msgspec.structs.replace(config.trainer, fleet=fleet)
+    log = found("log.path", config.log)
+    return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
+
+
 def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
     try:
         known = get_architecture(network.architecture).options
@@ -337,11 +380,11 @@ def from_json(text: str) -> Config:
         raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ConfigError("the log's configuration is not a table")
-    return from_tree(tree, "the log's configuration")
+    return _checked(tree, "the log's configuration")
 
 
 def to_json(config: Config) -> str:
-    return msgspec.json.encode(config).decode()
+    return msgspec.json.encode(_readable(config)).decode()
 
 
 def to_tree(config: Config) -> dict[str, Any]:
@@ -350,8 +393,18 @@ def to_tree(config: Config) -> dict[str, Any]:
 
 
 def to_toml(config: Config) -> str:
-    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out."""
-    return tomli_w.dumps(_without_none(to_tree(config)))
+    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out.
+
+    A `log.path` that is not UTF-8, which TOML is, comes back as text that shows its bytes.
+    """
+    return tomli_w.dumps(_without_none(to_tree(_readable(config))))
+
+
+def _readable(config: Config) -> Config:
+    path = strict.readable(config.log.path)
+    if path == config.log.path:
+        return config
+    return msgspec.structs.replace(config, log=msgspec.structs.replace(config.log, path=path))
 
 
 def _without_none(value: Any) -> Any:

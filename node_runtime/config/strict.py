@@ -70,6 +70,11 @@ def apply_override(tree: dict[str, Any], assignment: str) -> str:
     return key
 
 
+def readable(text: str) -> str:
+    """What UTF-8 can say: a file's name may be any bytes, and those that are no text become \\udcXX."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
     """A plain tree as the Struct `kind`. Raises `ConfigError`, as helpful as for a configuration.
 

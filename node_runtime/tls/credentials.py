@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
 from node_runtime.config.strict import ConfigError
+from node_runtime.whole_file import read_regular
 from protocol.rights import common_name
 
 CERTIFICATE = "certificate.pem"
@@ -152,6 +153,6 @@ def name_of(certificate: x509.Certificate) -> str:
 def read_bytes(path: Path) -> bytes:
     """Raises `ConfigError` when the file cannot be read."""
     try:
-        return path.read_bytes()
+        return read_regular(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error

@@ -11,15 +11,14 @@ EACH_TICK = (topics.TICK, topics.COMMAND, topics.RESULT)
 """Every tick has one of each, so a number that is missing is a message that was lost."""
 
 
-def stretches(numbers: Iterable[int]) -> list[tuple[int, int]]:
-    """Rising numbers as (first, how many) of each stretch without a hole."""
-    found: list[tuple[int, int]] = []
-    for number in numbers:
-        if found and number == sum(found[-1]):
-            found[-1] = (found[-1][0], found[-1][1] + 1)
-        else:
-            found.append((number, 1))
-    return found
+def holes(there: Iterable[int], first: int, last: int) -> list[tuple[int, int]]:
+    """(first, how many) of every stretch of first..last of which nothing is there.
+
+    As much work as there are numbers, not as many as there could be: a log says what its numbers are.
+    """
+    inside = sorted({number for number in there if first <= number <= last})
+    between = zip([first - 1, *inside], [*inside, last + 1], strict=True)
+    return [(a + 1, b - a - 1) for a, b in between if b > a + 1]
 
 
 def lost_ticks(run: Run) -> list[tuple[str, int, int]]:
@@ -34,6 +33,5 @@ def lost_ticks(run: Run) -> list[tuple[str, int, int]]:
         # Where a log begins or ends within a run, it is no loss that a tick has some of its messages only.
         first = (max if run.part > 1 else min)(min(seqs) for seqs in logged if seqs)
         last = (min if run.ends_within else max)(max(seqs) for seqs in logged if seqs)
-        missing = sorted(set(range(first, last + 1)) - set.intersection(*logged))
-        found += [(run_id, first, count) for first, count in stretches(missing)]
+        found += [(run_id, at, count) for at, count in holes(set.intersection(*logged), first, last)]
     return found

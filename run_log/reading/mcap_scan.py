@@ -23,12 +23,14 @@ from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, 
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
+from node_runtime.whole_file import open_regular
 from run_log.errors import LogError
 
 PREFIX = struct.Struct("<BQ")
 FOOTER = struct.Struct("<BQQQI")
-CHUNK_LIMIT = 1024 * 1024 * 1024
-"""Bytes of an uncompressed chunk; more is damage, and would only exhaust the memory."""
+UNPACKED_TIMES, UNPACKED_ALWAYS = 64, 64 * 1024 * 1024
+"""A log unpacks to at most so many times its size, or so many bytes: ours to two or three times. More would only
+exhaust the memory, which is what a file that unpacks to nearly nothing but zeros is made for."""
 UNREADABLE = (
     McapError,
     CRCValidationError,
@@ -53,11 +55,13 @@ class Scan:
     """Byte at which a truncated file ends in the middle; None for a whole one."""
     damage: list[str] = field(default_factory=list)
     size: int = 0
+    unpacked: int = 0
+    """Bytes of the chunks so far, without their compression."""
 
     def __iter__(self) -> Iterator[Record]:
         """Raises `LogError`: the file cannot be opened, is no MCAP file, or is damaged."""
         try:
-            with self.path.open("rb") as stream:
+            with open_regular(self.path) as stream:
                 self.size = stream.seek(0, 2)
                 stream.seek(0)
                 yield from self._records(stream)
@@ -111,13 +115,28 @@ class Scan:
                         raise ValueError("its checksum does not fit")
                     return [Attachment.read(data)]
                 case Opcode.CHUNK:
-                    return _chunk(Chunk.read(data))
+                    return self._chunk(Chunk.read(data))
                 case _:  # indexes, and what later versions of the format may add
                     return []
         except UNREADABLE as error:
             name = Opcode(opcode).name.lower()
             self._damaged(position, f"a record ({name}) does not fit its checksum or cannot be read: {error}")
             return []
+
+    def _chunk(self, chunk: Chunk) -> list[Record]:
+        size = chunk.uncompressed_size
+        if chunk.compression not in ("", "zstd"):
+            raise ValueError(f"its compression {chunk.compression!r} is none that a log of Tandem has")
+        packed = chunk.compression == "zstd"
+        if (zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)) != size:
+            raise ValueError("its size is not the size it says")
+        self.unpacked += size
+        if self.unpacked > max(UNPACKED_TIMES * self.size, UNPACKED_ALWAYS):
+            raise LogError(
+                f"{self.path}: {self.size} bytes that unpack to more than {self.unpacked - 1}: not read, since no log "
+                f"of Tandem unpacks to {UNPACKED_TIMES} times its size, and this one would take the memory"
+            )
+        return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, Record)]
 
     def _check_data_end(self, position: int, body: bytes, checksum: int) -> None:
         if len(body) != 4 or int.from_bytes(body, "little") not in (0, checksum):
@@ -162,12 +181,3 @@ class Scan:
                 f"`tandem recover {self.path}` makes a new file of what is still good."
             )
         self.damage.append(text)
-
-
-def _chunk(chunk: Chunk) -> list[Record]:
-    size = chunk.uncompressed_size
-    if size > CHUNK_LIMIT or (
-        chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) != size
-    ):
-        raise ValueError("its size is not the size it says")
-    return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, Record)]

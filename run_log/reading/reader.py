@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mcap.records import Attachment, Channel, Header, Message, Metadata
@@ -63,7 +64,7 @@ def _take_metadata(run: Run, record: Metadata) -> None:
         run.recovered = True
     elif record.name == CONTINUED:
         run.continued = record.metadata.get("in")
-    elif record.name == IDENTITY and (part := record.metadata.get("part", "")).isdecimal():
+    elif record.name == IDENTITY and re.fullmatch("[0-9]{1,9}", part := record.metadata.get("part", "")):
         run.part = int(part)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 
+from node_runtime.config.strict import readable
 from run_log.errors import LogError
 from run_log.file_format import RAW, RECOVERED, check_header
 from run_log.reading.mcap_scan import Scan
@@ -85,7 +86,9 @@ def _copy(
     writer = mcap_writer(sink, CHUNK_BYTES)
     writer.start(header.profile, header.library)
     reason = "whole" if probe.cut_at is None else f"cut at byte {probe.cut_at}"
-    writer.add_metadata(RECOVERED, {"from": probe.path.name, "because": "; ".join([reason, *probe.damage])})
+    writer.add_metadata(
+        RECOVERED, {"from": readable(probe.path.name), "because": "; ".join([reason, *probe.damage])}
+    )
     new_schemas = {
         schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
         for schema in schemas.values()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from run_log.errors import LogError
-from run_log.reading.gaps import stretches
+from run_log.reading.gaps import holes
 from run_log.replaying.recorded import RecordedController
 from run_log.run import Run
 
@@ -33,9 +33,8 @@ def replayable(run: Run, recorded: RecordedController, from_tick: int | None) ->
     """
     segments = _begin(run, recorded, from_tick)
     last, begin = recorded.last, segments.start
-    missing = (seq for seq in range(begin + 1, last + 1) if seq not in recorded.ticks)
     # A missing tick ends a segment: what the controller knew after it is known again at the next keyframe.
-    for gap, length in stretches(missing):
+    for gap, length in holes(recorded.ticks, begin + 1, last):
         if gap <= begin:
             continue
         if gap > begin + 1:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
+from node_runtime.whole_file import write_whole
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
@@ -22,12 +24,12 @@ def report(path: str | Path, out_dir: str | Path) -> list[Path]:
     data = traces(run)
     figures = {f"{path.stem}.png": plots.overview(data, title(run))}
     figures |= {f"{path.stem}-{name}.png": figure for name, figure in plots.pictures(data).items()}
-    return [_save(figure, out_dir / name) for name, figure in figures.items()]
+    return [save_picture(figure, out_dir / name) for name, figure in figures.items()]
 
 
 def picture(run: Run, path: str | Path) -> Path:
     """The whole run on one page. Raises `LogError` as `report` does."""
-    return _save(plots.overview(traces(run), title(run)), Path(path))
+    return save_picture(plots.overview(traces(run), title(run)), Path(path))
 
 
 def title(run: Run) -> str:
@@ -40,10 +42,21 @@ def title(run: Run) -> str:
     )
 
 
-def _save(figure: plots.Figure, path: Path) -> Path:
+def save_picture(figure: plots.Figure, path: Path, dpi: float | None = None) -> Path:
+    """Write a figure whole, in the format that the name's ending says; returns the path.
+
+    Raises:
+        LogError: no picture has that ending, the file cannot be written, or it is a link, a device or a pipe.
+    """
+    ending, known = path.suffix.lstrip(".").lower(), figure.canvas.get_supported_filetypes()
+    if ending not in known:
+        raise LogError(
+            f"{path}: no picture has that ending; name it .png, or one of {', '.join(sorted(known))}"
+        )
+    content = BytesIO()
+    figure.savefig(content, format=ending, dpi=figure.dpi if dpi is None else dpi)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
+        write_whole(path, content.getvalue())
     except OSError as error:
         raise LogError(f"{path}: cannot be written: {error.strerror}") from error
     return path

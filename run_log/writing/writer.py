@@ -17,7 +17,8 @@ import msgspec
 from lbmpc.plants import Plant
 from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
-from node_runtime.config.sections import Config, to_toml
+from node_runtime.config.sections import Config, to_json, to_toml
+from node_runtime.config.strict import readable
 from protocol import codec, topics
 from protocol.codec import Head
 from protocol.messages import Message
@@ -137,7 +138,7 @@ class LogWriter:
             LogError: the file does not hold everything; `tandem recover` saves what it holds.
         """
         if continued is not None:
-            self._mcap.add_metadata(CONTINUED, {"in": continued.name})
+            self._mcap.add_metadata(CONTINUED, {"in": readable(continued.name)})
         self._mcap.finish()
         if not self.sink.close():
             raise LogError(f"{self.sink.error}; the log is cut short: `tandem recover` saves what there is")
@@ -199,7 +200,7 @@ def _attachments(config: Config, plant: Plant, versions: dict[str, str]) -> list
     channels = {RAW + topic.name: topic.type.__name__ for topic in topics.ALL}
     as_json = "application/json"
     return [
-        (CONFIG, as_json, msgspec.json.format(msgspec.json.encode(config)).decode()),
+        (CONFIG, as_json, msgspec.json.format(to_json(config))),
         ("config.toml", "application/toml", to_toml(config)),
         ("versions.json", as_json, json.dumps(versions, indent=2)),
         ("seeds.json", as_json, json.dumps({"seed": config.seed})),

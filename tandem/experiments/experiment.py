@@ -94,7 +94,7 @@ def run(
     report, summary = out / "report.html", out / "summary.json"
     write_whole(report, html.encode())
     write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
-    return Finished(report, summary, sum(want.log is not None for want in wants.values()), every)
+    return Finished(report, summary, sum(len(want.logs) for want in wants.values()), every)
 
 
 def settings(declared: Declaration, where: str) -> Config:

@@ -6,13 +6,14 @@ None is ever overwritten.
 from __future__ import annotations
 
 import fcntl
-import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
+from node_runtime.whole_file import require_regular
 from run_log.writing.parts import existing_parts
 from tandem.terminal import Refused
 
@@ -47,7 +48,7 @@ def claimed(log: Path) -> Iterator[tuple[RunFiles, list[str]]]:
     What has these names already is moved aside to NAME.1.mcap, NAME.1.png and so on.
 
     Raises:
-        Refused: another run is writing there, or the place cannot be written to.
+        Refused: another run is writing there, the place cannot be written to, or one of the names is not of a file.
     """
     files = RunFiles.of(log)
     if log.suffix in (".png", ".processes"):
@@ -70,16 +71,24 @@ def claimed(log: Path) -> Iterator[tuple[RunFiles, list[str]]]:
 
 def _move_aside(files: RunFiles) -> list[str]:
     there = files.there()
-    if files.folder.is_dir():
+    for path in there:
+        if path != files.folder or path.is_symlink() or not path.is_dir():
+            require_regular(path)
+    if files.folder in there:
         lock = _lock(files.folder)
         if lock is None:
             raise Refused(_busy(files.log))
         os.close(lock)
-    names = (files.log.with_suffix(f".{number}{files.log.suffix}") for number in itertools.count(1))
-    aside = next(name for name in names if not RunFiles.of(name).there())
+    stem = files.log.stem
+    ends = {files.log.suffix, ".png", ".processes", *(path.name.removeprefix(stem) for path in there)}
+    aside = next(
+        name
+        for name in (files.log.with_name(f"{stem}.{number}") for number in count(1))
+        if not any(os.path.lexists(f"{name}{end}") for end in ends)
+    )
     said = []
     for old in there:
-        new = old.with_name(aside.stem + old.name.removeprefix(files.log.stem))
+        new = aside.with_name(aside.name + old.name.removeprefix(stem))
         old.rename(new)
         if old != files.folder:
             said.append(f"{old} was there already; it is now {new}")
@@ -92,7 +101,7 @@ def _busy(log: Path) -> str:
 
 def _lock(folder: Path) -> int | None:
     """Hold the folder for as long as this process lives; None when another process does."""
-    handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

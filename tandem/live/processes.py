@@ -52,13 +52,13 @@ def command_line(command: str, config: Path) -> list[str]:
 class Child:
     """A process of the table, running in a process group of its own, its output in a file."""
 
-    def __init__(self, process: Process, config: Path, folder: Path):
-        """config: the TOML file it reads; folder: where its output goes."""
+    def __init__(self, process: Process, config: Path, folder: Path, *options: str):
+        """config: the TOML file it reads; folder: where its output goes; options: more of its command line."""
         self.process, self.name = process, process.name
         self.started_at = 0.0
         """Of the newest start, seconds on the monotonic clock."""
         self._output = folder / f"{process.name}.txt"
-        self._command = command_line(process.command, config)
+        self._command = [*command_line(process.command, config), *options]
         self._running: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:

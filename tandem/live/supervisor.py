@@ -100,7 +100,12 @@ class Supervisor:
     ):
         self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
         table = [process for process in TABLE if process.name != "trainer" or (trainer and trains(config))]
-        self.children = {process.name: Child(process, config_file, folder) for process in table}
+        # The log's name may be any bytes, which a TOML file cannot say.
+        options = {"recorder": ("--log", config.log.path)}
+        self.children = {
+            process.name: Child(process, config_file, folder, *options.get(process.name, ()))
+            for process in table
+        }
         self._bus: Bus | None = None
         self._mailbox: Mailbox | None = None
         self._next_show = 0.0

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -371,3 +372,21 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
     assert ear.of(topics.KEYFRAME)[0].resumed == ""
     # At its orderly end it left a checkpoint of its own.
     assert read(path, ControllerCore(live, "x").memory.belongs()).run_id == ear.of(topics.TICK)[0].run_id
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere")])
+def test_a_pipe_or_a_link_as_checkpoint_blocks_nothing_and_keeps_its_place(
+    make: Callable[[Path], None], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "elsewhere").write_bytes(b"not a checkpoint")
+    path = tmp_path / "checkpoint"
+    make(path)
+    kind = path.lstat().st_mode
+    assert resume(Anybody(BELONGS), path) is None
+    counts_ = counts()
+    with CheckpointWriter(path, BELONGS, Outbox("controller-1"), 100, counts_) as writer:
+        writer.offer(memory())
+    assert counts_["checkpoints failed"] == 1
+    assert path.lstat().st_mode == kind
+    assert (tmp_path / "elsewhere").read_bytes() == b"not a checkpoint"
+    assert caplog.text.count("only a regular file is read, replaced or moved") == 2

@@ -6,6 +6,7 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from controller_node.codegen.compiler import Compiler
+from controller_node.codegen.compiler import Compiler, is_sealed
 from lbmpc.casadi_buffers import Bound
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem
@@ -163,3 +164,207 @@ def test_new_weights_rebuild_nothing_and_are_written_in_place(tmp_path: Path) ->
         fresh = function(oracle)(np.zeros(4), np.zeros(1), theta)
         np.testing.assert_allclose(bound.outputs["h"], np.array(fresh[0]), atol=1e-16)
     assert len(list(tmp_path.iterdir())) == 1
+
+
+# -- what is loaded ------------------------------------------------------------------------------------------
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
+SOMEBODY = 12345
+
+
+def built(cache: Path) -> Path:
+    """The library of `small` in a cache."""
+    assert is_compiled(Compiler(cache)(small()))
+    (library,) = cache.glob("small-*.so")
+    return library
+
+
+def replaced(library: Path, content: bytes) -> None:
+    """As another inode: this process may have the old one in its memory."""
+    library.unlink()
+    library.write_bytes(content)
+    library.chmod(0o600)
+
+
+def runs_compiled(cache: Path, caplog: pytest.LogCaptureFixture) -> bool:
+    """Whether a start uses compiled code; the answer is right in any case. `caplog` has what it said."""
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        f = Compiler(cache)(small())
+    assert float(evaluate(f, np.ones((7, 3)), np.ones((3, 11)))[1].sum()) == 7 * 3 * 3 * 11
+    return is_compiled(f)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda whole: whole[:5000],
+        lambda whole: b"",
+        lambda whole: os.urandom(len(whole)),
+        lambda whole: whole[: len(whole) // 2] + b"\0" * 64 + whole[len(whole) // 2 + 64 :],
+        lambda whole: whole[:-100],  # what a version without checksums left
+        lambda whole: whole[:-1],
+    ],
+    ids=["cut", "empty", "garbage", "one block of zeros", "no checksum", "cut checksum"],
+)
+def test_a_damaged_library_is_seen_before_it_is_loaded_and_compiled_again(
+    damaged: Callable[[bytes], bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    library = built(tmp_path)
+    replaced(library, damaged(library.read_bytes()))
+    assert runs_compiled(tmp_path, caplog)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert f"{library}: is not as it was written" in caplog.text
+    assert runs_compiled(tmp_path, caplog)
+    assert not caplog.records
+
+
+def test_a_library_cut_in_place_does_not_end_the_next_process(tmp_path: Path) -> None:
+    library = built(tmp_path)
+    content = library.read_bytes()
+    replaced(library, content)
+    os.truncate(library, 5000)
+    code = (
+        "import sys; from pathlib import Path; from tests.controller_node.test_compiler import *;"
+        "print(is_compiled(Compiler(Path(sys.argv[1]))(small())))"
+    )
+    run = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, cwd=ROOT)
+    assert (run.returncode, run.stdout) == (0, "True\n"), run.stderr
+    assert is_sealed(library.read_bytes(), library.name)
+
+
+def test_one_library_under_the_name_of_another_is_not_loaded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    x = ca.MX.sym("x")
+    Compiler(tmp_path)(ca.Function("f", [x], [2 * x]))
+    (other,) = tmp_path.iterdir()
+    replaced(library := built(tmp_path), other.read_bytes())
+    assert runs_compiled(tmp_path, caplog)
+    assert f"{library}: is not as it was written" in caplog.text
+
+
+def test_several_damaged_libraries_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    x = ca.MX.sym("x")
+    functions = [ca.Function("f", [x], [factor * x]) for factor in (2, 3)]
+    for one in functions:
+        Compiler(tmp_path)(one)
+    for library in tmp_path.iterdir():
+        replaced(library, b"")
+    compiler = Compiler(tmp_path)
+    assert [float(compiler(one)(1)) for one in functions] == [2, 3]
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("elsewhere")])
+def test_what_is_no_file_keeps_its_place_and_costs_no_speed(
+    make: Callable[[Path], None], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    library = built(tmp_path)
+    library.unlink()
+    make(library)
+    kind = library.lstat().st_mode
+    for _ in range(2):
+        assert runs_compiled(tmp_path, caplog)
+    assert library.lstat().st_mode == kind
+    assert sorted(tmp_path.iterdir()) == sorted([library, library.with_suffix(".2.so")])
+
+
+def test_what_a_broken_compiler_made_is_not_found_by_a_better_one(tmp_path: Path) -> None:
+    cache, name = tmp_path / "cache", 'if [ "$1" = --version ]; then cc --version'
+    command = script(tmp_path / "cc", f'{name}; else echo garbage > "$3"; fi')
+    assert not is_compiled(Compiler(cache, command)(small()))
+    script(tmp_path / "cc", f'{name}; else exec cc "$@"; fi')
+    assert is_compiled(Compiler(cache, command)(small()))
+
+
+# -- whose it is ---------------------------------------------------------------------------------------------
+
+
+def test_the_cache_is_for_its_owner_alone_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        library = built(tmp_path / "new" / "cache")
+    finally:
+        os.umask(before)
+    for path in (library, library.parent, library.parent.parent):
+        assert path.stat().st_mode & 0o077 == 0
+
+
+def group_may_write(path: Path) -> None:
+    path.chmod(path.stat().st_mode | 0o020)
+
+
+def all_may_write(path: Path) -> None:
+    path.chmod(0o777)
+
+
+def somebody_elses(path: Path) -> None:
+    os.chown(path, SOMEBODY, -1)
+
+
+def a_link(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("what", "change", "reason"),
+    [
+        ("folder", group_may_write, "can be written by others (mode 0720): chmod go-w"),
+        ("folder", all_may_write, "can be written by others (mode 0777): chmod go-w"),
+        ("folder", a_link, "is a link"),
+        ("above", all_may_write, "which everybody can write"),
+        ("library", group_may_write, "can be written by others (mode 0620): chmod go-w"),
+        pytest.param("folder", somebody_elses, "belongs to user 12345", marks=needs_root),
+        pytest.param("above", somebody_elses, "which belongs to user 12345", marks=needs_root),
+        pytest.param("library", somebody_elses, "belongs to user 12345", marks=needs_root),
+    ],
+)
+def test_what_others_can_write_is_not_loaded_and_one_line_says_so(
+    what: str, change: Callable[[Path], None], reason: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = tmp_path / "above" / "cache"
+    library = built(cache)
+    change({"library": library, "folder": cache, "above": cache.parent}[what])
+    assert not runs_compiled(cache, caplog)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert reason in caplog.text
+    assert "virtual machine" in caplog.text
+
+
+def test_a_cache_of_our_own_below_a_sticky_folder_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tmp_path.chmod(0o1777)
+    built(tmp_path / "cache")
+    assert runs_compiled(tmp_path / "cache", caplog)
+
+
+@pytest.mark.parametrize("change", [a_link, pytest.param(somebody_elses, marks=needs_root), all_may_write])
+def test_the_last_resort_in_tmp_is_looked_at_without_following_links(
+    change: Callable[[Path], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "file").write_text("no folder")
+    wanted = tmp_path / "file" / "cache"
+    built_there = tmp_path / f"tandem-kernels-{os.geteuid()}"
+    built(built_there)
+    assert runs_compiled(wanted, caplog)
+    change(built_there)
+    assert not runs_compiled(wanted, caplog)
+    assert f"{wanted} cannot be written, and {built_there}" in caplog.text
+
+
+def test_a_cache_mounted_noexec_is_named_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    real = os.statvfs(tmp_path)
+    mounted = os.statvfs_result((*real[:8], real.f_flag | os.ST_NOEXEC, real.f_namemax))
+    monkeypatch.setattr(os, "statvfs", lambda path: mounted)
+    assert not runs_compiled(tmp_path, caplog)
+    assert "mounted noexec" in caplog.text
+    assert "XDG_CACHE_HOME" in caplog.text

@@ -16,7 +16,7 @@ from node_runtime.realtime import clock
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
-from run_log.reading.gaps import lost_ticks, stretches
+from run_log.reading.gaps import holes, lost_ticks
 from run_log.reading.reader import read_run
 from run_log.reporting.summary import summarise
 from run_log.run import gather
@@ -96,6 +96,9 @@ def test_what_is_sent_again_or_by_a_stranger_is_no_gap(tmp_path: Path) -> None:
         assert writer.lost == {}
 
 
-def test_stretches() -> None:
-    assert stretches([]) == []
-    assert stretches([1, 2, 3, 7, 9, 10]) == [(1, 3), (7, 1), (9, 2)]
+def test_holes() -> None:
+    assert holes([], 1, 0) == []
+    assert holes([], 3, 5) == [(3, 3)]
+    assert holes([4, 5, 6, 8], 1, 10) == [(1, 3), (7, 1), (9, 2)]
+    assert holes([0, 1, 2**63 - 1], 0, 2**63 - 1) == [(2, 2**63 - 3)]
+    assert holes([-5, 1, 99], 1, 2) == [(2, 1)]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -192,3 +194,21 @@ def test_any_plant_has_its_names_on_the_axes(
 def test_reading_needs_neither_torch_nor_a_display() -> None:
     code = "import sys, run_log.reporting.report, run_log.replaying.replay; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
+def test_a_picture_replaces_files_alone(whole: Path, tmp_path: Path, make: Callable[[Path], None]) -> None:
+    (tmp_path / "elsewhere").write_text("somebody else's")
+    make(tmp_path / "run.png")
+    kind = (tmp_path / "run.png").lstat().st_mode
+    with pytest.raises(LogError, match=r"run\.png: cannot be written: it is a (pipe|link|folder)"):
+        report(whole, tmp_path)
+    assert (tmp_path / "run.png").lstat().st_mode == kind
+    assert (tmp_path / "elsewhere").read_text() == "somebody else's"
+
+
+def test_a_picture_of_an_unknown_kind_is_refused_with_those_that_are_known(
+    whole: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(LogError, match=r"no picture has that ending.*png.*svg"):
+        picture(read_run(whole), tmp_path / "run.picture")

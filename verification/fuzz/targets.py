@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from controller_node.certified_sets import CertifiedSets, Found
+from controller_node.codegen.compiler import SEAL, is_sealed, sealed
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from lbmpc.sets.certificate import CertificateError
@@ -35,6 +36,8 @@ from verification.fuzz.seeds import ANSWERS, config, seeds
 
 SHARE_OF_SLOW = 0.01
 """Of the payloads, for readers of whole files: a thousand times slower than a message."""
+
+LIBRARY = "kernel-0123456789ab.so"
 
 ACCEPTED = ("accepted", "accepted, cut short")
 Read = Callable[[bytes], str]
@@ -84,6 +87,7 @@ def targets(seed: int, folder: Path) -> list[Target]:
     add("configuration, JSON", _reconfiguring, [to_json(settings).encode()], 0.02, textual=True)
     sets = _sets()
     add("certified sets", _certifying, [sets, gzip.compress(sets, mtime=0)], 0.1)
+    add("compiled code", _loading, [sealed(b"\x7fELF" + bytes(range(256)), LIBRARY)], 0.2)
     log = _log(settings, payloads, folder)
     add("log file", _logging(folder / f"fuzzed-{seed}.mcap"), [log], SHARE_OF_SLOW)
     return found
@@ -203,6 +207,15 @@ def _certifying(payload: bytes) -> str:
         CertifiedSets.from_bytes(payload)
     except CertificateError:
         return "refused"
+    return "accepted"
+
+
+def _loading(payload: bytes) -> str:
+    """Nothing is ever loaded here: a library is accepted that is, byte for byte, what was written for its name."""
+    if not is_sealed(payload, LIBRARY):
+        return "refused"
+    content = payload.rpartition(SEAL)[0]
+    assert payload == sealed(content, LIBRARY)
     return "accepted"
 
 

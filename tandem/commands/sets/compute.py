@@ -50,11 +50,14 @@ class SetsCompute(Configured):
         from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
         from lbmpc.sets.enclosures.disturbance import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
+        from node_runtime.whole_file import require_regular
 
         if not 0.0 < self.slack < 1.0:
             raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
-        if self.out.is_dir():
-            raise Refused(f"{self.out}: is a folder; name a file")
+        try:
+            require_regular(self.out)
+        except OSError as error:
+            raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
         model = build_model(config)
         W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
         start = start_of(config, model)

@@ -39,6 +39,7 @@ class SetsPlot(Command):
         from lbmpc.sets.certificate import CertificateError, require_match
         from lbmpc.sets.geometry.polytope import SetError
         from run_log.reading.reader import read_run
+        from run_log.reporting.report import save_picture
         from run_log.reporting.summary import trajectory
         from run_log.run import plant_of
         from tandem.commands.sets.picture import Drawn, picture
@@ -64,11 +65,9 @@ class SetsPlot(Command):
             x0 = states[0]
         try:
             figure = picture(Drawn(sets.certificate, model, np.asarray(x0), states), _title(sets))
-            figure.savefig(out, dpi=120)
+            save_picture(figure, out, dpi=120)
         except SetError as error:
             raise Refused(f"{file}: {error}") from error
-        except OSError as error:
-            raise Refused(f"{out}: cannot be written: {error.strerror}") from error
         self.say(f"picture {out}")
         self.emit({"picture": str(out), "sha256": sets.sha256})
         return 0

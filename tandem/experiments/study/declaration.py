@@ -131,6 +131,8 @@ def resolve(declared: Declaration, plant: Plant, where: str, quick: bool = False
         for one in _resolve(declared, case, plant, where, quick)
     ]
     known = [case.name for case in resolved]
+    if twice := [name for name in known if known.count(name) > 1]:
+        raise ConfigError(f"{where}: two cases are called {twice[0]!r}")
     for group in declared.group:
         if group.reference is not None and not quick:
             _known(Path(where), f"group {group.name!r}: reference", group.reference, known)

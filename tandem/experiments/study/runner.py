@@ -5,6 +5,7 @@ A run is the same in any process, so neither the number of processes nor an inte
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import msgspec
 
 from node_runtime.config.sections import AdaptationConfig, Config, PlantConfig
-from node_runtime.whole_file import write_whole
+from node_runtime.whole_file import read_regular, write_whole
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
 from tandem.experiments.study.declaration import Resolved
@@ -27,6 +28,10 @@ from tandem.experiments.study.work import Record, read, work
 
 Progress = Callable[[int, int], None]
 """Told what is done and of how many."""
+
+
+LONGEST_NAME = 160
+"""Letters of a case in a file's name, which may have 255 in all."""
 
 
 class RunnerError(RuntimeError):
@@ -38,24 +43,24 @@ class Want(NamedTuple):
 
     job: Job
     detail: bool
-    log: Path | None
+    logs: tuple[Path, ...]
+    """Two cases may be one job: each has a log of its own."""
 
 
 def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Want]:
     """Every job once, floors too, by key. `detailed`: groups whose pictures show traces."""
     wants: dict[str, Want] = {}
 
-    def want(job: Job, detail: bool, log: Path | None) -> None:
-        before = wants.get(job.key, Want(job, False, None))
-        wants[job.key] = Want(job, detail or before.detail, log or before.log)
+    def want(job: Job, detail: bool, *logs: Path) -> None:
+        before = wants.get(job.key, Want(job, False, ()))
+        wants[job.key] = Want(job, detail or before.detail, (*before.logs, *logs))
 
     for plan in plans:
         case = plan.case
         name = f"{_file_name(case.name)}-seed{plan.job.config.seed}.mcap"
-        log = logs / name if case.log and plan.x0 is None else None
-        want(plan.job, case.group in detailed, log)
+        want(plan.job, case.group in detailed, *([logs / name] if case.log and plan.x0 is None else []))
         if plan.floor is not None:
-            want(plan.floor, False, None)
+            want(plan.floor, False)
     return wants
 
 
@@ -75,8 +80,7 @@ def run_all(
     missing = [
         (key, want)
         for key, want in wants.items()
-        if read(folder / f"{key}.json", want.detail) is None
-        or (want.log is not None and not want.log.exists())
+        if read(folder / f"{key}.json", want.detail) is None or not all(log.is_file() for log in want.logs)
     ]
     # Long ones first, or one of them would keep a single core busy at the end.
     missing.sort(key=lambda one: _effort(one[1].job), reverse=True)
@@ -85,7 +89,7 @@ def run_all(
     with _workers(processes) as pool:
         try:
             futures = [
-                pool.submit(work, want.job, key, folder, want.detail, want.log) for key, want in missing
+                pool.submit(work, want.job, key, folder, want.detail, want.logs) for key, want in missing
             ]
             for done, future in enumerate(as_completed(futures), there + 1):
                 future.result()
@@ -132,7 +136,9 @@ def _effort(job: Job) -> float:
 
 
 def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_=." else "-" for c in name)
+    """Two names are two files, also where what a file's name had better not have is replaced."""
+    clean = "".join(c if c.isascii() and (c.isalnum() or c in "-_=.") else "-" for c in name)[:LONGEST_NAME]
+    return clean if clean == name else f"{clean}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 # -- solve times ---------------------------------------------------------------------------------------------
@@ -178,7 +184,7 @@ def time_all(
         for done, (key, case) in enumerate(by_key.items(), 1):
             path = folder / f"{key}.json"
             try:
-                timing = msgspec.json.decode(path.read_bytes(), type=Timing)
+                timing = msgspec.json.decode(read_regular(path), type=Timing)
             except (OSError, msgspec.DecodeError):
                 timing = Timing([])
             while len(timing.runs) < most[key]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
 from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
-from node_runtime.whole_file import write_whole
+from node_runtime.whole_file import read_regular, require_regular, write_whole
 from run_log.reporting.summary import SOFT, summarise, trajectory
 from run_log.run import Run, plant_of
 from run_log.writing.save import save
@@ -55,14 +56,16 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return self.lost is None and self.violations == 0
 
 
-def work(job: Job, key: str, folder: Path, detail: bool, log: Path | None) -> None:
-    """Run `job` and write `folder`/`key`.json, and its log.
+def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -> None:
+    """Run `job` and write `folder`/`key`.json, and its logs.
 
     Raises:
         ConfigError: the job's configuration admits no controller.
+        OSError: something else than a file has the name of a log.
     """
     outcome = follow(job.config, job.steps, job.faults)
-    if log is not None:
+    for log in logs:
+        require_regular(log)
         partial = log.with_suffix(".partial")
         partial.unlink(missing_ok=True)
         save(outcome.run, partial)
@@ -110,7 +113,7 @@ def _lemma(run: Run, config: Config) -> Lemma | None:
 def read(path: Path, detail: bool) -> Record | None:
     """A finished run; None where there is none, or not all that is wanted of it."""
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=Record)
+        found = msgspec.json.decode(read_regular(path), type=Record)
     except (OSError, msgspec.DecodeError):
         return None
     return found if found.traces is not None or not detail else None

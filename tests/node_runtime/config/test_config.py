@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -164,3 +165,39 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
 def test_what_the_plant_does_not_have(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
         plant_of(override(Config(), [given]), get_plant)
+
+
+def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    keys = ("log.path", "controller.checkpoint", "controller.sets", "bus.tls.keys")
+    file = tmp_path / "config.toml"
+    file.write_text("\n".join(f'{key} = "~/below/{key}"' for key in keys))
+    for found in (load(file), load(None, [f"{key}=~/below/{key}" for key in keys])):
+        paths = (found.log.path, found.controller.checkpoint, found.controller.sets, found.bus.tls.keys)
+        assert paths == tuple(f"{tmp_path}/below/{key}" for key in keys)
+    place = '{name = "jet2", endpoint = "tls/jet2:7448", keys = "~/keys"}'
+    assert load(None, [f"trainer.fleet=[{place}]"]).trainer.fleet[0].keys == f"{tmp_path}/keys"
+
+
+def test_a_tilde_that_is_part_of_a_name_or_of_a_log_stays():
+    assert load(None, ["log.path=~backup.mcap"]).log.path == "~backup.mcap"
+    assert load(None, ["log.path=a/~/b.mcap"]).log.path == "a/~/b.mcap"
+    # A log's configuration was another machine's: nothing of this one is put into it.
+    assert from_json('{"log": {"path": "~nobody-at-all/x.mcap"}}').log.path == "~nobody-at-all/x.mcap"
+
+
+def test_the_home_of_somebody_unknown_is_refused_with_the_cause():
+    said = message("bus.tls.keys=~nobody-at-all/keys")
+    assert "no home folder of ~nobody-at-all is known" in said
+    assert said.startswith("--set bus.tls.keys")
+
+
+def test_a_text_that_is_not_utf_8_is_refused_and_a_logs_name_may_be_any_bytes():
+    odd = os.fsdecode(b"caf\xe9")
+    for key in ("controller.sets", "bus.tls.keys", "controller.checkpoint"):
+        assert f"{key} = 'caf\\udce9' is not UTF-8" in message(f"{key}={odd}")
+    assert "not UTF-8" in message(f'l2nw.variables=["z", "{odd}"]')
+    config = load(None, [f"log.path={odd}.mcap"])
+    assert os.fsencode(config.log.path) == b"caf\xe9.mcap"
+    for text in (to_json(config), to_toml(config)):
+        assert "udce9.mcap" in text.encode().decode()

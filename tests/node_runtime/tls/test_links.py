@@ -182,7 +182,10 @@ def test_an_ipv6_router_that_its_certificate_does_not_name_is_refused(tmp_path: 
         pytest.skip("this machine has no IPv6 loopback address")
     certificate_authority.create("jet1", [], tmp_path / "keys", 30)
     router = live_config(f'bus.endpoint="tls/{place}"', f'bus.tls.keys="{tmp_path}/keys/router"')
-    with open_router(router), pytest.raises(ConfigError, match=r"not for ::1: `tandem keys renew .* --host ::1`"):
+    with (
+        open_router(router),
+        pytest.raises(ConfigError, match=r"not for ::1: `tandem keys renew .* --host ::1`"),
+    ):
         Bus(override(router, [f'bus.tls.keys="{tmp_path}/keys/trainer"']), "trainer", "t-1").open()
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -272,3 +274,25 @@ def test_the_shipped_sets_are_about_the_shipped_configuration():
     assert (mine.pop("plant"), mine.pop("X"), mine.pop("U")) == (its.pop("plant"), its.pop("X"), its.pop("U"))
     for name, value in mine.items():
         np.testing.assert_allclose(value, its[name], rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
+def test_an_output_that_is_no_file_is_refused_before_anything_is_computed(
+    make: Callable[[Path], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    make(tmp_path / "out")
+    kind = (tmp_path / "out").lstat().st_mode
+    assert main(["sets", "compute", *OPTIONS, "--out", str(tmp_path / "out")]) == 2
+    assert "only a regular file is read, replaced or moved" in capsys.readouterr().err
+    assert (tmp_path / "out").lstat().st_mode == kind
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_pipe_as_a_file_of_sets_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "sets.json")
+    with pytest.raises(CertificateError, match="it is a pipe"):
+        read_sets(tmp_path / "sets.json")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import signal
 import subprocess
@@ -25,7 +26,7 @@ from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Resolved, load, resolve
 from tandem.experiments.study.plan import Job, code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
-from tandem.experiments.study.work import Record, read
+from tandem.experiments.study.work import Record, read, work
 from tests.helpers.paths import CONFIGS, write_namesakes
 
 PLANT = get_plant("moore_greitzer")
@@ -162,7 +163,7 @@ def test_figures_do_not_depend_on_the_number_of_processes(finished: tuple[Path, 
     folder, _made = finished
     plans = list(rows(cases(folder / "small.toml")))
     wants = wanted(plans, {"comparison", "rows"}, folder / "no-logs")
-    few = {key: want for key, want in wants.items() if want.log is None}
+    few = {key: want for key, want in wants.items() if not want.logs}
     run_all(few, folder / "alone", 1)
     for key in few:
         assert (folder / "alone" / f"{key}.json").read_bytes() == (
@@ -329,3 +330,37 @@ def test_a_record_that_lacks_what_is_wanted_is_not_taken(tmp_path: Path) -> None
     path.write_bytes(msgspec.json.encode(a_record(1.0, 0.0)))
     assert read(path, detail=False) is not None
     assert read(path, detail=True) is None
+
+
+def test_cases_with_names_alike_have_a_log_each(tmp_path: Path) -> None:
+    names = ["a b", "a-b", "a?b", "a\u00a0b", "caf\u00e9", "cafe\u0301", "x" * 60]
+    case = '[[case]]\nname = "{}"\ngroup = "g"\nlog = true\nset.controller.oracle = "linear"\n'
+    path = tmp_path / "alike.toml"
+    path.write_text(
+        'name = "alike"\ntitle = "t"\n[[group]]\nname = "g"\ntitle = "t"\n' + "".join(map(case.format, names))
+    )
+    wants = wanted(list(rows(cases(path))), set(), tmp_path)
+    logs = [log.name for want in wants.values() for log in want.logs]
+    assert len(wants) == 2  # one job, and the floor that all are compared with
+    assert len(set(logs)) == len(logs) == len(names)
+    assert "a-b-seed0.mcap" in logs
+    assert all(log.isascii() and len(log) < 200 for log in logs)
+
+
+def test_a_value_that_is_varied_twice_is_no_second_case(tmp_path: Path) -> None:
+    path = tmp_path / "twice.toml"
+    path.write_text(SMALL.replace("[0.2, 0.5]", "[0.5, 0.5]"))
+    assert path.read_text() != SMALL
+    with pytest.raises(ConfigError, match=r"two cases are called 'gamma: gamma = 0\.5'"):
+        cases(path)
+
+
+def test_something_else_than_a_file_in_the_folder_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    want = next(want for want in wanted(list(rows(cases(path))), set(), tmp_path).values() if want.logs)
+    os.mkfifo(want.logs[0])
+    with pytest.raises(OSError, match="it is a pipe"):
+        work(msgspec.structs.replace(want.job, steps=2), "key", tmp_path, False, want.logs)
+    os.mkfifo(tmp_path / "key.json")
+    assert read(tmp_path / "key.json", False) is None

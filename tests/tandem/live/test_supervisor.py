@@ -10,13 +10,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from run_log.reading.reader import read_run
+from run_log.writing.parts import part_path
 from tandem.live.files import claimed
 from tandem.terminal import Refused
 from tests.helpers.live import wait_for
@@ -277,3 +278,52 @@ def test_places_where_no_log_can_be(tmp_path: Path, name: str):
     (tmp_path / "file").write_text("")
     with pytest.raises(Refused, match=name.split("/")[0]), claimed(tmp_path / name):
         pass
+
+
+@pytest.mark.parametrize(
+    "name", ["mylog", "mylog.", ".mylog", "my.log", "my.1", os.fsdecode(b"caf\xe9.mcap")]
+)
+def test_any_name_of_a_log_is_moved_aside_again_and_again(tmp_path: Path, name: str):
+    log = tmp_path / name
+    contents = []
+    for number in range(3):
+        with claimed(log) as (files, moved):
+            assert len(moved) == (3 if number else 0)
+            for path in (files.log, files.picture, part_path(files.log, 2)):
+                assert not path.exists()
+                contents.append(f"{number} {path.name}".encode(errors="surrogateescape"))
+                path.write_bytes(contents[-1])
+    there = [path.read_bytes() for path in tmp_path.iterdir() if path.is_file()]
+    assert sorted(there) == sorted(contents)
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 3
+
+
+@pytest.mark.parametrize("taken", ["a.mcap", "a.png", "a.part2.mcap", "a.processes"])
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere")])
+def test_a_pipe_or_a_link_with_the_name_of_a_runs_file_keeps_its_place(
+    tmp_path: Path, taken: str, make: Callable[[Path], None]
+):
+    (tmp_path / "elsewhere").write_text("somebody else's")
+    if taken != "a.mcap":
+        (tmp_path / "a.mcap").write_text("an older run")
+    make(tmp_path / taken)
+    before = sorted(tmp_path.iterdir())
+    with (
+        pytest.raises(Refused, match=f"{taken}: cannot be written: it is a (pipe|link)"),
+        claimed(tmp_path / "a.mcap"),
+    ):
+        pass
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_log_whose_name_is_no_text_is_written_and_drawn(tmp_path: Path):
+    name = os.fsdecode(b"caf\xe9.mcap")
+    linear = ("--oracle", "linear", "--set", "controller.solver.compile=never")
+    with launched(tmp_path, *linear, "--log", name) as run:
+        code, result = run.ends()
+    assert code == 0, run.said
+    assert result["ticks"] > 0
+    assert result["log"].endswith("caf\\udce9.mcap")
+    log = tmp_path / name
+    assert log.with_suffix(".png").is_file()
+    assert read_run(log).config.log.path.endswith("caf\\udce9.mcap")

@@ -1,0 +1,177 @@
+"""A log from anybody: it runs no code, overwrites nothing and takes bounded memory (docs/security.md)."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
+
+from lbmpc.plants import get_plant
+from node_runtime.config.sections import Config, override
+from protocol import codec, topics
+from run_log.errors import LogError
+from run_log.file_format import CONFIG, LIBRARY, PROFILE
+from run_log.reading import mcap_scan
+from run_log.reading.gaps import lost_ticks
+from run_log.reading.reader import read_run
+from run_log.reading.recover import recover
+from run_log.replaying.replay import replay
+from run_log.reporting.report import report
+from run_log.reporting.summary import summarise
+from run_log.writing.writer import LogWriter
+from tests.helpers.paths import ROOT
+from tests.helpers.run_log_samples import synthetic, write
+
+MEMORY = 3 * 1024**3
+"""Bytes of address space in which a command must say that it does not read a log."""
+FAR = 2**63 - 1
+SMALL = override(
+    Config(), ["controller.oracle=linear", "controller.horizon=8", "controller.solver.compile=never"]
+)
+
+
+def inside(number: int) -> bytes:
+    return number.to_bytes(8, "little")
+
+
+def bomb(path: Path, size: int, compression: str = "zstd") -> Path:
+    """A log of a few kilobytes whose last chunk unpacks to `size` bytes."""
+    with LogWriter(path, SMALL, get_plant("moore_greitzer")) as writer:
+        writer.write("controller/tick", b"", 1)
+    whole = path.read_bytes()
+    packer = zstandard.ZstdCompressor(level=19).compressobj(size=size)
+    block = bytes(2**20)
+    data = b"".join(
+        [packer.compress(block[: min(len(block), size - at)]) for at in range(0, size, len(block))]
+    )
+    data += packer.flush()
+    name = compression.encode()
+    chunk = inside(0) + inside(0) + inside(size) + bytes(4) + len(name).to_bytes(4, "little") + name
+    chunk += inside(len(data)) + data
+    end = whole.rindex(bytes([Opcode.DATA_END]) + inside(4))
+    path.write_bytes(whole[:end] + bytes([Opcode.CHUNK]) + inside(len(chunk)) + chunk)
+    return path
+
+
+def test_a_small_log_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "bomb.mcap", 3 * 1024**3)
+    assert path.stat().st_size < 2**20
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (lambda: read_run(path), lambda: recover(path, tmp_path / "whole.mcap")):
+        with pytest.raises(LogError, match=r"unpack to more than .* not read"):
+            read()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300 * 1024
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_many_chunks_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, messages = synthetic(override(Config(), ["log.chunk_bytes=8192"]), 60)
+    path = write(tmp_path / "run.mcap", config, messages)
+    read_run(path)
+    monkeypatch.setattr(mcap_scan, "UNPACKED_TIMES", 1)
+    monkeypatch.setattr(mcap_scan, "UNPACKED_ALWAYS", 0)
+    with pytest.raises(LogError, match="unpack to more than"):
+        read_run(path)
+
+
+def test_another_compression_than_ours_is_damage(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "run.mcap", 1000, "lz4")
+    with pytest.raises(LogError, match="its compression 'lz4' is none that a log of Tandem has"):
+        read_run(path)
+
+
+def far_log(path: Path) -> Path:
+    """One with a tick, a result and a command whose numbers are as large as a number can be."""
+    config, messages = synthetic(override(Config(), ["controller.keyframe_every=20"]), 60)
+    with LogWriter(path, config, get_plant(config.plant.model)) as writer:
+        for topic, message, log_time in messages:
+            far = topic in (topics.TICK, topics.RESULT, topics.COMMAND) and message.seq == 59
+            one = msgspec.structs.replace(message, seq=FAR) if far else message
+            writer.write(topic.name, codec.encode(one), log_time)
+    return path
+
+
+def test_a_number_far_away_takes_no_memory_for_all_between(tmp_path: Path) -> None:
+    run = read_run(far_log(tmp_path / "far.mcap"))
+    assert (run.controllers[0], 59, FAR - 59) in lost_ticks(run)
+    assert summarise(run).lost_ticks >= FAR - 59
+    assert report(run.path, tmp_path)
+
+
+def configured(path: Path, **changes: dict[str, object]) -> Path:
+    """A log with a whole header and this configuration, and nothing else."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile=PROFILE, library=LIBRARY)
+        writer.add_attachment(0, 0, CONFIG, "application/json", json.dumps(changes).encode())
+        writer.add_attachment(0, 0, "../../escaped", "text/plain", b"escaped")
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"l2nw": {"window": 2 * 10**9}},
+            "l2nw.window = 2000000000 is not an integer of at least 1 and at most",
+        ),
+        ({"adaptation": {"refit": {"window": 10**12}}}, "adaptation.refit.window"),
+        ({"network": {"window": 10**9}}, "network.window"),
+        ({"network": {"hidden": [10**9]}}, "network.hidden"),
+        ({"network": {"architecture": "../../os"}}, "no architecture is called"),
+        ({"network": {"architecture": "os"}}, "no architecture is called"),
+    ],
+)
+def test_sizes_and_names_in_a_logs_configuration_have_limits(
+    changes: dict[str, dict[str, object]], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(LogError) as caught:
+        read_run(configured(tmp_path / "run.mcap", **changes))
+    assert said in str(caught.value)
+
+
+def test_a_network_that_no_message_could_carry_is_not_built(tmp_path: Path) -> None:
+    config, messages = synthetic(override(SMALL, ["controller.oracle=dnn", "network.hidden=[4096, 4096]"]), 3)
+    run = read_run(write(tmp_path / "run.mcap", config, messages))
+    run.streams.pop(topics.RUN_INFO["controller"].name)
+    with pytest.raises(LogError, match="hidden weights, and 4194304 is the most"):
+        replay(run)
+
+
+@pytest.mark.parametrize("command", ["replay", "report", "recover"])
+def test_a_hostile_log_writes_and_runs_nothing(command: str, tmp_path: Path) -> None:
+    """In a process with little memory, beside files that have the names that the log names."""
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    (folder / "os.py").write_text("raise SystemExit('imported')")
+    (tmp_path / "escaped").write_text("mine")
+    bomb(folder / "bomb.mcap", 8 * 1024**3)
+    configured(folder / "names.mcap", plant={"model": "../../os"}, network={"architecture": "os"})
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    code = (
+        "import sys, resource; from tandem.cli import main;"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}));"
+        f"print([main(['{command}', name]) for name in ('bomb.mcap', 'names.mcap')])"
+    )
+    run = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
+        timeout=120,
+    )
+    expected = [2, 0] if command == "recover" else [2, 2]  # what is whole needs no recovery
+    assert (run.returncode, run.stdout.splitlines()[-1]) == (0, str(expected)), run.stderr
+    assert "Traceback" not in run.stderr
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
