@@ -29,6 +29,7 @@ from tandem.commands.report import Report
 from tandem.commands.run import Run
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
+from tandem.streams import never_failing
 
 AnyCommand = (
     Annotated[Run, subcommand("run")]
@@ -51,11 +52,23 @@ AnyCommand = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, do, and say what is wrong in one message; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else argv
+    with never_failing() as output:
+        try:
+            code = _do(sys.argv[1:] if argv is None else argv)
+        except SystemExit as end:  # after --help, or a mistake in the arguments
+            if not isinstance(end.code, int):
+                raise
+            code = end.code
+        return output.exit_code(code)
+
+
+def _do(argv: Sequence[str]) -> int:
+    from tandem import terminal
+
     if list(argv) == ["--version"]:
         from importlib.metadata import version
 
-        sys.stdout.write(f"tandem {version('tandem-control')}\n")
+        terminal.write(f"tandem {version('tandem-control')}\n")
         return 0
     parsed: Any = tyro.cli(
         AnyCommand,
@@ -67,7 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Command = getattr(parsed, "action", parsed)
     from node_runtime.config.strict import ConfigError
     from run_log.errors import LogError
-    from tandem import terminal
 
     try:
         return command.run()

@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 from rich.table import Table
+from rich.text import Text
 
 from run_log.reporting.summary import Summary
 
@@ -80,8 +81,7 @@ def table(summary: Summary) -> Table:
     shown.add_column(style="dim")
     for name, value in msgspec.to_builtins(summary).items():
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
-        text = _text(value)
-        shown.add_row(name, f"[{style}]{text}[/]" if style else text, MEANING.get(name, ""))
+        shown.add_row(name, Text(_text(value), style), MEANING.get(name, ""))
     return shown
 
 

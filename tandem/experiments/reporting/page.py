@@ -11,6 +11,7 @@ import numpy as np
 from lbmpc.plants import Plant
 from node_runtime import provenance
 from node_runtime.config.sections import Config, to_toml
+from run_log.reporting.canvas import PictureError, drawing
 from tandem.experiments.reporting import findings, pictures, style
 from tandem.experiments.study.declaration import Declaration, Group
 from tandem.experiments.study.results import CaseResult, spread
@@ -18,6 +19,7 @@ from tandem.experiments.study.results import CaseResult, spread
 
 class Drawn(NamedTuple):
     uri: str
+    """Empty where it could not be drawn; the caption says why."""
     caption: str
     alt: str
 
@@ -101,10 +103,14 @@ def page(
 
 def _part(group: Group, results: list[CaseResult], plant: Plant, command: str) -> Part:
     survival = group.picture == "survival"
-    drawn = [
-        Drawn(style.data_uri(one.figure), one.caption, one.alt)
-        for one in pictures.draw(group.picture, results, plant, group.reference)
-    ]
+    try:
+        with drawing(f"the picture of {group.name}"):
+            drawn = [
+                Drawn(style.data_uri(one.figure), one.caption, one.alt)
+                for one in pictures.draw(group.picture, results, plant, group.reference)
+            ]
+    except PictureError as error:
+        drawn = [Drawn("", str(error), "")]
     return Part(
         name=group.name,
         title=group.title,
