@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from node_runtime.config.sections import Config
 
 
-class _Printable(logging.Formatter):
+class PrintableLog(logging.Formatter):
     """What strangers put into names and messages stays text, and within the lines that are about it."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -32,7 +32,7 @@ class Process(Configured):
         """Run it; its log goes to standard error."""
         handler = logging.StreamHandler(sys.stderr)
         form = f"%(asctime)s.%(msecs)03d {name} %(levelname)s: %(message)s"
-        handler.setFormatter(_Printable(form, datefmt="%H:%M:%S"))
+        handler.setFormatter(PrintableLog(form, datefmt="%H:%M:%S"))
         logging.basicConfig(handlers=[handler], level=logging.INFO)
         code = main(config)
         self.emit({"process": name, "exit_code": code})

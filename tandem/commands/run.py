@@ -121,7 +121,7 @@ class Run(Configured):
             return trouble, not supervisor.recorder_died
 
     def _conclude(self, files: RunFiles, trouble: str | None, logged: bool, began: bool) -> int:
-        """Figures and picture from the log alone. Raises `Impatient` when they are not waited for."""
+        """Figures and picture from the log alone. Raises `Impatient` when the figures are not waited for."""
         from run_log.errors import LogError
         from run_log.reading.reader import read_run
         from run_log.reporting import report
@@ -129,6 +129,7 @@ class Run(Configured):
         from run_log.reporting.summary import summarise
         from run_log.writing.parts import existing_parts
         from tandem import summary_table
+        from tandem.live.supervisor import Impatient
 
         if trouble is None and not logged:
             trouble = (
@@ -137,6 +138,7 @@ class Run(Configured):
         if trouble is None and not began:
             trouble = "stopped before the first command"
         result: dict[str, Any] = {}
+        code = 1
         try:
             with self.console.status("reading the log"):
                 parts = existing_parts(files.log)
@@ -149,6 +151,10 @@ class Run(Configured):
                     self.say(f"picture {_near(report.picture(ran, files.picture))}")
             except PictureError as error:
                 self.say(f"no picture: {error}", style="yellow")
+            except Impatient:
+                interrupted = f"interrupted while drawing; `tandem report {files.log}` draws it"
+                trouble = f"{trouble}\n{interrupted}" if trouble else interrupted
+                code = INTERRUPTED
         except LogError as error:
             trouble = f"{trouble}\n{error}" if trouble else str(error)
         else:
@@ -164,7 +170,7 @@ class Run(Configured):
             terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
             result = {"error": trouble, **result}
         self.emit(result)
-        return 0 if trouble is None else 1
+        return 0 if trouble is None else code
 
 
 def _free_endpoint() -> str:
