@@ -1,8 +1,8 @@
 """`tandem`: the command line. Every command has `--help`, and `--json` for one JSON object on stdout.
 
-Exit codes: 0 it went well; 1 it did not (a replay differs, a process died); 2 what was asked cannot be done
-(a mistake in the arguments, the configuration or the file); 3 there are no such sets, or their certificate does not
-hold; 130 interrupted.
+Exit codes: 0 it went well; 1 it did not (a replay differs, a process died, the output could not be
+written, which a reader who leaves does not mean); 2 what was asked cannot be done (a mistake in the arguments, the
+configuration or the file); 3 there are no such sets, or their certificate does not hold; 130 interrupted.
 
 What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and
 the controller no torch.

@@ -27,7 +27,7 @@ class PictureError(LogError):
 
 @contextmanager
 def drawing(what: str | Path) -> Iterator[None]:
-    """What is drawn within depends on nobody's settings. Raises `PictureError`, whatever fails; import what draws here.
+    """What is drawn within depends on nobody's settings. Raises `PictureError`, whatever fails.
 
     what: the picture's name or file, for the message.
     """
@@ -38,6 +38,8 @@ def drawing(what: str | Path) -> Iterator[None]:
         # A `Figure` without pyplot has no use for a backend, and to set one would import it.
         with rc_context({key: rcParamsDefault[key] for key in rcParamsDefault if key != "backend"}):
             yield
+    except ModuleNotFoundError:  # nothing can be drawn here; whoever asked says what to install
+        raise
     except OSError as error:
         raise PictureError(f"{what}: cannot be written: {error.strerror}") from error
     except Exception as error:

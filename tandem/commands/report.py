@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from tandem import terminal
-from tandem.commands.base import Command
+from tandem.commands.base import Command, require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +32,7 @@ class Report(Command):
         from run_log.reporting.summary import summarise
         from tandem import summary_table
 
+        require("matplotlib")
         ran = read_run(self.file)
         summary = summarise(ran)
         self.console.print(summary_table.table(summary))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from tandem import terminal
-from tandem.commands.base import NO_SETS, Command
+from tandem.commands.base import NO_SETS, Command, require
 from tandem.terminal import Refused
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class SetsPlot(Command):
         from run_log.reporting.summary import trajectory
         from run_log.run import plant_of
 
+        require("matplotlib")
         file, log = self.file, self.log
         out = file.with_suffix("").with_suffix(".png") if self.out is None else self.out
         try:
