@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 
+from node_runtime.printable import printable
+
 log = logging.getLogger(__name__)
 
 # A hostile sender must not fill the memory with reasons; the counters travel in every Health message.
@@ -27,7 +29,8 @@ class RejectedMessages:
             seen = self._counts.get(key, 0)
             self._counts[key] = seen + 1
         if seen == 0:
-            log.warning("%s (%s); ignored, further ones are only counted", key, detail[:300] or "no detail")
+            told = printable(detail[:300]) or "no detail"
+            log.warning("%s (%s); ignored, further ones are only counted", key, told)
 
     def counters(self) -> dict[str, int]:
         """Keys like "bad plant/state: not finite"."""

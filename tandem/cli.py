@@ -1,8 +1,8 @@
 """`tandem`: the command line. Every command has `--help`, and `--json` for one JSON object on stdout.
 
-Exit codes: 0 it went well; 1 it did not (a replay differs, a process died); 2 what was asked cannot be done
-(a mistake in the arguments, the configuration or the file); 3 there are no such sets, or their certificate does not
-hold; 130 interrupted.
+Exit codes: 0 it went well; 1 it did not (a replay differs, a process died, the output could not be
+written, which a reader who leaves does not mean); 2 what was asked cannot be done (a mistake in the arguments, the
+configuration or the file); 3 there are no such sets, or their certificate does not hold; 130 interrupted.
 
 What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and
 the controller no torch.
@@ -10,7 +10,6 @@ the controller no torch.
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -30,6 +29,7 @@ from tandem.commands.report import Report
 from tandem.commands.run import Run
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
+from tandem.streams import never_failing
 
 AnyCommand = (
     Annotated[Run, subcommand("run")]
@@ -52,14 +52,23 @@ AnyCommand = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, do, and say what is wrong in one message; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else argv
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # A file's name may be any bytes, and a terminal may know few letters: what it cannot show ends no command.
-        sys.stdout.reconfigure(errors="backslashreplace")
+    with never_failing() as output:
+        try:
+            code = _do(sys.argv[1:] if argv is None else argv)
+        except SystemExit as end:  # after --help, or a mistake in the arguments
+            if not isinstance(end.code, int):
+                raise
+            code = end.code
+        return output.exit_code(code)
+
+
+def _do(argv: Sequence[str]) -> int:
+    from tandem import terminal
+
     if list(argv) == ["--version"]:
         from importlib.metadata import version
 
-        sys.stdout.write(f"tandem {version('tandem-control')}\n")
+        terminal.write(f"tandem {version('tandem-control')}\n")
         return 0
     parsed: Any = tyro.cli(
         AnyCommand,
@@ -71,7 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Command = getattr(parsed, "action", parsed)
     from node_runtime.config.strict import ConfigError
     from run_log.errors import LogError
-    from tandem import terminal
 
     try:
         return command.run()

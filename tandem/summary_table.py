@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 from rich.table import Column, Table
+from rich.text import Text
 
 from run_log.reporting.summary import Summary
 
@@ -58,8 +59,7 @@ def table(summary: Summary) -> Table:
     shown = Table(*columns, show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name, value in msgspec.to_builtins(summary).items():
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
-        text = _text(value)
-        shown.add_row(name, f"[{style}]{text}[/]" if style else text, MEANING.get(name, ""))
+        shown.add_row(name, Text(_text(value), style), MEANING.get(name, ""))
     return shown
 
 

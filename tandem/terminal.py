@@ -5,9 +5,13 @@ What it needs is imported when something is shown: every process comes by here, 
 
 from __future__ import annotations
 
+import json
+import math
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+from node_runtime.printable import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,34 +24,35 @@ class Refused(Exception):
 
 def console(as_json: bool) -> Console:
     """Where to write for a person: standard output, or standard error when a program reads the former."""
-    from rich.console import Console
+    from tandem.console import PlainConsole
 
-    return Console(stderr=as_json, highlight=False, soft_wrap=False)
+    return PlainConsole(stderr=as_json)
 
 
 def say(console: Console, *lines: str, style: str | None = None) -> None:
-    """Lines for a person as they are: nothing in them is markup, and none is broken."""
+    """Lines for a person as they are: none is broken."""
     for text in lines:
-        console.print(text, style=style, markup=False, soft_wrap=True)
+        console.print(text, style=style, soft_wrap=True)
+
+
+def write(text: str) -> None:
+    """Text on standard output for a person or a program, without a console's widths and styles."""
+    sys.stdout.write(printable(text))
+    sys.stdout.flush()
 
 
 def emit(result: Mapping[str, Any]) -> None:
-    """One JSON object on standard output; NaN becomes null, which JSON has, and so is what UTF-8 can say."""
+    """One JSON object on standard output, in ASCII; NaN becomes null, which JSON has."""
     import msgspec
 
-    try:
-        text = msgspec.json.encode(result, enc_hook=_plain)
-    except UnicodeEncodeError:  # the name of a file that is no text
-        text = msgspec.json.encode(_readable(msgspec.to_builtins(result, enc_hook=_plain)))
-    sys.stdout.write(text.decode() + "\n")
-    sys.stdout.flush()
+    # msgspec's own encoder refuses the name of a file that is not UTF-8.
+    tree = _finite(msgspec.to_builtins(result, enc_hook=_plain))
+    write(json.dumps(tree, separators=(",", ":")) + "\n")
 
 
 def complain(text: str, as_json: bool) -> None:
     """A message for a person on standard error; for a program too, `{"error": ...}` on standard output."""
-    from rich.console import Console
-
-    Console(stderr=True, highlight=False).print(f"tandem: {text}", style="red", markup=False, soft_wrap=True)
+    say(console(as_json=True), f"tandem: {text}", style="red")
     if as_json:
         emit({"error": text})
 
@@ -70,7 +75,7 @@ def _bar(console: Console, *columns: ProgressColumn) -> Progress:
     from rich.progress import BarColumn, Progress, TextColumn
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         *columns,
         console=console,
@@ -79,14 +84,21 @@ def _bar(console: Console, *columns: ProgressColumn) -> Progress:
     )
 
 
-def _readable(value: Any) -> Any:
-    from node_runtime.config.strict import readable
+def limited(option: str, value: float, low: float, high: float) -> None:
+    """Raises `Refused` for an option's value that is not from `low` to `high`; NaN is not."""
+    if value < low:
+        raise Refused(f"{option} {value:g}: at least {low:g}")
+    if not value <= high:
+        raise Refused(f"{option} {value:g}: at most {high:g}")
 
+
+def _finite(value: Any) -> Any:
+    """A plain tree with null for every number that JSON does not have."""
     if isinstance(value, dict):
-        return {key: _readable(below) for key, below in value.items()}
+        return {key: _finite(below) for key, below in value.items()}
     if isinstance(value, list | tuple):
-        return [_readable(below) for below in value]
-    return readable(value) if isinstance(value, str) else value
+        return [_finite(below) for below in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _plain(value: object) -> Any:

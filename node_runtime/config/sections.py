@@ -24,9 +24,12 @@ from protocol.codec import first_non_finite
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
-Window = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
-"""Samples that are held in memory at once: a log that is replayed says how many, too."""
+# Upper limits are far above every honest use. A log brings its configuration along: memory and time are taken by it.
+Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
+"""How many of something, each of which takes memory or time."""
+Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000)]
+Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+LONGEST_PERIOD = 1e6
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
@@ -46,7 +49,7 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
-    plan_patience: Positive = 1.25
+    plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
 
@@ -55,7 +58,7 @@ class SolverConfig(Section, frozen=True):
     """"converged" solves every tick to its tolerance; "real_time" takes one prepared Gauss-Newton step."""
     compile: literals.CompileMode = "auto"
     """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
-    max_iterations: PositiveInt = 10
+    max_iterations: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
     tolerance: Positive = 1e-6
     """Converged when no input of the plan moves by more than this (input units)."""
     penalty: Positive = 1e4
@@ -72,7 +75,7 @@ class BackupConfig(Section, frozen=True):
 
 
 class ControllerConfig(Section, frozen=True):
-    horizon: PositiveInt = 60
+    horizon: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 60
     oracle: literals.OracleName = "dnn"
     tightening: literals.TighteningName = "first_step"
     sets: str | None = None
@@ -83,11 +86,11 @@ class ControllerConfig(Section, frozen=True):
     """Diagonal state weights; None: ones."""
     R: list[Positive] | None = None
     """Diagonal input weights; None: ones."""
-    keyframe_every: PositiveInt = 100
+    keyframe_every: Count = 100
     """Ticks between keyframes in the log."""
     late_fraction: Unit = 0.2
     """A tick is late when it starts later than this share of a period after its slot."""
-    phase_ms: NonNegative | None = None
+    phase_ms: Annotated[float, msgspec.Meta(ge=0, le=3.6e6)] | None = None
     """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
     checkpoint: str = ""
     """File from which the controller takes its memory when it is started again; "": none."""
@@ -115,7 +118,7 @@ class NetworkConfig(Section, frozen=True):
 class RefitConfig(Section, frozen=True):
     """Of K at an adoption; used where `adaptation.at_adoption` is "refit"."""
 
-    window: Window = 200
+    window: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 200
     """Newest samples that the controller remembers for it."""
     ridge: Positive = 1e-4
     """Weight that holds K where it was."""
@@ -125,11 +128,11 @@ class TrialConfig(Section, frozen=True):
     """Of new hidden weights, before they are adopted and for a while after."""
 
     enabled: bool = True
-    seconds: Positive = 4.0
+    seconds: Seconds = 4.0
     """How far the controller's own samples reach back, on which a set on offer is tried."""
     samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
     """How many there are of them; a fast loop takes one every few ticks, a slow one reaches further back."""
-    confirm: Positive = 1.0
+    confirm: Seconds = 1.0
     """Seconds after its adoption in which a set that predicts worse than the one before is rolled back."""
     margin: NonNegative = 0.2
     """Share by which the mean squared error of a new set may be larger than the old one's."""
@@ -157,7 +160,7 @@ class AdaptationConfig(Section, frozen=True):
 
 
 class L2nwConfig(Section, frozen=True):
-    window: Window = 100
+    window: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
     bandwidth: Positive = 0.5
     regularisation: Positive = 1e-3
     variables: list[str] | None = None
@@ -178,15 +181,15 @@ class PlantPlace(Section, frozen=True):
 class TrainerConfig(Section, frozen=True):
     enabled: bool = True
     """False: hidden layers are never trained (last layer only)."""
-    capacity: PositiveInt = 2000
+    capacity: Count = 2000
     """p_max of the replay buffer."""
     strategy: literals.Strategy = "fifo"
-    train_every: PositiveInt = 10
+    train_every: Count = 10
     """New samples between two trainings."""
-    min_samples: PositiveInt = 20
-    batch: PositiveInt = 512
+    min_samples: Count = 20
+    batch: Count = 512
     """M, the samples drawn at random from the buffer for one training."""
-    steps: PositiveInt = 300
+    steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 300
     """Adam steps in one training, each on all M samples."""
     learning_rate: Positive = 1e-3
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -207,18 +210,18 @@ class BusConfig(Section, frozen=True):
     insecure: bool = False
     """True: no warning that everybody who reaches a tcp/ endpoint beyond this machine may command the plant."""
     tls: TlsConfig = TlsConfig()
-    lease_ms: PositiveInt = 1500
-    follow_silence: Positive = 1.0
+    lease_ms: Milliseconds = 1500
+    follow_silence: Seconds = 1.0
     """Seconds of silence after which another process incarnation may take over a topic."""
 
 
 class LogConfig(Section, frozen=True):
     path: str = "run.mcap"
-    chunk_bytes: PositiveInt = 256 * 1024
-    flush_ms: PositiveInt = 500
-    split_minutes: NonNegative = 60.0
+    chunk_bytes: Annotated[int, msgspec.Meta(ge=1, le=64 * 1024 * 1024)] = 256 * 1024
+    flush_ms: Milliseconds = 500
+    split_minutes: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 60.0
     """A new file, NAME.part2.mcap, after so long: the index of a file is in memory until it ends. 0: never."""
-    keep: Annotated[int, msgspec.Meta(ge=0)] = 0
+    keep: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0
     """How many of a run's files stay, the one being written included; older ones are removed. 0: all."""
 
 
@@ -227,7 +230,7 @@ class RealtimeConfig(Section, frozen=True):
     """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
     awake: literals.AwakeMode = "auto"
     """Keep the cores from sleeping between slots; "auto": where there is a priority and the period is below 10 ms."""
-    cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0)]] = "auto"
+    cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0, le=8191)]] = "auto"
     """Core of the controller's loop and core of the plant's; "auto": two of their own where `awake` would be needed."""
 
 
@@ -236,7 +239,7 @@ class Config(Section, frozen=True):
 
     name: Name = "jet1"
     """The plant's name, part of every key."""
-    rate: Positive = 20.0
+    rate: Annotated[float, msgspec.Meta(gt=0, le=1e5)] = 20.0
     """Samples a second (Hz)."""
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
     plant: PlantConfig = PlantConfig()
@@ -306,6 +309,12 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
+    try:
+        to_json(config)
+    except UnicodeEncodeError as error:  # only the command line can name a file so
+        fail("", f"{error.object}: is not UTF-8, as what a log holds must be; choose another name")
+    if config.period > LONGEST_PERIOD:
+        fail("rate", f"rate = {config.rate}: a period of {config.period:g} s; at most {LONGEST_PERIOD:g} s")
     activation = config.network.activation
     if activation not in BOUNDED:
         fail(

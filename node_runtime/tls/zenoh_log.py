@@ -19,6 +19,7 @@ from collections.abc import Iterator
 
 import zenoh
 
+from node_runtime.printable import printable
 from node_runtime.rejected import RejectedMessages
 from protocol import topics
 
@@ -139,6 +140,10 @@ def _read(reading: int, real: int, refusals: Refusals) -> None:
             # What was allowed is most of it, and must cost next to nothing.
             if b"is authorized to" in line and not any(mark in line for mark in _TOLD):
                 continue
-            if not refusals.read(line.decode(errors="replace")):
-                os.write(real, line + b"\n")
+            text = line.decode(errors="replace")
+            if not refusals.read(text):
+                with contextlib.suppress(
+                    OSError
+                ):  # nobody reads it any more: refusals are counted all the same
+                    os.write(real, printable(_COLOUR.sub("", text)).encode() + b"\n")
     os.close(reading)

@@ -31,26 +31,23 @@ def overview(data: Traces, title: str = "") -> Figure:
     return _figure(title, [*performed, *commanded, *learned, partial(_timing, data)], height=1.9)
 
 
-def pictures(data: Traces) -> dict[str, Figure]:
-    """Every separate picture by name; what the run has not (hidden weights, timings) has no picture."""
+def pictures(data: Traces) -> dict[str, Callable[[], Figure]]:
+    """What draws each separate picture, by name; what the run has not (hidden weights, timings) has no picture."""
     plant = data.plant
-    drawn = {
-        "states": _figure("States", [partial(_state, data, i) for i in range(plant.d)]),
-        "input": _figure("Input", [partial(_input, data, j) for j in range(plant.m)], height=3.2),
-        "error": _figure("Prediction error", [partial(_error, data)], height=3.2),
+    drawn: dict[str, Callable[[], Figure]] = {
+        "states": partial(_figure, "States", [partial(_state, data, i) for i in range(plant.d)]),
+        "input": partial(_figure, "Input", [partial(_input, data, j) for j in range(plant.m)], height=3.2),
+        "error": partial(_figure, "Prediction error", [partial(_error, data)], height=3.2),
     }
     shown = _model_errors(data)
     if shown:
-        drawn["model_error"] = _figure(
-            "Model error over one period, measured and estimated",
-            [partial(_model_error, data, i) for i in shown],
-        )
+        title = "Model error over one period, measured and estimated"
+        drawn["model_error"] = partial(_figure, title, [partial(_model_error, data, i) for i in shown])
     if np.isfinite(data.tick_ms).any():
-        drawn["timing"] = _figure("Time spent", [partial(_timing, data)], height=3.2)
+        drawn["timing"] = partial(_figure, "Time spent", [partial(_timing, data)], height=3.2)
     if _learns(data):
-        drawn["weights"] = _figure(
-            "Hidden weights", [partial(_weights, data), partial(_losses, data)], height=2.4
-        )
+        parts: list[Callable[[Axes], None]] = [partial(_weights, data), partial(_losses, data)]
+        drawn["weights"] = partial(_figure, "Hidden weights", parts, height=2.4)
     return drawn
 
 

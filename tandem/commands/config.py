@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -23,7 +22,7 @@ class ConfigShow(Configured):
         if self.json:
             terminal.emit(to_tree(config))
         else:
-            sys.stdout.write(to_toml(config))
+            terminal.write(to_toml(config))
         return 0
 
 

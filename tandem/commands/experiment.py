@@ -59,12 +59,15 @@ class Experiment(Command):
         import msgspec
 
         from controller_node.build import build_plant
+        from run_log.reporting.canvas import load_matplotlib
+
+        load_matplotlib()
         from tandem.experiments import experiment
         from tandem.experiments.study.declaration import load
         from tandem.experiments.study.runner import RunnerError
 
-        if self.jobs is not None and self.jobs < 1:
-            raise Refused(f"--jobs {self.jobs}: at least 1")
+        if self.jobs is not None:
+            terminal.limited("--jobs", self.jobs, 1, 1024)
         path = _find(self.what)
         declared = load(path)
         plant = build_plant(experiment.settings(declared, str(path)))

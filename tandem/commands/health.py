@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -30,6 +29,7 @@ class Health(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve()
+        terminal.limited("--seconds", self.seconds, 0.0, 86_400.0)
         return answer(config, self.process, self.seconds, self.json)
 
 
@@ -39,7 +39,7 @@ def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
     if health is None:
         text = f"{process}: not heard of for {seconds:g} s at {config.bus.endpoint}"
         if not as_json:
-            sys.stdout.write(text + "\n")
+            terminal.write(text + "\n")
         else:
             terminal.emit({"process": process, "status": None, "error": text})
         return 1
@@ -47,7 +47,7 @@ def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
         fields = ("process", "run_id", "status", "note", "counters")
         terminal.emit({name: getattr(health, name) for name in fields})
     else:
-        sys.stdout.write(": ".join(filter(None, (process, health.status, health.note))) + "\n")
+        terminal.write(": ".join(filter(None, (process, health.status, health.note))) + "\n")
     return 0 if health.status in WELL else 1
 
 

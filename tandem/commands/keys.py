@@ -151,15 +151,14 @@ class KeysCommand:
     )
 
 
-def _row(one: Issued) -> list[Text]:
+def _row(one: Issued) -> list[str | Text]:
     from rich.text import Text
 
     from node_runtime.tls.credentials import WARN_DAYS
 
-    # As Text: in a plain string rich would take `:CD:` in a fingerprint for the name of a picture.
     end = Text(f"{one.valid_until:%Y-%m-%d}\n")
     end.append(f"{one.days_left:.0f} days", style="bold red" if one.days_left < WARN_DAYS else "")
-    return [Text(one.role), Text("\n".join(_may(one.role))), end, Text(f"{one.fingerprint[:23]}…")]
+    return [one.role, "\n".join(_may(one.role)), end, f"{one.fingerprint[:23]}…"]
 
 
 def _may(role: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,10 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+from node_runtime.printable import printable
 from tandem.commands.base import FROM_CONFIG, Configured, require
 
 if TYPE_CHECKING:
     from node_runtime.config.sections import Config
+
+
+class PrintableLog(logging.Formatter):
+    """What strangers put into names and messages stays text, and within the lines that are about it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record)).replace("\n", "\n    ")
 
 
 class Process(Configured):
@@ -21,14 +30,10 @@ class Process(Configured):
 
     def _process(self, name: str, main: Callable[[Config], int], config: Config) -> int:
         """Run it; its log goes to standard error."""
-        import logging
-
-        logging.basicConfig(
-            stream=sys.stderr,
-            level=logging.INFO,
-            format=f"%(asctime)s.%(msecs)03d {name} %(levelname)s: %(message)s",
-            datefmt="%H:%M:%S",
-        )
+        handler = logging.StreamHandler(sys.stderr)
+        form = f"%(asctime)s.%(msecs)03d {name} %(levelname)s: %(message)s"
+        handler.setFormatter(PrintableLog(form, datefmt="%H:%M:%S"))
+        logging.basicConfig(handlers=[handler], level=logging.INFO)
         code = main(config)
         self.emit({"process": name, "exit_code": code})
         return code

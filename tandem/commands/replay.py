@@ -67,9 +67,7 @@ class Replay(Command):
             values = f"recorded {first.recorded}, replayed {first.replayed}"
             self.say(f"first at tick {first.tick}: {first.field} {values}")
         if not (found.equal or found.rounding) and found.largest_difference is not None:
-            self.console.print(
-                f"largest difference of an input: {found.largest_difference:.3g}", markup=False
-            )
+            self.say(f"largest difference of an input: {found.largest_difference:.3g}")
         self.say(*(f"note: {note}" for note in found.notes), style="yellow")
         self.emit(msgspec.to_builtins(found))
         return 0 if found.equal and not found.lost_ticks else 1

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from tandem.commands.base import Command
+from tandem import terminal
+from tandem.commands.base import Command, require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +24,7 @@ class Report(Command):
     """Where the pictures go."""
 
     def run(self) -> int:
+        """0, or 1 when a picture cannot be drawn or written."""
         import msgspec
 
         from run_log.reading.reader import read_run
@@ -30,13 +32,17 @@ class Report(Command):
         from run_log.reporting.summary import summarise
         from tandem import summary_table
 
+        require("matplotlib")
         ran = read_run(self.file)
         summary = summarise(ran)
-        with self.console.status("drawing"):
-            drawn = report(self.file, self.output or self.file.parent)
         self.console.print(summary_table.table(summary))
+        with self.console.status("drawing"):
+            drawn, failed = report(self.file, self.output or self.file.parent)
         self.say(*(f"picture {picture}" for picture in drawn))
         if ran.note:
             self.say(ran.note, style="yellow")
-        self.emit({**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]})
-        return 0
+        for error in failed:
+            terminal.complain(str(error), as_json=False)
+        result = {**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]}
+        self.emit({**result, "failed": [str(error) for error in failed]} if failed else result)
+        return 1 if failed else 0

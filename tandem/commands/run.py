@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 
 from node_runtime.config.literals import OracleName
+from node_runtime.config.strict import readable
+from node_runtime.printable import printable
 from tandem import terminal
 from tandem.commands.base import FROM_CONFIG, INTERRUPTED, Configured, require
 
@@ -18,6 +20,9 @@ if TYPE_CHECKING:
     from tandem.live.files import RunFiles
     from tandem.live.monitor import Monitor, Snapshot
     from tandem.live.supervisor import Wish
+
+LONGEST_S = 1e8
+"""Three years. Whoever wants no end runs the processes themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +53,12 @@ class Run(Configured):
         config, given = self.resolve()
         if not self.seconds > config.period:
             raise terminal.Refused(f"--seconds {self.seconds:g}: less than one period of {config.period:g} s")
+        terminal.limited("--seconds", self.seconds, 0.0, LONGEST_S)
+        path = Path(config.log.path).absolute()
+        # A file's name may be any bytes; but what moves the cursor is a trap for whoever lists the folder.
+        shown = readable(str(path))
+        if printable(shown) != shown:
+            raise terminal.Refused(f"{path}: control characters in the name of the log or of its folders")
         import msgspec
 
         from controller_node.build import build_model, build_plant
@@ -80,7 +91,12 @@ class Run(Configured):
                 text = f"ended at once, everything was killed; {files.log} may be cut short"
                 terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", self.json)
                 return INTERRUPTED
-            return self._conclude(files, trouble, logged, monitor.first_command is not None)
+            try:
+                return self._conclude(files, trouble, logged, monitor.first_command is not None)
+            except Impatient:
+                text = f"interrupted; `tandem report {files.log}` gives figures and pictures"
+                terminal.complain(text, self.json)
+                return INTERRUPTED
 
     def _supervise(
         self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
@@ -106,13 +122,15 @@ class Run(Configured):
             return trouble, not supervisor.recorder_died
 
     def _conclude(self, files: RunFiles, trouble: str | None, logged: bool, began: bool) -> int:
-        """Figures and picture from the log alone."""
+        """Figures and picture from the log alone. Raises `Impatient` when the figures are not waited for."""
         from run_log.errors import LogError
         from run_log.reading.reader import read_run
         from run_log.reporting import report
+        from run_log.reporting.canvas import PictureError
         from run_log.reporting.summary import summarise
         from run_log.writing.parts import existing_parts
         from tandem import summary_table
+        from tandem.live.supervisor import Impatient
 
         if trouble is None and not logged:
             trouble = (
@@ -121,18 +139,26 @@ class Run(Configured):
         if trouble is None and not began:
             trouble = "stopped before the first command"
         result: dict[str, Any] = {}
+        code = 1
         try:
-            with self.console.status("reading the log and drawing"):
+            with self.console.status("reading the log"):
                 parts = existing_parts(files.log)
                 ran = read_run(parts[0] if parts else files.log)
                 summary = summarise(ran)
-                picture = report.picture(ran, files.picture)
+            result = summary_table.of(summary)
+            self.console.print(summary_table.table(summary))
+            try:
+                with self.console.status("drawing"):
+                    self.say(f"picture {_near(report.picture(ran, files.picture))}")
+            except PictureError as error:
+                self.say(f"no picture: {error}", style="yellow")
+            except Impatient:
+                interrupted = f"interrupted while drawing; `tandem report {files.log}` draws it"
+                trouble = f"{trouble}\n{interrupted}" if trouble else interrupted
+                code = INTERRUPTED
         except LogError as error:
             trouble = f"{trouble}\n{error}" if trouble else str(error)
         else:
-            result = summary_table.of(summary)
-            self.console.print(summary_table.table(summary))
-            self.say(f"picture {_near(picture)}")
             self.say(*(f"replay  tandem replay {_near(part)}" for part in parts))
             if len(parts) > 1:
                 text = (
@@ -145,7 +171,7 @@ class Run(Configured):
             terminal.complain(f"{trouble}\nAll output is in {_near(files.folder)}.", as_json=False)
             result = {"error": trouble, **result}
         self.emit(result)
-        return 0 if trouble is None else 1
+        return 0 if trouble is None else code
 
 
 def _free_endpoint() -> str:

@@ -13,6 +13,9 @@ from tandem import terminal
 from tandem.commands.base import FROM_CONFIG, Configured, require
 from tandem.terminal import Refused
 
+MOST_STEPS = 1_000_000
+"""All of them are in memory until the end."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Configured):
@@ -48,8 +51,7 @@ class Simulate(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
-        if self.steps < 1:
-            raise Refused(f"--steps {self.steps}: at least 1")
+        terminal.limited("--steps", self.steps, 1, MOST_STEPS)
         if self.log is not None and self.log.exists():
             raise Refused(
                 f"{self.log}: exists already, and a log never overwrites anything; choose another name"

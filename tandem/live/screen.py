@@ -9,6 +9,8 @@ from rich.live import Live
 
 from tandem.live import view
 from tandem.live.monitor import Event, Snapshot
+from tandem.streams import blocked
+from tandem.terminal import say
 
 
 class Screen:
@@ -21,7 +23,9 @@ class Screen:
         self._live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
 
     def show(self, now: Snapshot) -> None:
-        """Bring the screen up to date."""
+        """Bring the screen up to date; nothing where its reader does not read, for whom no loop waits."""
+        if blocked(self._console.file):
+            return
         if self._console.is_terminal:
             width, height = self._console.size
             self._live.update(view.render(now, width, height - 1), refresh=True)
@@ -35,7 +39,8 @@ class Screen:
             self._plain(view.line(now))
 
     def _plain(self, text: str) -> None:
-        self._console.print(text, markup=False, soft_wrap=True)
+        # Nothing that a stranger says in several lines looks like one of ours.
+        say(self._console, text.replace("\n", "\n" + 10 * " "))
 
     def __enter__(self) -> Screen:
         if self._console.is_terminal:

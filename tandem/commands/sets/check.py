@@ -30,8 +30,7 @@ class SetsCheck(Configured):
         from lbmpc.sets.check import check
         from tandem.commands.sets.sampling import HAIR, sample
 
-        if self.samples < 1:
-            raise terminal.Refused(f"--samples {self.samples}: at least 1")
+        terminal.limited("--samples", self.samples, 1, 1_000_000)
         model = build_model(config)
         result: dict[str, Any] = {"file": str(self.file), "certificate": "ok"}
         reason = ""

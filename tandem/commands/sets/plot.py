@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from tandem import terminal
-from tandem.commands.base import NO_SETS, Command
+from tandem.commands.base import NO_SETS, Command, require
 from tandem.terminal import Refused
 
 if TYPE_CHECKING:
@@ -37,13 +37,12 @@ class SetsPlot(Command):
         from lbmpc.model import ModelError, build_model
         from lbmpc.plants import get_plant
         from lbmpc.sets.certificate import CertificateError, require_match
-        from lbmpc.sets.geometry.polytope import SetError
         from run_log.reading.reader import read_run
-        from run_log.reporting.report import save_picture
+        from run_log.reporting.canvas import drawing, save
         from run_log.reporting.summary import trajectory
         from run_log.run import plant_of
-        from tandem.commands.sets.picture import Drawn, picture
 
+        require("matplotlib")
         file, log = self.file, self.log
         out = file.with_suffix("").with_suffix(".png") if self.out is None else self.out
         try:
@@ -63,11 +62,10 @@ class SetsPlot(Command):
                 raise Refused(f"{log}: is a run of {plant_of(ran).name}, and the sets are of {plant.name}")
             states = trajectory(ran, plant).x
             x0 = states[0]
-        try:
-            figure = picture(Drawn(sets.certificate, model, np.asarray(x0), states), _title(sets))
-            save_picture(figure, out, dpi=120)
-        except SetError as error:
-            raise Refused(f"{file}: {error}") from error
+        with drawing(out):
+            from tandem.commands.sets.picture import Drawn, picture
+        drawn = Drawn(sets.certificate, model, np.asarray(x0), states)
+        save(lambda: picture(drawn, _title(sets)), out, dpi=120)
         self.say(f"picture {out}")
         self.emit({"picture": str(out), "sha256": sets.sha256})
         return 0

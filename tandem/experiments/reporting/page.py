@@ -10,9 +10,17 @@ import numpy as np
 from lbmpc.plants import Plant
 from node_runtime import provenance
 from node_runtime.config.sections import Config, to_toml
+from run_log.reporting.canvas import PictureError, drawing
 from tandem.experiments.reporting import findings, pictures, style
 from tandem.experiments.study.declaration import Declaration, Group
 from tandem.experiments.study.results import CaseResult, spread
+
+
+class Drawn(NamedTuple):
+    uri: str
+    """Empty where it could not be drawn; the caption says why."""
+    caption: str
+    alt: str
 
 
 class Table(NamedTuple):
@@ -26,7 +34,7 @@ class Part(NamedTuple):
 
     group: Group
     claims: list[findings.Claim]
-    pictures: list[style.Picture]
+    pictures: list[Drawn]
     table: Table
     words: list[str]
 
@@ -58,7 +66,6 @@ def page(
             parts.append(_part(group, own, plant))
     loader = jinja2.PackageLoader("tandem.experiments.reporting", "")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["data_uri"] = style.data_uri
     return environment.get_template("page.html.j2").render(
         declared=declared,
         parts=parts,
@@ -74,10 +81,18 @@ def page(
 
 def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
     survival = group.picture == "survival"
+    try:
+        with drawing(f"the picture of {group.name}"):
+            drawn = [
+                Drawn(style.data_uri(one.figure), one.caption, one.alt)
+                for one in pictures.draw(group.picture, results, plant, group.reference)
+            ]
+    except PictureError as error:
+        drawn = [Drawn("", str(error), "")]
     return Part(
         group=group,
         claims=findings.claims(results) if group.picture == "trajectories" else [],
-        pictures=pictures.draw(group.picture, results, plant, group.reference),
+        pictures=drawn,
         table=_survival_table(results) if survival else _table(results, plant),
         words=findings.survival(results) if survival else findings.compare(results, group.reference),
     )

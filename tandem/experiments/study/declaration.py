@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from lbmpc.plants import Plant
-from node_runtime.config.sections import Config, PositiveInt, Section, from_tree
+from node_runtime.config.sections import Config, Count, Section, from_tree
 from node_runtime.config.strict import ConfigError, apply_override, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults
 
@@ -48,11 +48,11 @@ class Case(Section, frozen=True):
     """Changes of the configuration, as a table like it."""
     vary: dict[str, list[Any]] = msgspec.field(default_factory=dict)
     """Makes a case of each combination: "section.key" -> values."""
-    seeds: list[Annotated[int, msgspec.Meta(ge=0)]] | PositiveInt = 1
+    seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count = 1
     """Which, or how many from 0 on."""
     x0s: Name = "default"
     """A name of [x0s]; "default" is the configuration's own x0."""
-    steps: PositiveInt | None = None
+    steps: Count | None = None
     faults: Faults = Faults()
     log: bool = False
     """Keep the MCAP log of every run from the default x0."""
@@ -63,9 +63,9 @@ class Case(Section, frozen=True):
 class Quick(Section, frozen=True):
     """What --quick leaves of each case."""
 
-    seeds: PositiveInt = 2
-    x0s: PositiveInt = 3
-    values: PositiveInt = 3
+    seeds: Count = 2
+    x0s: Count = 3
+    values: Count = 3
     """Of each `vary`, first, last and some between."""
 
 
@@ -75,7 +75,7 @@ class Declaration(Section, frozen=True, kw_only=True):
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
     title: str
     about: str = ""
-    steps: PositiveInt = 200
+    steps: Count = 200
     base: dict[str, Any] = msgspec.field(default_factory=dict)
     """Changes of the configuration for all cases."""
     x0s: dict[str, Starts] = msgspec.field(default_factory=dict)

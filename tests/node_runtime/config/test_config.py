@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from msgspec import inspect
 
 from lbmpc.plants import get_plant
 from node_runtime.config.plant import plant_of
@@ -78,7 +79,16 @@ def test_commented_values_of_the_shipped_file_are_valid():
         ("network.hidden=32", "network.hidden = 32 is not a list, each entry an integer of at least 1"),
         ("trainer.enabled=1", "trainer.enabled = 1 is not true or false"),
         ("rate=nan", "rate = nan is not a number above 0"),
-        ("rate=inf", "rate is not a finite number"),
+        ("rate=inf", "rate = inf is not a number above 0 and at most 100000"),
+        ("rate=1e-300", "rate = 1e-300: a period of 1e+300 s; at most 1e+06 s"),
+        ("controller.solver.penalty=inf", "controller.solver.penalty is not a finite number"),
+        (
+            "controller.horizon=2000000000",
+            "controller.horizon = 2000000000 is not an integer of at least 1 and at most 1000",
+        ),
+        ("l2nw.window=1000000", "l2nw.window = 1000000 is not an integer of at least 1 and at most 10000"),
+        ("log.chunk_bytes=1000000000000", "is not an integer of at least 1 and at most 67108864"),
+        ("realtime.cores=[0, 1000000000]", "realtime.cores[1]: Expected `int` <= 8191"),
         ("plant=3", "plant = 3 is a table: write [plant] and its keys below"),
         ("controler.oracle=dnn", "unknown key 'controler'; did you mean 'controller'?"),
         ("network.hiden=[3]", "unknown key 'network.hiden'; did you mean 'network.hidden'?"),
@@ -201,3 +211,51 @@ def test_a_text_that_is_not_utf_8_is_refused_and_a_logs_name_may_be_any_bytes():
     assert os.fsencode(config.log.path) == b"caf\xe9.mcap"
     for text in (to_json(config), to_toml(config)):
         assert "udce9.mcap" in text.encode().decode()
+
+
+def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> None:
+    """Reasons: what only scales or is compared, and sizes neither memory nor time."""
+    harmless = {
+        "tolerance",
+        "penalty",
+        "W",
+        "Q",
+        "R",
+        "x0",
+        "options",
+        "output_scale",
+        "max_layer_norm",
+        "ridge",
+        "margin",
+        "floor",
+        "floor_after",
+        "column_bound",
+        "initial_scale",
+        "bandwidth",
+        "regularisation",
+        "learning_rate",
+    }
+    unlimited: set[str] = set()
+
+    def look(kind: inspect.Type, name: str) -> None:
+        match kind:
+            case inspect.StructType(fields=fields):
+                for field in fields:
+                    look(field.type, field.name)
+            case inspect.UnionType(types=types):
+                for one in types:
+                    look(one, name)
+            case inspect.ListType(item_type=item) | inspect.DictType(value_type=item):
+                look(item, name)
+            case inspect.IntType() | inspect.FloatType() if kind.le is None and kind.lt is None:
+                unlimited.add(name)
+
+    look(inspect.type_info(Config), "")
+    assert unlimited <= harmless
+
+
+def test_a_log_is_held_to_the_same_limits() -> None:
+    with pytest.raises(
+        ConfigError, match=r"the log's configuration: controller\.horizon = 2000000000 is not"
+    ):
+        from_json('{"controller": {"horizon": 2000000000}}')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -166,6 +167,23 @@ def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
     assert code == 0, run.said
     assert result["ticks"] >= 1
     assert not read_run(tmp_path / "run.mcap").truncated
+    assert (tmp_path / "run.png").exists()
+
+
+@pytest.mark.parametrize("output", ["| head -n 3 > heard.txt", "> /dev/full 2> /dev/full"])
+def test_who_does_not_read_ends_the_display_and_not_the_loop(tmp_path: Path, output: str):
+    log = tmp_path / "run.mcap"
+    run = shlex.join([*RUN, "--seconds", "2", "--oracle", "linear", "--log", str(log)])
+    command = f"{run} 2>&1 {output}; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    # A full disk is said by the exit code: the figures are lost. A reader may leave.
+    assert done.returncode == (1 if "full" in output else 0), done.stderr
+    assert done.stderr == ""
+    ran = read_run(log)
+    assert not ran.truncated
+    assert len(ran.ticks) >= 40
     assert (tmp_path / "run.png").exists()
 
 

@@ -1,0 +1,84 @@
+"""Where pictures are drawn: Matplotlib as it comes, whatever settings the person or the machine has for it.
+
+Nothing here imports Matplotlib before something is drawn: its import alone fails for some settings.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from node_runtime.whole_file import write_whole
+from run_log.errors import LogError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LONGEST = 200
+"""Characters of a reason: LaTeX gives its whole log."""
+
+
+class PictureError(LogError):
+    """A picture cannot be drawn or written; the text says which and why. Nothing else depends on it."""
+
+
+@contextmanager
+def drawing(what: str | Path) -> Iterator[None]:
+    """What is drawn within depends on nobody's settings. Raises `PictureError`, whatever fails.
+
+    what: the picture's name or file, for the message.
+    """
+    try:
+        load_matplotlib()
+        from matplotlib import rc_context, rcParamsDefault
+
+        # A `Figure` without pyplot has no use for a backend, and to set one would import it.
+        with rc_context({key: rcParamsDefault[key] for key in rcParamsDefault if key != "backend"}):
+            yield
+    except (
+        ModuleNotFoundError,
+        PictureError,
+    ):  # nothing can be drawn here; whoever asked says what to install
+        raise
+    except OSError as error:
+        raise PictureError(f"{what}: cannot be written: {error.strerror}") from error
+    except Exception as error:
+        lines = str(error).splitlines() or [""]
+        raise PictureError(
+            f"{what}: cannot be drawn: {lines[0][:LONGEST]} ({type(error).__name__})"
+        ) from error
+
+
+def load_matplotlib() -> None:
+    """Import it without the person's choice of a backend and of a settings file, either of which may be a mistake."""
+    kept = {name: os.environ.pop(name) for name in ("MPLBACKEND", "MATPLOTLIBRC") if name in os.environ}
+    try:
+        import matplotlib  # noqa: F401
+    finally:
+        os.environ.update(kept)
+
+
+def save(make: Callable[[], Figure], path: Path, dpi: int | None = None) -> Path:
+    """Draw a figure and write it to `path`, in the format that the name's ending says; whole or not at all.
+
+    dpi: dots per inch; None: the figure's own.
+
+    Raises:
+        PictureError: it cannot be drawn or written, no picture has that ending, or a link, a device or a pipe has
+            that name.
+    """
+    with drawing(path):
+        figure, ending = make(), path.suffix.lstrip(".").lower()
+        known = figure.canvas.get_supported_filetypes()
+        if ending not in known:
+            raise PictureError(
+                f"{path}: no picture has that ending; name it .png, or one of {', '.join(sorted(known))}"
+            )
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=ending, dpi=dpi or "figure")
+        write_whole(path, buffer.getvalue())
+    return path

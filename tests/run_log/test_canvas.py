@@ -1,0 +1,82 @@
+"""Pictures depend on nobody's settings for Matplotlib."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import pytest
+from matplotlib.figure import Figure
+
+from run_log.reporting.canvas import PictureError, drawing, save
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from run_log.reporting.canvas import drawing, save
+with drawing("x"):
+    from matplotlib.figure import Figure
+def make():
+    figure = Figure()
+    figure.subplots().set_title("title $x_e$")
+    return figure
+save(make, Path(sys.argv[1]))
+"""
+OTHERS = "text.usetex: True\nsavefig.format: pdf\nfigure.facecolor: red\nsavefig.dpi: 7\nbackend: gtk4agg\n"
+
+
+def drawn(folder: Path, **environment: str) -> bytes:
+    folder.mkdir(exist_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(folder / "x.png")],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return (folder / "x.png").read_bytes()
+
+
+def test_a_picture_is_the_same_under_any_settings(tmp_path: Path) -> None:
+    plain = drawn(tmp_path / "plain")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "matplotlibrc").write_text(OTHERS)
+    assert drawn(tmp_path / "own", MPLBACKEND="nonsense") == plain
+    elsewhere = tmp_path / "own" / "matplotlibrc"
+    assert drawn(tmp_path / "named", MATPLOTLIBRC=str(elsewhere), MPLBACKEND="") == plain
+    not_text = tmp_path / "bytes.rc"
+    not_text.write_bytes(b"font.size: \xff\n")
+    assert drawn(tmp_path / "bytes", MATPLOTLIBRC=str(not_text)) == plain
+
+
+def test_settings_of_the_program_around_are_as_before() -> None:
+    with matplotlib.rc_context({"font.size": 31.0}):
+        with drawing("x"):
+            assert matplotlib.rcParams["font.size"] == matplotlib.rcParamsDefault["font.size"]
+        assert matplotlib.rcParams["font.size"] == 31.0
+
+
+def test_whatever_fails_in_drawing_is_one_line_about_that_picture(tmp_path: Path) -> None:
+    def broken() -> Figure:
+        figure = Figure()
+        figure.text(0, 0, r"$\bad{$")
+        return figure
+
+    with pytest.raises(PictureError, match=r"x\.png: cannot be drawn: .*ValueError") as caught:
+        save(broken, tmp_path / "x.png")
+    assert len(str(caught.value).splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_format_or_a_folder_that_cannot_be_is_said(tmp_path: Path) -> None:
+    with pytest.raises(PictureError, match=r"x\.zzz: cannot be drawn: Format 'zzz' is not supported"):
+        save(Figure, tmp_path / "x.zzz")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PictureError, match="cannot be written"):
+        save(Figure, tmp_path / "file" / "x.png")
