@@ -63,7 +63,7 @@ def test_the_claim_holds_and_more_is_known_with_more_knowledge_of_h(family: Cert
     fractions = [volume_fraction(c) for c in (box, hull, family)]
     # For this plant the hull of h is nearly its box.
     assert fractions[0] * (1 - 1e-5) <= fractions[1] < fractions[2]
-    assert not Guard(hull).first_inputs(START).lower
+    assert Guard(hull).first_inputs(START).piece == -1
     assert Guard(family).first_inputs(START).piece > 0
 
 
@@ -279,7 +279,7 @@ def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
 
 
 def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
-    guard, rng = Guard(family, ()), np.random.default_rng(6)
+    guard, rng = Guard(family, share=0.0), np.random.default_rng(6)
     bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
     tight = 0
     for index, piece in enumerate(family.pieces):
@@ -303,7 +303,7 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
 
 
 def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
-    plain, wary, rng = Guard(family, ()), Guard(family, (0.05,)), np.random.default_rng(9)
+    plain, wary, rng = Guard(family, share=0.0), Guard(family), np.random.default_rng(9)
     base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
     tighter = 0
     for x in np.vstack([points_in(base, 60, rng), 0.97 * base.vertices]):
