@@ -28,8 +28,7 @@ class Observation:
     """Its sample number; a label needs two consecutive ones."""
     hidden: HiddenSet | None
     pieces: Pieces = ()
-    """The inputs of that period where there were several, deviations; without `applied` those of a part of it, whose last
-    acts now."""
+    """The inputs of that period where there were several, deviations. Without `applied` only the last counts: it acts now."""
 
 
 @dataclass(frozen=True, eq=False)

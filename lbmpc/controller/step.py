@@ -59,9 +59,7 @@ class Controller:
         input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
     """
 
-    def __init__(
-        self, problem: Problem, solver: Solves, real_time: bool = False, input_delay: float = 0.0
-    ):
+    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False, input_delay: float = 0.0):
         self.problem, self._solver, self.real_time = problem, solver, real_time
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model

@@ -99,7 +99,10 @@ class InputRows:
         """Newton's method on the width of the interval at a distance, which is concave and falls with the distance."""
         distance = min(most, room[self._none].min(initial=np.inf))
         per_up, per_down = np.append(self._per_up, 0.0), np.append(self._per_down, 0.0)
-        high, low = np.append(room[self._up] * self._per_up, self.high), np.append(room[self._down] * self._per_down, self.low)
+        high, low = (
+            np.append(room[self._up] * self._per_up, self.high),
+            np.append(room[self._down] * self._per_down, self.low),
+        )
         for _ in range(ROUNDS):
             highs, lows = high - distance * per_up, low - distance * per_down
             i, j = int(np.argmin(highs)), int(np.argmax(lows))
@@ -121,7 +124,11 @@ class InputRows:
             bounds=[*zip(self.low, self.high, strict=True), (None, most)],
             method="highs",
         )
-        return (float(found.x[m]), np.clip(found.x[:m], self.low, self.high)) if found.status == 0 else (-np.inf, 0.5 * (self.low + self.high))
+        return (
+            (float(found.x[m]), np.clip(found.x[:m], self.low, self.high))
+            if found.status == 0
+            else (-np.inf, 0.5 * (self.low + self.high))
+        )
 
     def _box(self, room: np.ndarray) -> Bounds | None:
         """The largest box of U's proportions inside {Q v <= room} and U, by a linear program in (centre, size)."""

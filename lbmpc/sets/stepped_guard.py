@@ -15,7 +15,9 @@ class SteppedGuard(Guard):
 
     def _inside(self, rows: InputRows, x: np.ndarray) -> Bounds | None:
         room = rows.room(x)
-        return next((found for reserve in RESERVES if (found := rows.within(room, reserve)) is not None), None)
+        return next(
+            (found for reserve in RESERVES if (found := rows.within(room, reserve)) is not None), None
+        )
 
     def _outside(self, rows: InputRows, x: np.ndarray) -> tuple[None, None]:
         return None, None

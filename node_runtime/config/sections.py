@@ -75,8 +75,8 @@ class ControllerConfig(Section, frozen=True):
     sets: str | None = None
     """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
     guard: literals.GuardName = "half"
-    """Distance that "invariant" keeps from the sets' boundary: half of what some input keeps; "steps": 0.02, 0.005, 0.001
-    or none, and outside no bounds at all, as runs recorded before this key did."""
+    """Distance that "invariant" keeps from the sets' boundary: half of what some input keeps; "steps": 0.02, 0.005,
+    0.001 or none, and outside no bounds at all, as runs recorded before this key did."""
     W: list[NonNegative] | None = None
     """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
     Q: list[NonNegative] | None = None
