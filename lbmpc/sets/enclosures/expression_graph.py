@@ -22,7 +22,8 @@ class UnsupportedOperation(ValueError):
     def __init__(self, operation: str, leaves: tuple[Node, ...]):
         super().__init__(
             f"the disturbance cannot be bounded rigorously: the plant's equations use `{operation}`, which is not "
-            "among + - * / sqrt exp log sin cos tanh and powers; write them with these, or give W yourself (--kind given)"
+            "among + - * / sqrt exp log sin cos tanh and powers; write them with these, or give W yourself "
+            "(--kind given)"
         )
         self.operation, self.leaves = operation, leaves
 

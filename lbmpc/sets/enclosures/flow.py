@@ -183,8 +183,8 @@ class Flow:
         names = " and ".join(self._name_of(leaf) for leaf in error.leaves)
         return (
             f"{error.operation} of an expression in {names or 'constants'} reaches where it is not defined and "
-            f"smooth ({DOMAINS[error.operation]}). Give {names or 'the plant'} bounds that keep away from there during the whole "
-            f"period, so a smaller region, or give W yourself (--kind given)"
+            f"smooth ({DOMAINS[error.operation]}). Give {names or 'the plant'} bounds that keep away "
+            "from there during the whole period, a smaller region so, or give W yourself (--kind given)"
         )
 
     def _integrate(

@@ -391,3 +391,34 @@ def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:
     verdict = check(loose)
     assert not verdict.ok
     assert "bounds nothing" in verdict.reason
+
+
+def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two opposite corners of a box, each of them twice: every edge is there twice, every row is touched.
+
+    The claim is false at the other two corners only.
+    """
+    certificate = construct(MODEL, "box", START)
+    box = {"G": [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], "g": [0.2, 0.2, 0.3, 0.3]}
+    false = changed(certificate, 0, **box)
+    assert "no input found" in check(false).reason
+    corners = np.array([[0, 3], [1, 2]])
+    for forged in (np.vstack([corners, corners]), np.vstack([corners, corners[:, ::-1]])):
+        monkeypatch.setattr(checker, "_bases", lambda *_a, forged=forged: forged)
+        assert "listed twice" in check(false).reason
+    # The same rows under other names: counted from the end.
+    monkeypatch.setattr(checker, "_bases", lambda *_a: np.vstack([corners, corners - 4]))
+    assert "is not given by 2 of its 4 rows" in check(false).reason
+    monkeypatch.setattr(checker, "_bases", lambda *_a: np.array([[0], [1], [2], [3]]))
+    assert "is not given by 2 of its 4 rows" in check(false).reason
+
+
+def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
+    """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
+    fast = replace(
+        two_inputs().plant,
+        name="fast",
+        rhs=lambda x, u: [-1000.0 * x[0] + u[0], x[1] + u[1]],
+    )
+    certificate = construct(build_model(fast, 0.1), "given", np.zeros(2), W=np.array([0.01, 0.01]))
+    assert check(certificate).ok

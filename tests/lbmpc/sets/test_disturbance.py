@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import casadi as ca
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from lbmpc.model import Model, build_model
-from lbmpc.plants.base import Plant, Truth
+from lbmpc.plants.base import Plant, Rhs, Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from lbmpc.sets.construct import whole
 from lbmpc.sets.enclosures.disturbance import (
     DisturbanceBound,
     DisturbanceError,
@@ -23,6 +25,7 @@ from lbmpc.sets.enclosures.disturbance import (
 )
 from lbmpc.sets.enclosures.flow import Flow, FlowEnclosure
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product, up
+from tests.helpers.pendulum import PENDULUM
 
 SAMPLES = 2000
 # What the integrator of the truth may be off by, per unit of the state's size.
@@ -406,3 +409,18 @@ def test_a_region_that_is_none_is_named():
         bound_box(model, Region(np.array([-1.0, 1.0]), np.array([1.0, -1.0]), r.u_lower, r.u_upper))
     with pytest.raises(DisturbanceError, match="2 states and 1 inputs"):
         bound_box(model, Region(r.x_lower[:1], r.x_upper[:1], r.u_lower, r.u_upper))
+
+
+@pytest.mark.parametrize(
+    ("rhs", "says"),
+    [
+        (lambda x, u: [x[1], u[0] - ca.sqrt(x[0] + 0.5) + ca.sqrt(0.5)], r"sqrt of an expression in angle .*above 0.*--kind given"),
+        (lambda x, u: [x[1], ca.log(1.0 + x[1] + u[0])], r"log of an expression in rate and torque .*above 0"),
+        (lambda x, u: [x[1], u[0] / (1.0 + x[0])], r"a division of an expression in angle .*must not come to 0"),
+        (lambda x, u: [x[1], u[0] - x[1] * ca.fabs(x[1])], r"`fabs`.*--kind given.*in rate"),
+    ],
+)
+def test_what_has_no_bound_is_named_with_its_state_and_a_remedy(rhs: Rhs, says: str) -> None:
+    model = build_model(replace(PENDULUM, rhs=rhs), 0.1)
+    with pytest.raises(DisturbanceError, match=says):
+        bound_box(model, whole(model))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -150,3 +151,19 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
 def test_what_the_plant_does_not_have(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
         plant_of(override(Config(), [given]))
+
+
+def test_a_log_from_before_a_key_says_what_was_in_force_then():
+    tree = to_tree(Config())
+    del tree["controller"]["guard"], tree["controller"]["input_delay_ms"]
+    old = from_json(json.dumps(tree))
+    assert old.controller.guard == "steps"
+    assert old.controller.input_delay_ms is None
+    assert Config().controller.guard == "half"
+    assert from_json(to_json(Config())) == Config()
+
+
+def test_a_delay_of_more_than_half_a_period_is_refused():
+    assert override(Config(), ["controller.input_delay_ms=25"]).controller.input_delay_ms == 25
+    with pytest.raises(ConfigError, match="input_delay_ms = 5 is more than half a period, 0.5 ms at rate = 1000 Hz"):
+        override(Config(), ["controller.input_delay_ms=5", "rate=1000"])
