@@ -47,6 +47,7 @@ def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     sets_are = f"{count} certified {'set' if count == 1 else 'sets'} ({certificate.kind}, "
     sets_are += f"{100 * found.volume_fraction:.1f} % of X, margin {found.invariance_margin:.2g}, "
     return (
-        "guaranteed: X and U at every sample, not between two, whatever the network says, if inputs act for "
-        f"whole periods, from every state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
+        "guaranteed: X and U at every sample, not between two, whatever the network says, if inputs act for whole "
+        f"periods, from every state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's "
+        "half-widths)"
     )

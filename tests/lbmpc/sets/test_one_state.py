@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import casadi as ca
+import msgspec
 import numpy as np
 import pytest
 
 from lbmpc.model import Model, build_model
 from lbmpc.plants.base import Rhs
 from lbmpc.sets import check as checker
+from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, volume_fraction
 from lbmpc.sets.guard import Guard
@@ -52,14 +54,14 @@ def test_an_unstable_state_is_kept_in_a_smaller_interval_and_no_more_is_believed
     certificate = construct(one_state(lambda x, u: [2.0 * ca.sin(x[0]) + u[0]]), "box", np.zeros(1))
     assert check(certificate).ok
     piece = certificate.pieces[0]
-    assert 0.3 < volume_fraction(certificate) < 0.7
-    wider = replace_piece(certificate, g=[g + 0.05 * abs(row[0]) for row, g in zip(piece.G, piece.g, strict=True)])
+    assert 0.2 < volume_fraction(certificate) < 0.5
+    wider = replace_piece(
+        certificate, g=[g + 0.05 * abs(row[0]) for row, g in zip(piece.G, piece.g, strict=True)]
+    )
     assert "no input found" in check(wider).reason
 
 
-def replace_piece(certificate, **fields):  # type: ignore[no-untyped-def]
-    import msgspec
-
+def replace_piece(certificate: Certificate, **fields: object) -> Certificate:
     piece = msgspec.structs.replace(certificate.pieces[0], **fields)
     return msgspec.structs.replace(certificate, pieces=[piece])
 

@@ -165,5 +165,7 @@ def test_a_log_from_before_a_key_says_what_was_in_force_then():
 
 def test_a_delay_of_more_than_half_a_period_is_refused():
     assert override(Config(), ["controller.input_delay_ms=25"]).controller.input_delay_ms == 25
-    with pytest.raises(ConfigError, match="input_delay_ms = 5 is more than half a period, 0.5 ms at rate = 1000 Hz"):
+    with pytest.raises(
+        ConfigError, match=r"input_delay_ms = 5 is more than half a period, 0\.5 ms at rate = 1000 Hz"
+    ):
         override(Config(), ["controller.input_delay_ms=5", "rate=1000"])
