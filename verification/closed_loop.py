@@ -118,7 +118,7 @@ class ClosedLoop:
                 pieces = (rest,)
             else:
                 pieces = ((case.delay, before), rest)
-                applied = sum(seconds * v for seconds, v in pieces) / period
+                applied = (case.delay * before + rest[0] * u) / period
             before = u
         return Found(outside, margin)
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-import casadi as ca
 import msgspec
 import numpy as np
 import pytest
 
 from lbmpc.controller.signals import Observation
 from lbmpc.controller.step import Controller
-from lbmpc.model import Model, build_model
+from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.sets import check as checker
@@ -28,7 +27,7 @@ from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution, Status
-from tests.helpers.pendulum import PENDULUM, pendulum
+from tests.helpers.pendulum import pendulum, two_inputs
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
@@ -248,20 +247,6 @@ def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family
 def test_without_sets_there_is_no_invariant_tightening() -> None:
     with pytest.raises(CertificateError, match="tandem sets compute"):
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant")
-
-
-def two_inputs() -> Model:
-    both = replace(
-        PENDULUM,
-        name="two_inputs",
-        inputs=("left", "right"),
-        rhs=lambda x, u: [x[1] + 0.3 * u[1], 4.0 * ca.sin(x[0]) + u[0]],
-        u_e=np.zeros(2),
-        u_min=np.array([-3.0, -1.0]),
-        u_max=np.array([3.0, 1.0]),
-        safe_input=np.zeros(2),
-    )
-    return build_model(both, 0.1)
 
 
 def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
