@@ -20,12 +20,15 @@ from lbmpc.oracles.dnn.trial import Trial
 from lbmpc.plants import Plant, get_plant
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
+from lbmpc.sets.guard import Guard
+from lbmpc.sets.stepped_guard import SteppedGuard
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import Problem, build_problem
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture
+from node_runtime.config import literals
 from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -35,6 +38,7 @@ WEIGHTS = WEIGHTS_LIMIT // 4
 """Hidden weights at most, float32 each."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
+GUARDS: dict[literals.GuardName, type[Guard]] = {"half": Guard, "steps": SteppedGuard}
 
 
 def build_plant(config: Config) -> Plant:
@@ -176,13 +180,15 @@ def build_controller(
             None if settings.W is None else np.array(settings.W, dtype=float),
             settings.solver.penalty,
             certificate,
+            GUARDS[settings.guard],
         )
     except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error
     chosen = settings.solver
     solver = TimedSolver(problem, chosen.max_iterations, chosen.tolerance, realise)
     problem.oracle.compile(realise)
-    controller = Controller(problem, solver, real_time=chosen.mode == "real_time")
+    seconds = 1e-3 * (settings.input_delay_ms or 0.0)
+    controller = Controller(problem, solver, real_time=chosen.mode == "real_time", input_delay=seconds)
     _warm_up(controller, solver, config.seed)
     return controller, solver
 

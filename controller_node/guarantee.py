@@ -26,13 +26,13 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
             return "guaranteed: nothing; the constraints of the nominal prediction are not tightened"
         case "first_step":
             return (
-                "guaranteed: the next state is in X for every disturbance in W, from states where the plan keeps its "
-                "first constraint; nothing for the steps after it"
+                "guaranteed: the next state, at its sample, is in X for every disturbance in W, from states where the "
+                "plan keeps its first constraint; nothing for the steps after it"
             )
         case "tube":
             return (
-                "guaranteed: X and U for ever, for every disturbance in W, from every state where the problem has a "
-                "solution once; W is taken as given"
+                "guaranteed: X and U at every sample, for ever, for every disturbance in W, from every state where the "
+                "problem has a solution once; W is taken as given"
             )
     return _of_sets(find_sets(config, model) if sets is None else sets, start_of(config, model))
 
@@ -40,11 +40,14 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
 def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     certificate, found = sets.certificate, sets.found
     count, margin = len(certificate.pieces), Guard(certificate).first_inputs(start).margin
-    inside = f"x0 is inside, {margin:.2g} from the boundary" if margin >= 0 else "x0 is OUTSIDE of them"
+    inside = f"x0 is inside, {margin:.2g} from the boundary"
+    if margin < 0:
+        inside = "x0 is OUTSIDE of them, from where nothing is guaranteed"
     trust = "W is given, not proved" if certificate.source_of_W == "given" else "W is proved"
     sets_are = f"{count} certified {'set' if count == 1 else 'sets'} ({certificate.kind}, "
     sets_are += f"{100 * found.volume_fraction:.1f} % of X, margin {found.invariance_margin:.2g}, "
     return (
-        "guaranteed: X and U at every sample, whatever the network says, if inputs act for whole periods, from every "
-        f"state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's half-widths)"
+        "guaranteed: X and U at every sample, not between two, whatever the network says, if inputs act for whole "
+        f"periods, from every state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's "
+        "half-widths)"
     )

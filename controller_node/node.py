@@ -19,7 +19,7 @@ from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config
+from node_runtime.config.sections import Config, override
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
@@ -53,6 +53,7 @@ LONGEST_PHASE = 0.5
 BACKUP_FROM = 0.01
 # Seconds, and share of a period at most.
 USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.25
+USUAL_ANSWER, USUAL_ANSWER_SHARE = 4e-3, 0.1
 COUNTS = (
     "ticks",
     "late ticks",
@@ -340,6 +341,7 @@ def _live(config: Config, stopping: threading.Event) -> int:
     run_id = new_run_id("controller")
     counts = dict.fromkeys(COUNTS, 0)
     _check_phase(config)
+    config = with_input_delay(config)
     place = core_for(config, "controller", os.sched_getaffinity(0))
     core = ControllerCore(config, run_id)
     log.info("%s", guarantee(config, core.controller.model, core.sets))
@@ -362,6 +364,14 @@ def _live(config: Config, stopping: threading.Event) -> int:
             with saving or nullcontext(), on_core(place):
                 node.run(stopping)
     return 0
+
+
+def with_input_delay(config: Config) -> Config:
+    """The configuration with `controller.input_delay_ms` settled, so that the log says what was in force."""
+    if config.controller.input_delay_ms is not None:
+        return config
+    usual = phase(config) + min(USUAL_ANSWER, USUAL_ANSWER_SHARE * config.period)
+    return override(config, [f"controller.input_delay_ms={min(usual, 0.5 * config.period) * 1e3!r}"])
 
 
 def phase(config: Config) -> float:

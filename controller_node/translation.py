@@ -59,8 +59,8 @@ class Translation:
         pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
         total = sum(seconds for seconds, _u in pieces)
         if pieces and not math.isclose(total, self.period, rel_tol=1e-3):
-            # Not the whole period: what acted in the rest of it is not known.
-            applied, pieces = None, ()
+            # Not the whole period: what acted in the rest of it is not known, but what acts now is.
+            applied = None
         x = np.array(state.x) - self.plant.x_e
         return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces)
 

@@ -130,7 +130,7 @@ class PlantSim:
             t=t,
             x=self._x.tolist(),
             applied=applied,
-            pieces=pieces if applied is not None and len(pieces) > 1 else [],
+            pieces=pieces if applied is None or len(pieces) > 1 else [],
             source=source,
             command_seq=-1 if orders is None else orders.seq,
         )

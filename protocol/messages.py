@@ -87,7 +87,8 @@ class PlantState(Message, frozen=True, kw_only=True):
     applied: list[float] | None
     """Time average of the input over the last period; None where that period was not a whole one."""
     pieces: list[Piece] = msgspec.field(default_factory=list)
-    """The inputs that made up that period, in order, where there was more than one; else empty."""
+    """The inputs that made up that period, in order, where there was more than one; else empty. Where it was not a
+    whole one, those that acted in it: the last still acts."""
     source: InputSource
     command_seq: Sequence
     """Tick of the last command received, -1 before the first."""

@@ -23,7 +23,7 @@ MEANING = {
     "weights_rolled_back": "adopted, then worse than the set before",
     "fallback_ticks": "input not from the solver",
     "soft_ticks": "a soft state constraint gave way",
-    "constraint_violations": "true state or applied input outside X or U",
+    "constraint_violations": "true state at a sample or applied input outside X or U",
     "cost": "sum of squared deviations",
     "overshoot": "of the first performance state",
     "settling_step": "last one off by more than 0.02",

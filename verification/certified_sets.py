@@ -1,10 +1,12 @@
 """Certified sets put to the test: many states, hostile disturbances, inputs chosen by a liar.
 
-    python -m verification.certified_sets sets.json --states 100000 --steps 200
+    python -m verification.certified_sets states sets.json --states 100000 --steps 200
+    python -m verification.certified_sets closed-loop sets.json --seeds 100
 
 From random states of the sets, the next input is whatever an adversarial oracle could make the controller choose: the
 lowest or the highest that the certified bounds on v_0 allow, or one at random in between. The disturbance is the vertex
-of W that pushes hardest against the nearest facet, a random point of W, or what the true plant does.
+of W that pushes hardest against the nearest facet, a random point of W, or what the true plant does. The second command
+is described in `verification.closed_loop`.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.guard import ROW_ROUNDING
 from lbmpc.sets.invariance.approach import one_period
 from node_runtime.realtime.scheduling import one_blas_thread
+from verification.closed_loop import ClosedLoop, OracleName, cases
 
 Disturbance = Literal["worst", "random", "true"]
 CHUNK = 500
@@ -106,27 +109,27 @@ class Rows:
         self.low, self.per_low = room[down] / slope[down], P[down] / slope[down, None]
 
 
-def measure(
+def states(
     file: Path,
-    states: Annotated[int, tyro.conf.arg(help="How many.")] = 100_000,
+    count: Annotated[int, tyro.conf.arg(name="states", help="How many.")] = 100_000,
     steps: int = 200,
     seed: int = 0,
 ) -> dict[str, float | int | str]:
-    """All three disturbances; each on its share of the states."""
+    """Many states and hostile disturbances, all three kinds; each on its share of the states."""
     certificate = read_sets(file).certificate
     model = build_model(get_plant(certificate.model.plant), certificate.model.period)
     low, high = (np.array(bound) for bound in certificate.model.X)
     crowd = Crowd(certificate, model, seed)
     result: dict[str, float | int | str] = {
         "file": str(file.name),
-        "states": states,
+        "states": count,
         "steps": steps,
         "seed": seed,
     }
     began = time.perf_counter()
     kinds: tuple[Disturbance, ...] = ("worst", "random", "true")
     for kind in kinds:
-        x, pieces = crowd.start(states // len(kinds))
+        x, pieces = crowd.start(count // len(kinds))
         infeasible = left = outside = 0
         for _ in range(steps):
             x, pieces, bad, out = crowd.step(x, pieces, kind)
@@ -136,7 +139,34 @@ def measure(
     return result | {"seconds": round(time.perf_counter() - began, 1)}
 
 
+def closed_loop(
+    file: Path, seeds: int = 100, steps: int = 100, oracle: OracleName = "perfect"
+) -> dict[str, float | int | str]:
+    """The control step with a solver that lies, errors of measurement and late commands: ticks outside, by case."""
+    certificate = read_sets(file).certificate
+    model = build_model(get_plant(certificate.model.plant), certificate.model.period)
+    loop = ClosedLoop(certificate, model, oracle)
+    result: dict[str, float | int | str] = {
+        "file": file.name,
+        "seeds": seeds,
+        "steps": steps,
+        "oracle": oracle,
+    }
+    began = time.perf_counter()
+    for case in cases():
+        found = [loop.run(case, seed, steps) for seed in range(seeds)]
+        name = f"{case.inputs}, noise {case.noise:g}, delay {1e3 * case.delay:g} ms"
+        result |= {
+            f"{name}: outside": sum(one.outside for one in found),
+            f"{name}: margin": float(f"{min(one.margin for one in found):.2g}"),
+        }
+    return result | {"seconds": round(time.perf_counter() - began, 1)}
+
+
 if __name__ == "__main__":
     # Many small products: threads would only wait for each other.
     with one_blas_thread():
-        sys.stdout.write(json.dumps(tyro.cli(measure, config=(tyro.conf.PositionalRequiredArgs,))) + "\n")
+        found = tyro.extras.subcommand_cli_from_dict(
+            {"states": states, "closed-loop": closed_loop}, config=(tyro.conf.PositionalRequiredArgs,)
+        )
+        sys.stdout.write(json.dumps(found) + "\n")

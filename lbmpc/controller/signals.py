@@ -28,7 +28,8 @@ class Observation:
     """Its sample number; a label needs two consecutive ones."""
     hidden: HiddenSet | None
     pieces: Pieces = ()
-    """The inputs of that period where there were several, deviations."""
+    """The inputs of that period where there were several, deviations. Without `applied` only the last counts: it acts
+    now."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ class ControllerState:
     predicted: np.ndarray
     """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
     delay: float
-    """Seconds from a sample until the command that answers it acts; smoothed, 0 until the plant has shown one."""
+    """Seconds from a sample until the command that answers it acts: smoothed, or as configured until there is one."""
     oracle: OracleState
 
     def to_arrays(self) -> dict[str, np.ndarray]:

@@ -56,12 +56,14 @@ class Controller:
         problem: the optimisation problem.
         solver: solves it.
         real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
+        input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
     """
 
-    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False):
+    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False, input_delay: float = 0.0):
         self.problem, self._solver, self.real_time = problem, solver, real_time
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
+        self._first_delay = self._acceptable(input_delay)
         self.oracle = problem.oracle
         self._absurd = ABSURD * self.model.plant.x_scale
 
@@ -70,7 +72,8 @@ class Controller:
         oracle = self.oracle.initial_state(np.random.default_rng(seed))
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
-        return ControllerState(plan, nothing, (0, -1), self._with_past(oracle, nothing), 0.0, oracle)
+        s = self._with_past(oracle, nothing)
+        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -131,10 +134,13 @@ class Controller:
 
     def _delay(self, delay: float, seen: Observation) -> float:
         """The plant reports when the last command took over from the one before; its average, at most half a period."""
-        if len(seen.pieces) < 2:
+        if seen.applied is None or len(seen.pieces) < 2:
             return delay
         measured = sum(seconds for seconds, _u in seen.pieces[:-1])
-        return min(delay + DELAY_GAIN * (measured - delay), 0.5 * self.model.period)
+        return self._acceptable(delay + DELAY_GAIN * (measured - delay))
+
+    def _acceptable(self, delay: float) -> float:
+        return min(delay, 0.5 * self.model.period)
 
     def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
         """The state, (d,), at which the command that is being computed will begin to act.

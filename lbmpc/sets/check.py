@@ -4,9 +4,10 @@ It shares nothing with the construction but the libraries. Why it may be believe
 
 1. The piece is widened a little, each row by its own random amount, so that no vertex is degenerate. What holds for
    the wider set holds for the piece.
-2. Qhull proposes the vertices, as bases: d rows that meet. Each is confirmed: the rows are independent, their point is
-   enclosed in a ball of known radius, and it is strictly inside all other rows.
-3. No vertex is missing: every edge, that is every d - 1 rows of a basis, is found in exactly two bases. The graph of a
+2. Qhull proposes the vertices, as bases: d rows that meet. Each is confirmed: it is proposed once, the rows are
+   independent, their point is enclosed in a ball of known radius, and it is strictly inside all other rows.
+3. No vertex is missing: every edge, that is every d - 1 rows of a basis, is found in exactly two bases, which are not
+   one basis said twice. The graph of a
    polyhedron's vertices is connected (Balinski 1961), so a list closed under its edges is complete, and no edge is a
    ray, so the set is bounded, and the hull of its vertices.
 4. Each row touches the set, so that the set is the one that was written down.
@@ -196,7 +197,7 @@ def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tupl
     inside = linprog(ball, np.column_stack([G, lengths]), g, bounds=(None, None), method="highs")
     if inside.status != 0 or inside.x[d] <= 0.0:
         raise Refuted("it is empty, flat or unbounded")
-    bases = _bases(G, wide, inside.x[:d])
+    bases = _distinct(_bases(G, wide, inside.x[:d]), G.shape)
     rows, bounds = G[bases], wide[bases]
     try:
         points = np.linalg.solve(rows, bounds[..., None])[..., 0]
@@ -219,6 +220,9 @@ def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tupl
 
 def _bases(G: np.ndarray, g: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Which d rows meet in each vertex, (k, d), as Qhull sees it."""
+    if G.shape[1] == 1:  # Qhull has no dimension 1: of the rows of each sign the tightest
+        bounds = np.divide(g, np.abs(G[:, 0]))
+        return np.array([[np.where(side, bounds, np.inf).argmin()] for side in (G[:, 0] > 0, G[:, 0] < 0)])
     try:
         # An unbounded set has a vertex at infinity; it is found out below.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -227,7 +231,18 @@ def _bases(G: np.ndarray, g: np.ndarray, inside: np.ndarray) -> np.ndarray:
         raise Refuted(f"Qhull cannot list its vertices: {str(error).splitlines()[0]}") from error
     if any(len(facet) != G.shape[1] for facet in found.dual_facets):
         raise Refuted("two vertices are too close to be told apart")
-    return np.sort(np.array(found.dual_facets), axis=1)
+    return np.array(found.dual_facets)
+
+
+def _distinct(bases: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The bases, (k, d), each in order. One that is there twice would have all its edges twice, without a neighbour."""
+    rows, d = shape
+    if bases.shape[1:] != (d,) or not ((bases >= 0) & (bases < rows)).all():
+        raise Refuted(f"a vertex is not given by {d} of its {rows} rows")
+    bases = np.sort(bases, axis=1)
+    if len(np.unique(bases, axis=0)) != len(bases):
+        raise Refuted("a vertex is listed twice, which could hide that another is missing")
+    return bases
 
 
 def _require_strict(
@@ -265,8 +280,11 @@ def _inside_exactly(G: np.ndarray, g: np.ndarray, basis: np.ndarray, row: int) -
 def _require_closed(bases: np.ndarray) -> None:
     """Every edge joins two vertices of the list."""
     d = bases.shape[1]
-    edges = np.concatenate([np.delete(bases, i, axis=1) for i in range(d)])
-    _, counts = np.unique(edges, axis=0, return_counts=True)
+    if d == 1:  # the edge of an interval is all of it
+        counts = np.array([len(bases)])
+    else:
+        edges = np.concatenate([np.delete(bases, i, axis=1) for i in range(d)])
+        _, counts = np.unique(edges, axis=0, return_counts=True)
     if not (counts == 2).all():
         raise Refuted(f"{int((counts != 2).sum())} of its edges lead to no vertex that was found")
 

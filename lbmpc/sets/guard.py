@@ -19,27 +19,38 @@ from lbmpc.sets.geometry.linear_program import linprog, load
 
 ROW_ROUNDING = 1e-10
 """In scaled lengths: rounding of a row's value must not put a state outside that was steered onto its facet."""
-RESERVES = (0.02, 0.005, 0.001)
-"""Distances from the target's boundary, as shares of X's half-widths, that are kept where some input keeps them: the
-claim does not need them, but a command that acts late, or a measurement that is off, is not part of W."""
+SHARE, MOST = 0.5, 0.04
+"""Half the distance from the target's boundary that some input keeps is kept, where a distance beyond MOST, as a share
+of X's half-widths, counts as MOST. The claim does not need it, but a command that acts late, or a measurement that is
+off, is not part of W. Some input keeps the margin that `lbmpc.sets.check` found, from every state of the family, so
+half of that is kept everywhere."""
+ROUNDS = 100
+"""Of Newton's method at most; it ends by itself, as a rule after three."""
+
+
+Bounds = tuple[np.ndarray, np.ndarray]
+"""Lower and upper, (m,) each."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstInputs:
-    """What is certified of v_0 in a state.
+    """What v_0 is to be in a state.
 
-    `lower` and `upper` (m,) keep the family, at some distance from its boundary where that can be had; None outside,
-    where nothing is certified. `margin` is the distance to the nearest facet, as a share of X's half-widths, negative
-    outside. `piece` is the set that x is in, -1 outside.
+    Inside, what lies between `lower` and `upper`, (m,) each, keeps the family, at some distance from its boundary.
+    Outside nothing is certified: the bounds are what would lead into the target of the nearest piece if that were as
+    certified here as inside, or, where nothing would, the one input that leads least far out of it. `margin` is the
+    distance to the nearest facet, as a share of X's half-widths, negative outside. `piece` is the set that x is in,
+    -1 outside.
     """
 
     lower: np.ndarray | None
     upper: np.ndarray | None
+    """None where a guard says nothing."""
     margin: float
     piece: int
 
 
-class _InputRows:
+class InputRows:
     """Rows of one piece's target over (x, v_0): P x + Q v_0 <= r."""
 
     def __init__(self, certificate: Certificate, index: int, scale: np.ndarray):
@@ -53,7 +64,8 @@ class _InputRows:
         self.Q = T @ (np.array(model.B) + np.array(piece.slope_u))
         self.r = t - (T @ np.array(piece.W).T).max(axis=1) - ROW_ROUNDING
         self.low, self.high = np.array(piece.u_lower), np.array(piece.u_upper)
-        if self.Q.shape[1] == 1:
+        self.single = self.Q.shape[1] == 1
+        if self.single:
             slope = self.Q[:, 0]
             self._up, self._down = slope > 0, slope < 0
             self._per_up, self._per_down = 1 / slope[self._up], 1 / slope[self._down]
@@ -61,24 +73,64 @@ class _InputRows:
         else:
             load()
 
-    def bounds(self, x: np.ndarray, reserves: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray] | None:
-        """Of v_0, (m,) each, with the first of the reserves that can be had, or none; None when there are no bounds."""
-        room = self.r - self.P @ x
-        find = self._interval if self.Q.shape[1] == 1 else self._box
-        for reserve in (*reserves, 0.0):
-            found = find(room - reserve)
-            if found is not None:
-                return found
-        return None
+    def room(self, x: np.ndarray) -> np.ndarray:
+        """What is left of each row for Q v_0 in the state x, (d,); (rows,)."""
+        return np.asarray(self.r - self.P @ x)
 
-    def _interval(self, room: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def within(self, room: np.ndarray, reserve: float) -> Bounds | None:
+        """Bounds on v_0, (m,) each, that keep this distance from the target's boundary; None when there are none."""
+        return self._interval(room - reserve) if self.single else self._box(room - reserve)
+
+    def farthest(self, room: np.ndarray, most: float) -> tuple[float, np.ndarray]:
+        """The largest distance from the target's boundary that some input keeps, and that input, (m,).
+
+        At most `most`. Negative where every input leads outside: then the input leads least far.
+        """
+        return self._farthest_single(room, most) if self.single else self._farthest(room, most)
+
+    def _interval(self, room: np.ndarray) -> Bounds | None:
         high = min(self.high[0], (room[self._up] * self._per_up).min(initial=np.inf))
         low = max(self.low[0], (room[self._down] * self._per_down).max(initial=-np.inf))
         if low > high or (room[self._none] < 0).any():
             return None
         return np.array([low]), np.array([high])
 
-    def _box(self, room: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _farthest_single(self, room: np.ndarray, most: float) -> tuple[float, np.ndarray]:
+        """Newton's method on the width of the interval at a distance, which is concave and falls with the distance."""
+        distance = min(most, room[self._none].min(initial=np.inf))
+        per_up, per_down = np.append(self._per_up, 0.0), np.append(self._per_down, 0.0)
+        high, low = (
+            np.append(room[self._up] * self._per_up, self.high),
+            np.append(room[self._down] * self._per_down, self.low),
+        )
+        for _ in range(ROUNDS):
+            highs, lows = high - distance * per_up, low - distance * per_down
+            i, j = int(np.argmin(highs)), int(np.argmax(lows))
+            gap = lows[j] - highs[i]
+            if gap <= 0.0:
+                break
+            nearer = distance - gap / (per_up[i] - per_down[j])
+            if not nearer < distance:
+                break
+            distance = nearer
+        return float(distance), np.clip([0.5 * (highs[i] + lows[j])], self.low, self.high)
+
+    def _farthest(self, room: np.ndarray, most: float) -> tuple[float, np.ndarray]:
+        m = len(self.low)
+        found = linprog(
+            np.append(np.zeros(m), -1.0),
+            np.column_stack([self.Q, np.ones(len(room))]),
+            room,
+            bounds=[*zip(self.low, self.high, strict=True), (None, most)],
+            method="highs",
+        )
+        return (
+            (float(found.x[m]), np.clip(found.x[:m], self.low, self.high))
+            if found.status == 0
+            else (-np.inf, 0.5 * (self.low + self.high))
+        )
+
+    def _box(self, room: np.ndarray) -> Bounds | None:
         """The largest box of U's proportions inside {Q v <= room} and U, by a linear program in (centre, size)."""
         m, half = len(self.low), (self.high - self.low) / 2
         rows = np.column_stack([self.Q, np.abs(self.Q) @ half])
@@ -99,8 +151,8 @@ class _InputRows:
 class Guard:
     """A certified family of sets, ready to be asked at every tick."""
 
-    def __init__(self, certificate: Certificate, reserves: tuple[float, ...] = RESERVES):
-        self._reserves = reserves
+    def __init__(self, certificate: Certificate, share: float = SHARE, most: float = MOST):
+        self._share, self._most = share, most
         x_lower, x_upper = (np.array(bound) for bound in certificate.model.X)
         self.scale = (x_upper - x_lower) / 2
         self.certificate = certificate
@@ -112,7 +164,7 @@ class Guard:
             [np.array(p.g) / n for p, n in zip(certificate.pieces, lengths, strict=True)]
         )
         self._starts = np.cumsum([0] + [len(n) for n in lengths[:-1]])
-        self._steps = [_InputRows(certificate, i, self.scale) for i in range(len(certificate.pieces))]
+        self._steps = [InputRows(certificate, i, self.scale) for i in range(len(certificate.pieces))]
 
     def margins(self, x: np.ndarray) -> np.ndarray:
         """Distance of x (d,) to the nearest facet of each piece, as a share of X's half-widths; (pieces,)."""
@@ -123,7 +175,20 @@ class Guard:
         margins = self.margins(x)
         best = float(margins.max())
         for index in np.flatnonzero(margins >= 0.0):
-            found = self._steps[index].bounds(x, self._reserves)
+            found = self._inside(self._steps[index], x)
             if found is not None:
                 return FirstInputs(*found, best, int(index))
-        return FirstInputs(None, None, min(best, -ROW_ROUNDING), -1)
+        lower, upper = self._outside(self._steps[int(np.argmax(margins))], x)
+        return FirstInputs(lower, upper, min(best, -ROW_ROUNDING), -1)
+
+    def _inside(self, rows: InputRows, x: np.ndarray) -> Bounds | None:
+        room = rows.room(x)
+        distance, _ = rows.farthest(room, self._most)
+        return None if distance < 0.0 else rows.within(room, self._share * distance)
+
+    def _outside(self, rows: InputRows, x: np.ndarray) -> Bounds | tuple[None, None]:
+        found = self._inside(rows, x)
+        if found is not None:
+            return found
+        _, least = rows.farthest(rows.room(x), self._most)
+        return least, least

@@ -11,6 +11,7 @@ conditioned. The constraints do not see the oracle: in v they are linear, with c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,6 +57,7 @@ def build_problem(
     W: np.ndarray | None = None,
     penalty: float = 1e4,
     certificate: Certificate | None = None,
+    guard_of: Callable[[Certificate], Guard] = Guard,
 ) -> Problem:
     """Lay out the constraints of the named tightening.
 
@@ -81,7 +83,7 @@ def build_problem(
             raise CertificateError(
                 f"these sets are an approximation ({certificate.kind}) that claims nothing"
             )
-        guard = Guard(certificate)
+        guard = guard_of(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
     n = horizon
     if tightening == "tube":

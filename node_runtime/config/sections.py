@@ -80,6 +80,9 @@ class ControllerConfig(Section, frozen=True):
     tightening: literals.TighteningName = "first_step"
     sets: str | None = None
     """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
+    guard: literals.GuardName = "half"
+    """Distance that "invariant" keeps from the sets' boundary: half of what some input keeps; "steps": 0.02, 0.005,
+    0.001 or none, and outside no bounds at all, as runs recorded before this key did."""
     W: list[NonNegative] | None = None
     """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
     Q: list[NonNegative] | None = None
@@ -92,6 +95,9 @@ class ControllerConfig(Section, frozen=True):
     """A tick is late when it starts later than this share of a period after its slot."""
     phase_ms: Annotated[float, msgspec.Meta(ge=0, le=3.6e6)] | None = None
     """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
+    input_delay_ms: NonNegative | None = None
+    """From a sample until the command that answers it acts, until the plant has shown it; None: in lock-step 0, live
+    the phase and what an answer usually takes."""
     checkpoint: str = ""
     """File from which the controller takes its memory when it is started again; "": none."""
     solver: SolverConfig = SolverConfig()
@@ -323,6 +329,13 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
             f"one of {', '.join(BOUNDED)}",
         )
     _check_architecture(config.network, fail)
+    delay = config.controller.input_delay_ms
+    if delay is not None and delay > 500.0 * config.period:
+        fail(
+            "controller.input_delay_ms",
+            f"controller.input_delay_ms = {delay:g} is more than half a period, {500.0 * config.period:g} ms at "
+            f"rate = {config.rate:g} Hz: so late a command cannot be predicted for",
+        )
     if config.trainer.min_samples > config.trainer.capacity:
         fail(
             "trainer.min_samples",
@@ -389,6 +402,10 @@ def from_json(text: str) -> Config:
         raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ConfigError("the log's configuration is not a table")
+    controller = tree.setdefault("controller", {})
+    if isinstance(controller, dict):
+        # Logs from before the key: replays must find what was in force.
+        controller.setdefault("guard", "steps")
     return _checked(tree, "the log's configuration")
 
 

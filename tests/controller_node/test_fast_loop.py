@@ -11,12 +11,12 @@ import pytest
 
 from benchmarks.live.wakeups import Wakeups, measure
 from controller_node.core import ControllerCore
-from controller_node.node import COUNTS, ControllerNode, Latched, phase
+from controller_node.node import COUNTS, ControllerNode, Latched, phase, with_input_delay
 from network_model.description import hash_layers
 from node_runtime.bus.inbox import Received
 from node_runtime.bus.mailbox import Mailbox
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.sections import Config, from_json, override, to_json
 from node_runtime.health import HealthPublisher
 from node_runtime.realtime.pacer import Slot
 from node_runtime.rejected import RejectedMessages
@@ -200,6 +200,22 @@ def test_a_slot_lies_a_millisecond_behind_its_sample_or_a_quarter_of_a_period(
     assignments: list[str], seconds: float
 ) -> None:
     assert phase(override(Config(), assignments)) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    ("assignments", "ms"),
+    [
+        (["rate=20"], 5.0),
+        (["rate=1000"], 0.35),
+        (["controller.phase_ms=24"], 25.0),
+        (["controller.input_delay_ms=7"], 7.0),
+    ],
+)
+def test_live_the_delay_begins_at_what_an_answer_usually_takes(assignments: list[str], ms: float) -> None:
+    settled = with_input_delay(override(Config(), assignments))
+    assert settled.controller.input_delay_ms == pytest.approx(ms)
+    # In the log, so that a replay begins with it.
+    assert from_json(to_json(settled)) == settled
 
 
 @pytest.mark.parametrize(("rate", "every"), [(1, 1), (20, 1), (50, 1), (51, 2), (100, 2), (1000, 20)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -35,3 +37,17 @@ PENDULUM = Plant(
 
 def pendulum(period: float = 0.1) -> Model:
     return build_model(PENDULUM, period)
+
+
+def two_inputs() -> Model:
+    both = replace(
+        PENDULUM,
+        name="two_inputs",
+        inputs=("left", "right"),
+        rhs=lambda x, u: [x[1] + 0.3 * u[1], 4.0 * ca.sin(x[0]) + u[0]],
+        u_e=np.zeros(2),
+        u_min=np.array([-3.0, -1.0]),
+        u_max=np.array([3.0, 1.0]),
+        safe_input=np.zeros(2),
+    )
+    return build_model(both, 0.1)

@@ -112,8 +112,13 @@ def test_the_period_in_which_the_plant_is_released_has_no_applied_input() -> Non
     sim = plant()
     sim.sample(0.0)
     sim.command(command(0, U, [U]), 0.3 * PERIOD)
-    assert sim.sample(PERIOD).applied is None
+    first = sim.sample(PERIOD)
+    assert first.applied is None
+    # But what acts now is known, so that the answer can be predicted ahead.
+    assert [piece.u for piece in first.pieces] == [[U]]
+    assert first.pieces[0].seconds == pytest.approx(0.7 * PERIOD)
     assert sim.sample(2 * PERIOD).applied == [U]
+    assert plant().sample(0.0).pieces == []
 
 
 def test_without_commands_the_plan_and_then_the_safe_input() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.sets.enclosures.expression_graph import UnsupportedOperation
-from lbmpc.sets.enclosures.flow import Flow
+from lbmpc.sets.enclosures.flow import Flow, name_of
 from lbmpc.sets.enclosures.interval import Interval, matrix_product, up
 
 
@@ -71,7 +71,10 @@ class Disturbance:
         try:
             self.flow = Flow.of_plant(model.plant, model.period)
         except UnsupportedOperation as error:
-            raise DisturbanceError(f"{model.plant.name}: {error}") from error
+            names = " and ".join(name_of(model.plant, leaf) for leaf in error.leaves)
+            raise DisturbanceError(
+                f"{model.plant.name}: {error}. It is taken of an expression in {names}"
+            ) from error
         self.e = Interval.of(np.concatenate([model.plant.x_e, model.plant.u_e]))
         self.AB = Interval.of(np.hstack([model.A, model.B]))
 
@@ -95,7 +98,4 @@ def nowhere(model: Model, lower: np.ndarray, upper: np.ndarray, reason: str) -> 
         f"{name} in [{low:.6g}, {high:.6g}]"
         for name, low, high in zip(names, lower + e, upper + e, strict=True)
     )
-    return (
-        f"{plant.name}: no bound of h for {where} over a period of {model.period:g} s: {reason}. Take a smaller "
-        "region of x and u, or a shorter period"
-    )
+    return f"{plant.name}: no bound of h for {where} over a period of {model.period:g} s: {reason}"

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lbmpc.sets.enclosures.affine_forms import Disturbance, DisturbanceError, Region, nowhere
+from lbmpc.sets.enclosures.flow import SMALLER
 from lbmpc.sets.enclosures.interval import Interval, matrix_product, up
 
 Progress = Callable[[float], None]
@@ -165,7 +166,10 @@ class BranchAndBound:
         points = self.disturbance.forms(c, c)
         for i, trouble in enumerate(points.trouble):
             if trouble or relative[i].max() <= FINEST:
-                reason = trouble or "the flow is enclosed from points, but from no box that is not tiny"
+                reason = (
+                    trouble
+                    or f"the flow is enclosed from points, but from no box that is not tiny. {SMALLER}"
+                )
                 raise DisturbanceError(nowhere(self.disturbance.model, lower[i], upper[i], reason))
 
 

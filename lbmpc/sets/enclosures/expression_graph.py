@@ -17,7 +17,15 @@ CONJUGATE = {"sin": "cos", "cos": "sin"}
 
 
 class UnsupportedOperation(ValueError):
-    """The plant's equations use an operation for which there are no rigorous series."""
+    """The plant's equations use an operation without rigorous series; `leaves`: what it is taken of."""
+
+    def __init__(self, operation: str, leaves: tuple[Node, ...]):
+        super().__init__(
+            f"the disturbance cannot be bounded rigorously: the plant's equations use `{operation}`, which is not "
+            "among + - * / sqrt exp log sin cos tanh and powers; write them with these, or give W yourself "
+            "(--kind given)"
+        )
+        self.operation, self.leaves = operation, leaves
 
 
 @dataclass(frozen=True)
@@ -28,6 +36,19 @@ class Node:
     operands: tuple[int, ...] = ()
     number: float = 0.0
     index: int = -1
+
+
+def leaves(nodes: Sequence[Node], operands: Sequence[int]) -> tuple[Node, ...]:
+    """The states and inputs that some of the nodes depend on, states first."""
+    found, seen, pending = set(), set(), list(operands)
+    while pending:
+        i = pending.pop()
+        if i not in seen:
+            seen.add(i)
+            pending.extend(nodes[i].operands)
+            if nodes[i].operation in ("state", "input"):
+                found.add(nodes[i])
+    return tuple(sorted(found, key=lambda node: (node.operation == "input", node.index)))
 
 
 class Graph:
@@ -133,10 +154,7 @@ class Graph:
                 return self.function(name, a)
             case "pow" | "constpow":
                 return self._general_power(a, b)
-        raise UnsupportedOperation(
-            f"the disturbance cannot be bounded rigorously: the plant's equations use `{name}`, which is not among "
-            "+ - * / sqrt exp log sin cos tanh and powers; write them with these, or give W yourself"
-        )
+        raise UnsupportedOperation(name, self.leaves(operands))
 
     def _general_power(self, a: int, b: int) -> int:
         exponent = self.nodes[b]
@@ -146,6 +164,10 @@ class Graph:
         if exponent.operation == "constant" and exponent.number == 0.5:
             return self.function("sqrt", a)
         return self.function("exp", self.times(b, self.function("log", a)))
+
+    def leaves(self, operands: Sequence[int]) -> tuple[Node, ...]:
+        """The states and inputs that these nodes depend on, states first."""
+        return leaves(self.nodes, operands)
 
     def derivative(self, output: int, seed: int) -> int | None:
         """Node of d(output)/d(seed); None where it is zero by structure."""

@@ -12,13 +12,14 @@ with dPhi/dp from the variational equation S' = f_x S + [0, f_u], so that a box 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.plants.base import Plant
-from lbmpc.sets.enclosures.expression_graph import Graph
+from lbmpc.sets.enclosures.expression_graph import Graph, Node
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product
 from lbmpc.sets.enclosures.series import Tape
 
@@ -29,6 +30,19 @@ ATTEMPTS = 4
 DOUBLINGS = 3
 # A remainder wider than this, of the state's size and of the box's image, is worth a smaller step.
 ROUGH, ROUGH_OF_BOX = 1e-11, 1e-6
+
+
+SMALLER = "Take a smaller region of x and u, or a shorter period"
+DOMAINS = {
+    "sqrt": "its argument must stay above 0",
+    "log": "its argument must stay above 0",
+    "a division": "its divisor must not come to 0",
+}
+
+
+def name_of(plant: Plant, leaf: Node) -> str:
+    """What the plant calls a state or an input of its equations."""
+    return (plant.states if leaf.operation == "state" else plant.inputs)[leaf.index]
 
 
 class NoEnclosure(ArithmeticError):
@@ -60,9 +74,18 @@ class FlowEnclosure:
 class Flow:
     """Phi_T(x, u) of dx/dt = f(x, u) with u constant over the period T (seconds)."""
 
-    def __init__(self, function: ca.Function, period: float, steps: int = 1, orders: int = ORDERS):
+    def __init__(
+        self,
+        function: ca.Function,
+        period: float,
+        steps: int = 1,
+        orders: int = ORDERS,
+        name_of: Callable[[Node], str] = lambda node: f"{node.operation} {node.index}",
+    ):
+        """`name_of`: what a state or an input is called, for messages."""
         self.d, self.m = function.numel_in(0), function.numel_in(1)
         self.period, self.steps, self.orders = period, steps, orders
+        self._name_of = name_of
         graph = Graph()
         outputs = graph.read(function)
         self._plain = Tape(graph, outputs)
@@ -78,7 +101,9 @@ class Flow:
             np.array(ca.Function("slope", [x, u], [ca.jacobian(f(x, u), x)])(plant.x_e, plant.u_e))
         )
         norm = float(np.abs(np.linalg.eigvals(slope)).max())
-        return cls(f, period, max(1, math.ceil(norm * period / STEP_NORM)))
+        return cls(
+            f, period, max(1, math.ceil(norm * period / STEP_NORM)), name_of=lambda node: name_of(plant, node)
+        )
 
     @property
     def q(self) -> int:
@@ -137,7 +162,7 @@ class Flow:
                     )
                 except (DomainError, NoEnclosure) as error:
                     for i in waiting[error.where & ~proved[waiting]]:
-                        trouble[i] = str(error)
+                        trouble[i] = self._trouble(error)
                     left.extend(waiting[error.where])
                     waiting = waiting[~error.where]
                     continue
@@ -150,6 +175,17 @@ class Flow:
                 break
             waiting = np.array(sorted(left), dtype=int)
         return FlowEnclosure(end, centre, slope, tuple(trouble))
+
+    def _trouble(self, error: DomainError | NoEnclosure) -> str:
+        """What failed, of what, and what to do."""
+        if isinstance(error, NoEnclosure):
+            return f"{error}. {SMALLER}"
+        names = " and ".join(self._name_of(leaf) for leaf in error.leaves)
+        return (
+            f"{error.operation} of an expression in {names or 'constants'} reaches where it is not defined and "
+            f"smooth ({DOMAINS[error.operation]}). Give {names or 'the plant'} bounds that keep away "
+            "from there during the whole period, a smaller region so, or give W yourself (--kind given)"
+        )
 
     def _integrate(
         self, x: Interval, u: Interval, xc: Interval, uc: Interval, radii: np.ndarray, steps: int

@@ -19,12 +19,16 @@ LARGEST_ANGLE = 1e5
 
 
 class DomainError(ArithmeticError):
-    """An operand reaches where the operation is not defined; `where` is a mask over the batch."""
+    """An operand reaches where the operation is not defined; `where` is a mask over the batch.
 
-    def __init__(self, operation: str, where: np.ndarray):
+    `leaves` are the states and inputs that the operand depends on, as nodes of the graph, where they are known.
+    """
+
+    def __init__(self, operation: str, where: np.ndarray, leaves: tuple[Any, ...] = ()):
         super().__init__(f"the argument of {operation} leaves the domain where it is defined and smooth")
         self.operation = operation
         self.where = where
+        self.leaves = leaves
 
 
 def down(value: Any) -> np.ndarray:

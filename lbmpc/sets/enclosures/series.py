@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lbmpc.sets.enclosures.expression_graph import CONJUGATE, Graph, Node
-from lbmpc.sets.enclosures.interval import Interval
+from lbmpc.sets.enclosures.expression_graph import CONJUGATE, Graph, Node, leaves
+from lbmpc.sets.enclosures.interval import DomainError, Interval
 
 # A sum of up to 40 products of floats, in any order, is off by less than 41 * 2^-53 = 4.6e-15 of the sum of their
 # magnitudes (Higham, Accuracy and Stability, 3.1); DOT is twice that, for the arithmetic on the bound itself. TINY is
@@ -120,7 +120,13 @@ class Coefficients:
 
     def _start(self, x: Sequence[Interval], u: Sequence[Interval]) -> None:
         for i in self.tape.needed:
-            self._first[i] = self._zeroth(self.tape.nodes[i], x, u)
+            node = self.tape.nodes[i]
+            try:
+                self._first[i] = self._zeroth(node, x, u)
+            except DomainError as error:
+                raise DomainError(
+                    error.operation, error.where, leaves(self.tape.nodes, node.operands[-1:])
+                ) from error
             self._store_interval(i, self._first[i])
         for i, value in enumerate(x):
             self._store_interval(self._state[i], value)

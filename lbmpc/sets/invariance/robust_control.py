@@ -20,6 +20,7 @@ import numpy as np
 from lbmpc.sets.geometry.operations import Body, ConvexSet, body, eliminate
 from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
 
+WIDE = 1e3
 LEFT_TO_CHECKER = 0.05
 """How much of the slack an invariant stage leaves, for the rounding of whoever checks it."""
 COPY_SHARES = tuple(np.arange(0.95, 0.0, -0.05).tolist())
@@ -54,17 +55,26 @@ class Stage:
 def predecessor(
     target: Body, plant: UncertainSystem, slack: float = 0.0, scale: np.ndarray | float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (G, g) of Pre(target), redundant ones among them; W is widened by slack times the ball of `scale`, (d,)."""
+    """Rows (G, g) of Pre(target), redundant ones among them; W is widened by slack times the ball of `scale`, (d,).
+
+    With several inputs those of a box that is `WIDE` times the target are among them.
+    """
     d = target.dimension
     reach = plant.W.support(target.G) + slack * np.linalg.norm(target.G * scale, axis=1)
     G_u, g_u = plant.U.one_sided()
-    rows = np.vstack(
-        [
-            np.column_stack([target.G @ plant.A, target.G @ plant.B]),
-            np.column_stack([np.zeros((len(G_u), d)), G_u]),
-        ]
-    )
-    return eliminate(rows, np.concatenate([target.g - reach, g_u]), plant.B.shape[1])
+    parts = [
+        np.column_stack([target.G @ plant.A, target.G @ plant.B]),
+        np.column_stack([np.zeros((len(G_u), d)), G_u]),
+    ]
+    bounds = [target.g - reach, g_u]
+    m = plant.B.shape[1]
+    if m > 1:
+        # What is forgotten within a period is bounded by no row of the target; between two inputs bounds are needed.
+        box = Polytope.box(target.centre - WIDE * target.scale, target.centre + WIDE * target.scale, ())
+        G_box, g_box = box.one_sided()
+        parts.append(np.column_stack([G_box, np.zeros((2 * d, m))]))
+        bounds.append(g_box)
+    return eliminate(np.vstack(parts), np.concatenate(bounds), m)
 
 
 def predecessor_iteration(
@@ -119,7 +129,8 @@ def _smaller_copy(
     for share in COPY_SHARES:
         try:
             copy = body(current.G, share * current.g, "a smaller copy", scale)
-            before = body(*predecessor(copy, plant, eps, scale), "its predecessor", scale)
+            G, g = predecessor(copy, plant, eps, scale)
+            before = body(np.vstack([copy.G, G]), np.concatenate([copy.g, g]), "what stays in it", scale)
         except EmptySetError:
             continue
         if before.includes(copy, 0.0):

@@ -237,3 +237,26 @@ def test_in_lock_step_there_is_no_delay() -> None:
     for i in range(4):
         state, result = CONTROLLER.step(state, seen(X, i))
         assert result.delay == 0.0
+
+
+@pytest.mark.parametrize("delay", [0.002, 0.01, 0.025])
+def test_a_delay_that_is_configured_is_predicted_over_from_the_first_tick_on(delay: float) -> None:
+    """The first period is not a whole one: the plant was held until the first command, and says what acts since."""
+    controller = Controller(PROBLEM, Solver(PROBLEM), input_delay=delay)
+    state = controller.initial_state(0)
+    state = ControllerState.from_arrays(state.to_arrays() | {"oracle.K": np.zeros_like(state.oracle["K"])})
+    state, first = controller.step(state, seen(X, 0, None))
+    assert first.delay == pytest.approx(delay)
+    x = MODEL.ahead(X, first.plan[0], 0.05 - delay)
+    part = Observation(x, None, 1, 1, None, ((0.05 - delay, first.plan[0]),))
+    state, second = controller.step(state, part)
+    assert second.delay == pytest.approx(delay)
+    assert second.label is None
+    where = MODEL.ahead(x, first.plan[0], delay)
+    after = MODEL.step(where, second.plan[0])
+    assert state.predicted[:4] == pytest.approx(after, abs=1e-9)
+
+
+def test_the_delay_begins_at_no_more_than_half_a_period() -> None:
+    assert Controller(PROBLEM, Solver(PROBLEM), input_delay=0.2).initial_state(0).delay == 0.025
+    assert CONTROLLER.initial_state(0).delay == 0.0

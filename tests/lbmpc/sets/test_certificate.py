@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-import casadi as ca
 import msgspec
 import numpy as np
 import pytest
 
 from lbmpc.controller.signals import Observation
 from lbmpc.controller.step import Controller
-from lbmpc.model import Model, build_model
+from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.sets import check as checker
@@ -28,7 +27,7 @@ from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.problem import build_problem
 from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution, Status
-from tests.helpers.pendulum import PENDULUM, pendulum
+from tests.helpers.pendulum import pendulum, two_inputs
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
@@ -63,7 +62,7 @@ def test_the_claim_holds_and_more_is_known_with_more_knowledge_of_h(family: Cert
     fractions = [volume_fraction(c) for c in (box, hull, family)]
     # For this plant the hull of h is nearly its box.
     assert fractions[0] * (1 - 1e-5) <= fractions[1] < fractions[2]
-    assert not Guard(hull).first_inputs(START).lower
+    assert Guard(hull).first_inputs(START).piece == -1
     assert Guard(family).first_inputs(START).piece > 0
 
 
@@ -250,20 +249,6 @@ def test_without_sets_there_is_no_invariant_tightening() -> None:
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant")
 
 
-def two_inputs() -> Model:
-    both = replace(
-        PENDULUM,
-        name="two_inputs",
-        inputs=("left", "right"),
-        rhs=lambda x, u: [x[1] + 0.3 * u[1], 4.0 * ca.sin(x[0]) + u[0]],
-        u_e=np.zeros(2),
-        u_min=np.array([-3.0, -1.0]),
-        u_max=np.array([3.0, 1.0]),
-        safe_input=np.zeros(2),
-    )
-    return build_model(both, 0.1)
-
-
 def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
     model = two_inputs()
     certificate = construct(model, "box", np.zeros(2))
@@ -279,7 +264,7 @@ def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
 
 
 def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
-    guard, rng = Guard(family, ()), np.random.default_rng(6)
+    guard, rng = Guard(family, share=0.0), np.random.default_rng(6)
     bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
     tight = 0
     for index, piece in enumerate(family.pieces):
@@ -303,7 +288,7 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
 
 
 def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
-    plain, wary, rng = Guard(family, ()), Guard(family, (0.05,)), np.random.default_rng(9)
+    plain, wary, rng = Guard(family, share=0.0), Guard(family), np.random.default_rng(9)
     base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
     tighter = 0
     for x in np.vstack([points_in(base, 60, rng), 0.97 * base.vertices]):
@@ -391,3 +376,34 @@ def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:
     verdict = check(loose)
     assert not verdict.ok
     assert "bounds nothing" in verdict.reason
+
+
+def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two opposite corners of a box, each of them twice: every edge is there twice, every row is touched.
+
+    The claim is false at the other two corners only.
+    """
+    certificate = construct(MODEL, "box", START)
+    box = {"G": [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], "g": [0.2, 0.2, 0.3, 0.3]}
+    false = changed(certificate, 0, **box)
+    assert "no input found" in check(false).reason
+    corners = np.array([[0, 3], [1, 2]])
+    for forged in (np.vstack([corners, corners]), np.vstack([corners, corners[:, ::-1]])):
+        monkeypatch.setattr(checker, "_bases", lambda *_a, forged=forged: forged)
+        assert "listed twice" in check(false).reason
+    # The same rows under other names: counted from the end.
+    monkeypatch.setattr(checker, "_bases", lambda *_a: np.vstack([corners, corners - 4]))
+    assert "is not given by 2 of its 4 rows" in check(false).reason
+    monkeypatch.setattr(checker, "_bases", lambda *_a: np.array([[0], [1], [2], [3]]))
+    assert "is not given by 2 of its 4 rows" in check(false).reason
+
+
+def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
+    """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
+    fast = replace(
+        two_inputs().plant,
+        name="fast",
+        rhs=lambda x, u: [-1000.0 * x[0] + u[0], x[1] + u[1]],
+    )
+    certificate = construct(build_model(fast, 0.1), "given", np.zeros(2), W=np.array([0.01, 0.01]))
+    assert check(certificate).ok

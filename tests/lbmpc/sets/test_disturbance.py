@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import casadi as ca
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from lbmpc.model import Model, build_model
-from lbmpc.plants.base import Plant, Truth
+from lbmpc.plants.base import Plant, Rhs, Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from lbmpc.sets.enclosures.disturbance import (
     DisturbanceBound,
@@ -23,6 +24,7 @@ from lbmpc.sets.enclosures.disturbance import (
 )
 from lbmpc.sets.enclosures.flow import Flow, FlowEnclosure
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product, up
+from tests.helpers.pendulum import PENDULUM
 
 SAMPLES = 2000
 # What the integrator of the truth may be off by, per unit of the state's size.
@@ -312,7 +314,10 @@ def test_box_holds_all_samples_and_is_tight(case):
 
 def test_hull_holds_all_samples_and_lies_in_the_box(case):
     model, p, h = case
-    box, hull = bound_box(model, whole(model)), bound_hull(model, whole(model))
+    box, hull = (
+        bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0])))),
+        bound_hull(model, whole(model)),
+    )
     assert excess(hull, p, h) <= 0.0
     axes = np.vstack([np.eye(model.d), -np.eye(model.d)])
     width = box.support(axes) + box.support(-axes)
@@ -365,7 +370,7 @@ def test_stopped_early_the_bound_is_wider_and_still_holds():
     h = disturbance(model, p)
     early = bound_box(model, whole(model), budget=1)
     assert excess(early, p, h) <= 0.0
-    full = bound_box(model, whole(model))
+    full = bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))
     assert (np.ptp(early.vertices, axis=0)[:2] > 1.05 * np.ptp(full.vertices, axis=0)[:2]).all()
 
 
@@ -396,7 +401,7 @@ def test_an_operation_without_series_is_named():
     plant = a_plant(lambda x, u: [x[1], ca.fabs(x[0]) - x[0] - x[1] + u[0]], "kink", x_e=(0.5, 0.0))
     model = build_model(plant, 0.1)
     with pytest.raises(DisturbanceError, match=r"kink.*fabs"):
-        bound_box(model, whole(model))
+        bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))
 
 
 def test_a_region_that_is_none_is_named():
@@ -406,3 +411,27 @@ def test_a_region_that_is_none_is_named():
         bound_box(model, Region(np.array([-1.0, 1.0]), np.array([1.0, -1.0]), r.u_lower, r.u_upper))
     with pytest.raises(DisturbanceError, match="2 states and 1 inputs"):
         bound_box(model, Region(r.x_lower[:1], r.x_upper[:1], r.u_lower, r.u_upper))
+
+
+@pytest.mark.parametrize(
+    ("rhs", "says"),
+    [
+        (
+            lambda x, u: [x[1], u[0] - ca.sqrt(x[0] + 0.5) + ca.sqrt(0.5)],
+            r"sqrt of an expression in angle .*above 0.*--kind given",
+        ),
+        (
+            lambda x, u: [x[1], ca.log(1.0 + x[1] + u[0])],
+            r"log of an expression in rate and torque .*above 0",
+        ),
+        (
+            lambda x, u: [x[1], u[0] / (1.0 + x[0])],
+            r"a division of an expression in angle .*must not come to 0",
+        ),
+        (lambda x, u: [x[1], u[0] - x[1] * ca.fabs(x[1])], r"`fabs`.*--kind given.*in rate"),
+    ],
+)
+def test_what_has_no_bound_is_named_with_its_state_and_a_remedy(rhs: Rhs, says: str) -> None:
+    model = build_model(replace(PENDULUM, rhs=rhs), 0.1)
+    with pytest.raises(DisturbanceError, match=says):
+        bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tomllib
@@ -259,3 +260,21 @@ def test_a_log_is_held_to_the_same_limits() -> None:
         ConfigError, match=r"the log's configuration: controller\.horizon = 2000000000 is not"
     ):
         from_json('{"controller": {"horizon": 2000000000}}')
+
+
+def test_a_log_from_before_a_key_says_what_was_in_force_then():
+    tree = to_tree(Config())
+    del tree["controller"]["guard"], tree["controller"]["input_delay_ms"]
+    old = from_json(json.dumps(tree))
+    assert old.controller.guard == "steps"
+    assert old.controller.input_delay_ms is None
+    assert Config().controller.guard == "half"
+    assert from_json(to_json(Config())) == Config()
+
+
+def test_a_delay_of_more_than_half_a_period_is_refused():
+    assert override(Config(), ["controller.input_delay_ms=25"]).controller.input_delay_ms == 25
+    with pytest.raises(
+        ConfigError, match=r"input_delay_ms = 5 is more than half a period, 0\.5 ms at rate = 1000 Hz"
+    ):
+        override(Config(), ["controller.input_delay_ms=5", "rate=1000"])

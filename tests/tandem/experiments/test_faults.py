@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from controller_node.build import build_oracle
+from controller_node.core import ControllerCore
 from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle, PerfectOracle
 from lbmpc.oracles.dnn.adaptation_law import refit
@@ -170,3 +171,22 @@ def test_lemma_1_holds_on_a_real_run() -> None:
     np.testing.assert_allclose(found.error, logged, rtol=1e-9, atol=1e-18)
     assert (found.accumulated <= found.bound).all()
     assert (found.bound <= found.bound_beforehand).all()
+
+
+@pytest.mark.parametrize("ms", [2.0, 10.0])
+def test_a_known_delay_is_predicted_over_from_the_first_tick_that_follows_one(ms: float) -> None:
+    settings = ["controller.oracle=linear", "trainer.enabled=false", f"controller.input_delay_ms={ms}"]
+    run = follow(config(*settings), 4, Faults(command_seconds=1e-3 * ms)).run
+    assert run.ticks[1].state is not None
+    assert run.ticks[1].state.applied is None
+    # At the second tick the plant moves under the first command until the second one acts.
+    u = np.array(run.ticks[1].state.pieces[-1].u)
+    core = ControllerCore(config(*settings), "controller")
+    model, u_e = core.controller.model, core.plant.u_e
+    for tick in run.ticks[:2]:
+        command = core.step(tick).command
+    start = model.ahead(np.array(run.ticks[1].state.x) - core.plant.x_e, u - u_e, 1e-3 * ms)
+    expected = model.step(start, np.array(command.u) - u_e)
+    assert core.memory.state.predicted == pytest.approx(expected, abs=1e-9)
+    assert [result.input_delay for result in run.results] == pytest.approx([1e-3 * ms] * 4)
+    assert replay(run).equal
