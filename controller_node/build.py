@@ -18,13 +18,13 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.trial import Trial
 from lbmpc.plants import Plant, get_plant
+from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.stepped_guard import SteppedGuard
+from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import Problem, build_problem
-from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture

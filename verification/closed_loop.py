@@ -21,11 +21,11 @@ from lbmpc.controller.step import Controller
 from lbmpc.model import Model, Pieces
 from lbmpc.oracles import LinearOracle, Oracle, PerfectOracle
 from lbmpc.plants.base import dop853
+from lbmpc.problem import build_problem
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.approach import STEP_NORM
-from lbmpc.solver.problem import build_problem
-from lbmpc.solver.rows import Box
+from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution, Status
 
 Inputs = Literal["random", "bang-bang"]

@@ -11,8 +11,8 @@ from controller_node.build import Realise, build_controller, build_model, build_
 from lbmpc.controller.step import Observation
 from lbmpc.model import Model
 from lbmpc.plants import Truth
+from lbmpc.problem import Problem, build_problem
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import Problem, build_problem
 from lbmpc.solver.solution import Solution, Status
 from node_runtime.config.literals import OracleName
 from node_runtime.config.sections import Config, load

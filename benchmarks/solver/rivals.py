@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.solver.problem import Problem
-from lbmpc.solver.rows import Rows
+from lbmpc.problem import Problem
+from lbmpc.solver.constraint_rows import Rows
 
 IPOPT = {
     "ipopt.print_level": 0,

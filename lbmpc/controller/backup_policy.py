@@ -34,11 +34,11 @@ from scipy.linalg import solve_discrete_are
 from lbmpc.casadi_buffers import Bound
 from lbmpc.model import Model
 from lbmpc.oracles.base import remembered
+from lbmpc.problem import Problem
 from lbmpc.sets.constraint_sets import state_set
+from lbmpc.solver.constraint_rows import Rows
 from lbmpc.solver.least_distance import NO_ROWS
-from lbmpc.solver.problem import Problem
 from lbmpc.solver.riccati import build_rows, build_sweep
-from lbmpc.solver.rows import Rows
 from lbmpc.solver.subproblem import Subproblem
 
 STEPS = 2

@@ -18,9 +18,9 @@ from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
+from lbmpc.problem import Problem
 from lbmpc.sets.guard import FirstInputs
-from lbmpc.solver.problem import Problem
-from lbmpc.solver.rows import Box
+from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
 
 DELAY_GAIN = 0.2

@@ -17,11 +17,11 @@ import numpy as np
 from lbmpc.casadi_buffers import Bound
 from lbmpc.oracles.base import Oracle, remembered
 from lbmpc.oracles.linear import LinearOracle
+from lbmpc.problem import Problem
+from lbmpc.solver.constraint_rows import Box, Rows
 from lbmpc.solver.least_distance import NO_ROWS, Shown
 from lbmpc.solver.nominal_rollout import build_nominal
-from lbmpc.solver.problem import Problem
 from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
-from lbmpc.solver.rows import Box, Rows
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 

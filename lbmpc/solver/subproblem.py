@@ -8,7 +8,7 @@ from math import isfinite
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.solver.rows import Rows
+from lbmpc.solver.constraint_rows import Rows
 
 
 @dataclass(frozen=True, eq=False)

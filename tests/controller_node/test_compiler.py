@@ -16,8 +16,8 @@ import pytest
 
 from controller_node.codegen.compiler import Compiler, is_sealed
 from lbmpc.casadi_buffers import Bound
+from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
 from tests.helpers.paths import ROOT
 from tests.helpers.science import compressor, function, oracle_named, trained_theta
 

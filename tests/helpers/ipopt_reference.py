@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.oracles.base import follow_symbols, remembered
+from lbmpc.problem import Problem
+from lbmpc.solver.constraint_rows import Rows
 from lbmpc.solver.least_distance import violation
-from lbmpc.solver.problem import Problem
-from lbmpc.solver.rows import Rows
 from lbmpc.solver.solution import Solution, Status
 
 

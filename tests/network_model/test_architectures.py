@@ -19,8 +19,8 @@ from lbmpc.controller.step import Controller
 from lbmpc.oracles import DnnOracle, HiddenSet, Verdict
 from lbmpc.oracles.base import follow
 from lbmpc.plants import Truth
+from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
 from lbmpc.solver.solution import Status
 from network_model import architectures, registry
 from network_model.description import NetworkDescription, hash_layers

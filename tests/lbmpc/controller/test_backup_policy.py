@@ -14,10 +14,10 @@ from lbmpc.controller.backup_policy import RAMP, STEPS, BackupPlanner, Policy
 from lbmpc.model import Model, build_model
 from lbmpc.oracles import DnnOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.plants import Truth
+from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.least_distance import Nearest, least_distance
-from lbmpc.solver.problem import Problem, build_problem
 from node_runtime.config.sections import Config, override
 from protocol import codec, topics
 from protocol import messages as m
@@ -115,7 +115,7 @@ def test_a_margin_that_costs_nothing_is_kept(
         solved.append(arguments)
         return least_distance(*arguments)
 
-    monkeypatch.setattr("lbmpc.solver.rows.least_distance", counted)
+    monkeypatch.setattr("lbmpc.solver.constraint_rows.least_distance", counted)
     theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
     policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
     assert policy is not None

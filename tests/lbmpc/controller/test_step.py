@@ -13,9 +13,9 @@ from lbmpc.controller.step import Controller
 from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import HiddenSet, Verdict
+from lbmpc.problem import build_problem
+from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
-from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution, Status
 from network_model.description import hash_layers
 from tests.helpers.science import compressor, describe, features

@@ -14,8 +14,8 @@ from lbmpc.controller.signals import Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.controller.step import Controller
 from lbmpc.oracles import DnnOracle
+from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
 from node_runtime.config.sections import TrainerConfig
 from protocol import codec, topics
 from protocol import messages as m

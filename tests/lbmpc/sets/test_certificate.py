@@ -14,6 +14,7 @@ from lbmpc.controller.step import Controller
 from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
+from lbmpc.problem import build_problem
 from lbmpc.sets import check as checker
 from lbmpc.sets.certificate import Certificate, CertificateError, Piece, decode, encode, require_match
 from lbmpc.sets.check import check
@@ -23,9 +24,8 @@ from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.geometry.polytope import EmptySetError, SetError
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.approach import one_period
+from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
-from lbmpc.solver.rows import Box
 from lbmpc.solver.solution import Solution, Status
 from tests.helpers.pendulum import pendulum, two_inputs
 from tests.helpers.science import oracle_named

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lbmpc.oracles import LinearOracle
+from lbmpc.problem import build_problem, disturbance_set, input_set, state_set
 from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
 from lbmpc.sets.invariance.terminal import terminal_set
 from lbmpc.sets.invariance.tube import tube_margins
-from lbmpc.solver.problem import build_problem, disturbance_set, input_set, state_set
 from tests.helpers.science import compressor
 
 MODEL = compressor()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from lbmpc.oracles import DnnOracle, LinearOracle
 from lbmpc.plants import Truth
+from lbmpc.problem import build_problem, input_set
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem, input_set
 from lbmpc.solver.solution import Status
 from tests.helpers.ipopt_reference import ReferenceSolver
 from tests.helpers.paths import ROOT
@@ -174,7 +174,7 @@ SCRIPT = """
 import sys; sys.path.insert(0, {root!r})
 from tests.lbmpc.solver.test_gauss_newton import X0, MODEL, SMALL
 from tests.helpers.science import oracle_named, trained_theta
-from lbmpc.solver.problem import build_problem
+from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
 import numpy as np, hashlib
 oracle = oracle_named("dnn", MODEL)

@@ -9,8 +9,8 @@ import pytest
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.oracles import DnnOracle
 from lbmpc.plants import Plant, Truth
+from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.problem import build_problem
 from lbmpc.solver.solution import Status
 from network_model.description import NetworkDescription
 from tests.helpers.ipopt_reference import ReferenceSolver

@@ -11,7 +11,7 @@ import pytest
 from controller_node.build import build_backup, build_controller, build_model
 from lbmpc.controller.signals import Observation
 from lbmpc.plants import PLANTS, Plant
-from lbmpc.solver.rows import Rows
+from lbmpc.solver.constraint_rows import Rows
 from node_runtime.config.sections import Config, override
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay

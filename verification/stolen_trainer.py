@@ -1,4 +1,4 @@
-"""What the trial of hidden weights lets through: `python -m verification.hidden_weights` prints decision 0020's table.
+"""What the trial of hidden weights lets through: `python -m verification.stolen_trainer` prints decision 0020's table.
 
 Lock-step runs of the paper's start: undisturbed, with measurement noise, and under a stolen trainer that sends a set at
 every tick, at every seventh, or in place of each set that the real one trained; each with the trial and without it.

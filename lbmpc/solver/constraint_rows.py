@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lbmpc.problem import Problem
 from lbmpc.solver.least_distance import NO_ROWS, Nearest, Penalty, Shown, least_distance, violation
-from lbmpc.solver.problem import Problem
 
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds, (m,) each."""
