@@ -95,7 +95,7 @@ class ControllerConfig(Section, frozen=True):
     """A tick is late when it starts later than this share of a period after its slot."""
     phase_ms: Annotated[float, msgspec.Meta(ge=0, le=3.6e6)] | None = None
     """How long after a plant sample is due the controller's slot lies; None: 1 ms, at most a quarter of a period."""
-    input_delay_ms: NonNegative | None = None
+    input_delay_ms: Annotated[float, msgspec.Meta(ge=0, le=500.0 * LONGEST_PERIOD)] | None = None
     """From a sample until the command that answers it acts, until the plant has shown it; None: in lock-step 0, live
     the phase and what an answer usually takes."""
     checkpoint: str = ""

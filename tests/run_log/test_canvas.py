@@ -75,7 +75,7 @@ def test_whatever_fails_in_drawing_is_one_line_about_that_picture(tmp_path: Path
 
 
 def test_a_format_or_a_folder_that_cannot_be_is_said(tmp_path: Path) -> None:
-    with pytest.raises(PictureError, match=r"x\.zzz: cannot be drawn: Format 'zzz' is not supported"):
+    with pytest.raises(PictureError, match=r"x\.zzz: no picture has that ending; name it \.png"):
         save(Figure, tmp_path / "x.zzz")
     (tmp_path / "file").write_text("")
     with pytest.raises(PictureError, match="cannot be written"):

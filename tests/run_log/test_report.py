@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -204,8 +205,8 @@ def test_a_picture_replaces_files_alone(whole: Path, tmp_path: Path, make: Calla
     (tmp_path / "elsewhere").write_text("somebody else's")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
-    with pytest.raises(LogError, match=r"run\.png: cannot be written: it is a (pipe|link|folder)"):
-        report(whole, tmp_path)
+    (why,) = report(whole, tmp_path).failed
+    assert re.search(r"run\.png: cannot be written: it is a (pipe|link|folder)", str(why))
     assert (tmp_path / "run.png").lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_text() == "somebody else's"
 

@@ -314,10 +314,7 @@ def test_box_holds_all_samples_and_is_tight(case):
 
 def test_hull_holds_all_samples_and_lies_in_the_box(case):
     model, p, h = case
-    box, hull = (
-        bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0])))),
-        bound_hull(model, whole(model)),
-    )
+    box, hull = bound_box(model, whole(model)), bound_hull(model, whole(model))
     assert excess(hull, p, h) <= 0.0
     axes = np.vstack([np.eye(model.d), -np.eye(model.d)])
     width = box.support(axes) + box.support(-axes)
@@ -370,7 +367,7 @@ def test_stopped_early_the_bound_is_wider_and_still_holds():
     h = disturbance(model, p)
     early = bound_box(model, whole(model), budget=1)
     assert excess(early, p, h) <= 0.0
-    full = bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))
+    full = bound_box(model, whole(model))
     assert (np.ptp(early.vertices, axis=0)[:2] > 1.05 * np.ptp(full.vertices, axis=0)[:2]).all()
 
 
@@ -401,7 +398,7 @@ def test_an_operation_without_series_is_named():
     plant = a_plant(lambda x, u: [x[1], ca.fabs(x[0]) - x[0] - x[1] + u[0]], "kink", x_e=(0.5, 0.0))
     model = build_model(plant, 0.1)
     with pytest.raises(DisturbanceError, match=r"kink.*fabs"):
-        bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))
+        bound_box(model, whole(model))
 
 
 def test_a_region_that_is_none_is_named():

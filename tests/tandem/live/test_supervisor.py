@@ -341,7 +341,7 @@ def test_a_log_whose_name_is_no_text_is_written_and_drawn(tmp_path: Path):
         code, result = run.ends()
     assert code == 0, run.said
     assert result["ticks"] > 0
-    assert result["log"].endswith("caf\\udce9.mcap")
+    assert os.fsencode(result["log"]).endswith(b"caf\xe9.mcap")
     log = tmp_path / name
     assert log.with_suffix(".png").is_file()
     assert read_run(log).config.log.path.endswith("caf\\udce9.mcap")
