@@ -19,7 +19,7 @@ from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
@@ -371,7 +371,9 @@ def with_input_delay(config: Config) -> Config:
     if config.controller.input_delay_ms is not None:
         return config
     usual = phase(config) + min(USUAL_ANSWER, USUAL_ANSWER_SHARE * config.period)
-    return override(config, [f"controller.input_delay_ms={min(usual, 0.5 * config.period) * 1e3!r}"])
+    delay_ms = min(usual, 0.5 * config.period) * 1e3
+    settled = msgspec.structs.replace(config.controller, input_delay_ms=delay_ms)
+    return msgspec.structs.replace(config, controller=settled)
 
 
 def phase(config: Config) -> float:

@@ -315,10 +315,6 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
     infinite = first_non_finite(config)
     if infinite is not None:
         fail(infinite, f"{infinite} is not a finite number")
-    try:
-        to_json(config)
-    except UnicodeEncodeError as error:  # only the command line can name a file so
-        fail("", f"{error.object}: is not UTF-8, as what a log holds must be; choose another name")
     if config.period > LONGEST_PERIOD:
         fail("rate", f"rate = {config.rate}: a period of {config.period:g} s; at most {LONGEST_PERIOD:g} s")
     activation = config.network.activation

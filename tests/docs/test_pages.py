@@ -9,22 +9,9 @@ from pathlib import Path
 import pytest
 
 from tandem.cli import main
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import INSTALLED, ROOT
 
-PACKAGES = (
-    "network_model",
-    "lbmpc",
-    "protocol",
-    "node_runtime",
-    "controller_node",
-    "trainer_node",
-    "plant_sim",
-    "run_log",
-    "tandem",
-    "benchmarks",
-    "verification",
-    "tests",
-)
+PACKAGES = (*INSTALLED, "benchmarks", "verification", "tests")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)

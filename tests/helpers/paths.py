@@ -4,6 +4,18 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS, DOCS = ROOT / "configs", ROOT / "docs"
+INSTALLED = (
+    "network_model",
+    "lbmpc",
+    "protocol",
+    "node_runtime",
+    "controller_node",
+    "trainer_node",
+    "plant_sim",
+    "run_log",
+    "tandem",
+)
+"""The packages of the wheel."""
 NAMESAKES = ("signal", "queue", "protocol", "lbmpc", "tandem")
 
 

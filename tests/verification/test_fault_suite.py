@@ -25,7 +25,7 @@ from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import INSTALLED, ROOT
 from verification.faults import evaluation as measured
 from verification.faults import holds, suite, table
 from verification.faults.catalogue import ALL, BY_NAME, Fault, Stage
@@ -425,16 +425,7 @@ MAY_READ_IT = {
 def test_nothing_but_these_reads_the_wall_clock() -> None:
     """So a step of it can change nothing else; `make faults` steps it, and this says why that holds."""
     found = set()
-    for package in (
-        "lbmpc",
-        "protocol",
-        "node_runtime",
-        "controller_node",
-        "trainer_node",
-        "plant_sim",
-        "run_log",
-        "tandem",
-    ):
+    for package in INSTALLED:
         for path in sorted((ROOT / package).rglob("*.py")):
             for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if not isinstance(function, ast.FunctionDef):
