@@ -47,7 +47,7 @@ def build_plant(config: Config) -> Plant:
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
-    """The network of the configuration for this plant; inputs are scaled by its half-widths.
+    """The network of the configuration for this plant; its inputs and h are scaled by the half-widths.
 
     Raises:
         ValueError: the sizes or the options do not fit the architecture, there is none of that name, or the network
@@ -61,7 +61,7 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
         hidden=network.hidden,
         activations=[network.activation] * len(network.hidden),
         input_scale=[*plant.x_scale.tolist(), *plant.u_scale.tolist()],
-        output_scale=[network.output_scale * config.period] * plant.d,
+        output_scale=(network.output_scale * config.period * plant.x_scale).tolist(),
         max_layer_norm=network.max_layer_norm,
         architecture=network.architecture,
         window=architecture.window if network.window is None else network.window,
@@ -87,9 +87,8 @@ def build_oracle(config: Config, model: Model) -> Oracle:
             raise ConfigError(f"l2nw.variables: empty; choose from {', '.join(names)}")
         indices = tuple(names.index(name) for name in chosen)
         settings = config.l2nw
-        return L2nwOracle(
-            plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation
-        )
+        bandwidth = settings.bandwidth * np.concatenate([plant.x_scale, plant.u_scale])[list(indices)]
+        return L2nwOracle(plant.d, plant.m, indices, settings.window, bandwidth, settings.regularisation)
     return build_network_oracle(config, plant)
 
 
@@ -99,13 +98,13 @@ def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
         description = describe_network(config, plant)
     except ValueError as error:
         raise ConfigError(f"network: {error}") from error
-    adaptation, period = config.adaptation, config.period
+    adaptation, per_period = config.adaptation, config.period * plant.x_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
     return DnnOracle(
         description,
         adaptation.gamma if adaptation.enabled else 0.0,
-        adaptation.column_bound * period,
-        adaptation.initial_scale * period,
+        adaptation.column_bound * per_period,
+        adaptation.initial_scale * per_period,
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config),

@@ -65,6 +65,15 @@ class Model:
         """A + BK, Schur stable."""
         return self.A + self.B @ self.K
 
+    @cached_property
+    def cost_scale(self) -> float:
+        """What the cost is counted in: x'|P|x + u'Ru with every state and input at its half-width.
+
+        That is a bound on the cost to go from anywhere in X, and one input at the end of its range.
+        """
+        x, u = self.plant.x_scale, self.plant.u_scale
+        return float(x @ np.abs(self.P) @ x + u @ self.R @ u)
+
     def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray, pieces: Pieces = ()) -> np.ndarray:
         """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), with the input that really was applied.
 

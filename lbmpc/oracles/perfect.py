@@ -19,8 +19,9 @@ from lbmpc.plants.base import dop853
 
 STEP_NORM = 0.4
 """At most so much of |a| dt, a the linearisation, in one integration step: h is then right to 1e-9."""
-LEAST = 1e-3
-"""States that must stay positive are not let below this in the expression, or a wild plan would make it NaN."""
+LEAST = 2e-3
+"""Of their half-width: states that must stay positive are not let below this in the expression, or a wild plan would
+make it NaN."""
 
 
 class PerfectOracle(Oracle):
@@ -52,7 +53,8 @@ def _functions(model: Model) -> tuple[ca.Function, ca.Function]:
     f = plant.function()
     xu = ca.SX.sym("xu", d + model.m)
     low = np.full(d, -np.inf)
-    low[[domain.state for domain in plant.positive]] = LEAST
+    positive = [domain.state for domain in plant.positive]
+    low[positive] = LEAST * plant.x_scale[positive]
     start = ca.fmax(xu[:d] + plant.x_e, low)
     u = xu[d:] + plant.u_e
     steps = max(1, math.ceil(float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period / STEP_NORM))

@@ -60,9 +60,10 @@ class SolverConfig(Section, frozen=True):
     """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
     max_iterations: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
     tolerance: Positive = 1e-6
-    """Converged when no input of the plan moves by more than this (input units)."""
-    penalty: Positive = 1e4
-    """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
+    """Converged when no input of the plan moves by more than this share of its half-width."""
+    penalty: Positive = 100.0
+    """Exact-penalty weight on soft state constraints: what a violation of one half-width costs, in units of the cost to
+    go x'Px with every state at its half-width."""
 
 
 class BackupConfig(Section, frozen=True):
@@ -116,8 +117,9 @@ class NetworkConfig(Section, frozen=True):
     )
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
-    output_scale: Positive = 0.2
-    """h per second of period that counts as 1 for the network: h of a sampled plant grows with the period."""
+    output_scale: Positive = 0.4
+    """h that counts as 1 for the network, in half-widths of each state per second of period: h of a sampled plant grows
+    with the period."""
     max_layer_norm: Positive = 100.0
 
 
@@ -153,10 +155,10 @@ class AdaptationConfig(Section, frozen=True):
     """False: the last layer stays at K_0 (hidden layers only)."""
     gamma: Unit = 0.8
     """Learning rate of the last layer, 0 < gamma < 1."""
-    column_bound: Positive = 1.0
-    """Bound on the norm of each column of K, as h per second of period."""
-    initial_scale: NonNegative = 6e-3
-    """Standard deviation of the entries of K_0, as h per second of period."""
+    column_bound: Positive = 2.0
+    """Bound on the norm of each column of K, as h, in half-widths of its state per second of period."""
+    initial_scale: NonNegative = 1.2e-2
+    """Standard deviation of the entries of K_0, likewise."""
     start: literals.StartName = "random"
     """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
     at_adoption: literals.AdoptionName = "keep"
@@ -167,7 +169,8 @@ class AdaptationConfig(Section, frozen=True):
 
 class L2nwConfig(Section, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
-    bandwidth: Positive = 0.5
+    bandwidth: Positive = 1.0
+    """Of the Gaussian kernel, in half-widths of each of its variables."""
     regularisation: Positive = 1e-3
     variables: list[str] | None = None
     """Names of the states and inputs the kernel sees; None: the plant's own choice."""
