@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError
-from node_runtime.config.plant import initial_state
+from lbmpc.plants import Plant, PlantError, get_plant
+from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -81,8 +81,9 @@ class _LockStep:
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        x0 = initial_state(config, self.core.plant)
-        self.plant = PlantSim(self.core.plant, config.period, x0, config.plant.plan_patience, PLANT)
+        true = true_plant_of(config, get_plant)
+        x0 = initial_state(config, true)
+        self.plant = PlantSim(true, config.period, x0, config.plant.plan_patience, PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
         if faults.command_seconds >= config.period:
@@ -98,8 +99,8 @@ class _LockStep:
         if self.faults.drift is None:
             return []
         try:
-            return self.faults.drift.plants(self.core.plant)
-        except KeyError as error:
+            return self.faults.drift.plants(self.plant.plant)
+        except (KeyError, PlantError) as error:
             raise ConfigError(f"faults.drift: {error.args[0]}") from error
 
     def _noise(self) -> np.ndarray | None:
@@ -143,8 +144,11 @@ class _LockStep:
         started = time.perf_counter()
         t = seq * self.config.period
         true = self.plant.sample(t)
+        truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
-            self.plant.change(self.changes.pop(0)[1])
+            changed = self.changes.pop(0)[1]
+            self.plant.change(changed)
+            truth = changed.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = self._arriving(seq)
@@ -159,6 +163,7 @@ class _LockStep:
             state_verdict="fresh",
             state=state,
             weights=weights,
+            truth=dict(truth),
         )
         stepped = time.perf_counter()
         outputs = self.core.step(tick)
