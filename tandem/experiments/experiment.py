@@ -14,7 +14,7 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
-from tandem.experiments.study.declaration import Declaration, resolve
+from tandem.experiments.study.declaration import STEPS, Declaration, resolve, tree_of
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, time_all, wanted
 
@@ -82,7 +82,7 @@ def run(
     timings = time_all(
         cases,
         lambda case: repeats if case.group in shown and not quick else 1,
-        declared.steps * base.period,
+        (declared.steps or STEPS) * base.period,
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )
@@ -99,7 +99,7 @@ def run(
 
 def settings(declared: Declaration, where: str) -> Config:
     """The configuration that no case has changed. Raises `ConfigError`."""
-    return from_tree(dict(declared.base), where)
+    return from_tree(tree_of([declared], where), where)
 
 
 def overview(declared: Declaration) -> dict[str, Any]:

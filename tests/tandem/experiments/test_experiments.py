@@ -35,7 +35,7 @@ SMALL = """
 name = "small"
 title = "A small one"
 steps = 30
-[base]
+[set]
 controller = { horizon = 15, solver = { compile = "never" } }
 network = { hidden = [6] }
 trainer = { steps = 5 }
