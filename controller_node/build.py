@@ -21,14 +21,11 @@ from lbmpc.plants import Plant, get_plant
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
-from lbmpc.sets.guard import Guard
-from lbmpc.sets.stepped_guard import SteppedGuard
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture
-from node_runtime.config import literals
 from node_runtime.config.plant import plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -38,7 +35,6 @@ WEIGHTS = WEIGHTS_LIMIT // 4
 """Hidden weights at most, float32 each."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
-GUARDS: dict[literals.GuardName, type[Guard]] = {"half": Guard, "steps": SteppedGuard}
 
 
 def build_plant(config: Config) -> Plant:
@@ -133,9 +129,15 @@ def build_model(config: Config) -> Model:
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        return nominal_model(build_plant(config), config.period, Q, R)
+        return nominal_model(build_plant(config), config.period, Q, R, settings.terminal)
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
+
+
+def given_disturbance(config: Config) -> np.ndarray | None:
+    """Half-widths of W, (d,), as h of one period, where the configuration gives them."""
+    W = config.controller.W
+    return None if W is None else np.array(W, dtype=float) * config.period
 
 
 class TimedSolver(Solver):
@@ -177,10 +179,9 @@ def build_controller(
             build_oracle(config, model),
             settings.horizon,
             settings.tightening,
-            None if settings.W is None else np.array(settings.W, dtype=float),
+            given_disturbance(config),
             settings.solver.penalty,
             certificate,
-            GUARDS[settings.guard],
         )
     except (CertificateError, EmptySetError) as error:
         raise ConfigError(f"controller: {error}") from error

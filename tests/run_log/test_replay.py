@@ -509,7 +509,7 @@ def test_a_log_says_what_its_arithmetic_depended_on(run: Run) -> None:
         ({"blas": None, "processor": None}, 1e-12, True, None, "the log does not say its processor, blas: "),
         ({}, 1e-12, True, False, ""),
     ],
-    ids=["other kernel", "no compiler", "too far", "an older log", "this machine"],
+    ids=["other kernel", "no compiler", "too far", "says nothing of it", "this machine"],
 )
 def test_a_difference_by_rounding_is_called_that_and_explained(
     run: Run, facts: dict[str, str | None], by: float, rounding: bool, elsewhere: bool | None, note: str
