@@ -9,6 +9,7 @@ from matplotlib.ticker import NullLocator
 
 from lbmpc.plants import Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
+from tandem.experiments.reporting.pictures_by_episode import episodes
 from tandem.experiments.reporting.pictures_over_time import lemma, recovery, trajectories
 from tandem.experiments.reporting.style import Picture, figure, full_name, legend_above, looks
 from tandem.experiments.study.declaration import Picture as Kind
@@ -18,6 +19,8 @@ from tandem.experiments.study.results import CaseResult
 def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | None) -> list[Picture]:
     """The pictures of one group."""
     match kind:
+        case "episodes":
+            return episodes(results)
         case "trajectories":
             return trajectories(results, plant)
         case "states":
@@ -144,20 +147,20 @@ def survival(results: list[CaseResult]) -> list[Picture]:
 
 
 def by_family(results: list[CaseResult]) -> dict[str, list[CaseResult]]:
-    """Cases that one declaration's `vary` made, together."""
+    """Cases that differ in the last of what varies alone, together."""
     families: dict[str, list[CaseResult]] = {}
     for result in results:
-        families.setdefault(result.case.name.partition(": ")[0], []).append(result)
+        families.setdefault(result.case.family, []).append(result)
     return families
 
 
 def family_label(member: CaseResult) -> str:
-    return member.label.partition(": ")[0]
+    return member.case.family
 
 
 def margins(members: list[CaseResult]) -> list[float]:
     """What varies from member to member: a number, or the one entry of a list that does."""
-    values: list[Any] = [next(iter(member.case.varied.values()), 0.0) for member in members]
+    values: list[Any] = [list(member.case.varied.values())[-1] for member in members]
     if not isinstance(values[0], list):
         return [float(value) for value in values]
     table = np.array(values, dtype=float)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,7 @@ import msgspec
 
 from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, Count, Section, from_tree
-from node_runtime.config.shipped import shipped
+from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults
 
@@ -42,7 +42,7 @@ class Runs(Section, frozen=True, kw_only=True):
     """What a case runs. Its group and the experiment may say it for all of theirs: the nearest that says it counts."""
 
     config: str | None = None
-    """A shipped configuration to start from, by its name."""
+    """What to start from: a shipped configuration by its name, or a file."""
     set: dict[str, Any] = {}
     """Changes of the configuration, as a table like it: a case's over its group's, a group's over the experiment's."""
     seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count | None = None
@@ -172,17 +172,21 @@ def resolve(declared: Declaration, plant: Plant, where: str, quick: bool = False
     return resolved
 
 
-def tree_of(levels: Sequence[Runs], where: str) -> dict[str, Any]:
-    """The changes of an experiment, a group and a case, or of the first of them, laid over what they start from.
+def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str) -> Config:
+    """The configuration of an experiment, of a group or of a case, with what varies on top.
 
     Raises:
-        ConfigError: no configuration of that name is shipped.
+        ConfigError: there is no such configuration to start from, or the changes do not fit it.
     """
-    name = _said(levels, "config", "")
-    tree = load_tree(_shipped(name, where)) if name else {}
-    for level in levels:
-        tree = _merged(tree, level.set)
-    return tree
+    name = _said(levels, "config", None)
+    changes: dict[str, Any] = {}
+    for change in (*(level.set for level in levels), *(_below(key, value) for key, value in varied.items())):
+        changes = _merged(changes, change)
+    try:
+        tree = {} if name is None else load_tree(config_file(name))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: config: {error}") from error
+    return from_tree(_merged(tree, changes), where, dict.fromkeys(_keys(changes), where))
 
 
 def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick: bool) -> list[Resolved]:
@@ -204,10 +208,7 @@ def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick:
     made = []
     for values in itertools.product(*vary.values()):
         varied = dict(zip(vary, values, strict=True))
-        tree = tree_of(levels, where)
-        for key, value in varied.items():
-            tree = _merged(tree, _below(key, value))
-        config = from_tree(tree, f"{where}: case {case.name!r}")
+        config = config_of(levels, varied, f"{where}: case {case.name!r}")
         names = ", ".join(f"{key.rpartition('.')[2]} = {_shown(value)}" for key, value in varied.items())
         words = {key: _words(key, value) for key, value in varied.items()}
         made.append(
@@ -263,12 +264,6 @@ def _x0s(declared: Declaration, name: str, plant: Plant, where: str) -> list[lis
     return made
 
 
-def _shipped(name: str, where: str) -> Path:
-    path = shipped(f"{name}.toml")
-    _known(Path(where), "config", name, sorted(one.stem for one in path.parent.glob("*.toml")))
-    return path
-
-
 def _known(path: Path, key: str, name: str, names: list[str]) -> None:
     if name not in names:
         hint = did_you_mean(name, names, f"there are {', '.join(names)}")
@@ -297,6 +292,14 @@ def _below(key: str, value: Any) -> Any:
     for name in reversed(key.split(".")):
         value = {name: value}
     return value
+
+
+def _keys(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """Every "section.key" of a plain tree, the sections too."""
+    for name, value in tree.items():
+        yield above + name
+        if isinstance(value, dict):
+            yield from _keys(value, f"{above}{name}.")
 
 
 def _label(case: Case, words: list[str]) -> str:
