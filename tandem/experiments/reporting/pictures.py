@@ -160,7 +160,7 @@ def family_label(member: CaseResult) -> str:
 
 def margins(members: list[CaseResult]) -> list[float]:
     """What varies from member to member: a number, or the one entry of a list that does."""
-    values: list[Any] = [list(member.case.varied.values())[-1] for member in members]
+    values: list[Any] = [[0.0, *member.case.varied.values()][-1] for member in members]
     if not isinstance(values[0], list):
         return [float(value) for value in values]
     table = np.array(values, dtype=float)
