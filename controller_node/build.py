@@ -17,7 +17,7 @@ from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOr
 from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Plant, get_plant
+from lbmpc.plants import Plant, PlantError, get_plant
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -26,7 +26,7 @@ from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture
-from node_runtime.config.plant import plant_of
+from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol.topics import WEIGHTS_LIMIT
@@ -38,7 +38,7 @@ SHORTEST_WATCH = 8
 
 
 def build_plant(config: Config) -> Plant:
-    """The plant named by the configuration, whose lengths fit it. Raises `ConfigError`."""
+    """The plant named by the configuration, as the model knows it; its lengths fit. Raises `ConfigError`."""
     return plant_of(config, get_plant)
 
 
@@ -75,7 +75,10 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     if config.controller.oracle == "linear":
         return LinearOracle(plant.d, plant.m)
     if config.controller.oracle == "perfect":
-        return PerfectOracle(model)
+        try:
+            return PerfectOracle(model, true_plant_of(config, get_plant))
+        except PlantError as error:
+            raise ConfigError(f"controller.oracle = 'perfect': {error}") from error
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
         chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)

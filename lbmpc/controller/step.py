@@ -102,6 +102,8 @@ class Controller:
         verdict = Verdict("none")
         if seen.hidden is not None:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
+        if seen.truth:
+            oracle = self.oracle.told(oracle, seen.truth)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard

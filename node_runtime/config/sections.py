@@ -51,6 +51,8 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 

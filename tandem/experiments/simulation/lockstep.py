@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError
-from node_runtime.config.plant import initial_state
+from lbmpc.plants import Plant, PlantError, get_plant
+from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -88,7 +88,7 @@ class _LockStep:
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = self.core.plant
+        self.true = true_plant_of(config, get_plant)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
@@ -102,15 +102,15 @@ class _LockStep:
         self.log: list[tuple[Topic, m.Message, int]] = []
 
     def _started_plant(self, run_id: str) -> PlantSim:
-        x0 = initial_state(self.config, self.core.plant)
+        x0 = initial_state(self.config, self.true)
         return PlantSim(self.true, self.config.period, x0, self.config.plant.plan_patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
             return []
         try:
-            return self.faults.drift.plants(self.core.plant)
-        except KeyError as error:
+            return self.faults.drift.plants(self.true)
+        except (KeyError, PlantError) as error:
             raise ConfigError(f"faults.drift: {error.args[0]}") from error
 
     def _noise(self) -> np.ndarray | None:
@@ -162,9 +162,11 @@ class _LockStep:
         started = time.perf_counter()
         t = seq * self.config.period
         true = self.plant.sample(t)
+        truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.true = self.changes.pop(0)[1]
             self.plant.change(self.true)
+            truth = self.true.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = self._arriving(seq)
@@ -179,6 +181,7 @@ class _LockStep:
             state_verdict="fresh",
             state=state,
             weights=weights,
+            truth=dict(truth),
         )
         stepped = time.perf_counter()
         outputs = self.core.step(tick)

@@ -29,7 +29,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     cost: float | None
     """Sum of the squared deviations of the performance states; null where the plant was lost."""
     regret: float | None
-    """Cost above that of the true h from the same start; null where either was lost, or the plant drifts."""
+    """Cost above that of the true h from the same start; null where either was lost."""
     overshoot: float | None
     settling_step: int | None
     violations: int
@@ -82,18 +82,17 @@ def collect(
     cases: dict[str, CaseResult] = {}
     for plan in plans:
         case, record = plan.case, records[plan.job.key]
-        floor = records[plan.floor.key] if plan.floor is not None else None
-        timing = timings.get(case.name)
+        floor, timing = records[plan.floor.key], timings.get(case.name)
         result = cases.setdefault(case.name, CaseResult(case, [], [], timing))
         result.rows.append(_row(plan, record, floor, timing, plant))
         result.records.append(record)
     return list(cases.values())
 
 
-def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | None, plant: Plant) -> Row:
+def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Plant) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
-    known = record.cost is not None and floor is not None and floor.cost is not None
+    known = record.cost is not None and floor.cost is not None
     return Row(
         case=plan.case.name,
         group=plan.case.group,
@@ -101,7 +100,7 @@ def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | N
         seed=plan.seed,
         x0=list(x0),
         cost=record.cost,
-        regret=record.cost - floor.cost if known else None,  # type: ignore[operator, union-attr]
+        regret=record.cost - floor.cost if known else None,  # type: ignore[operator]
         overshoot=record.overshoot,
         settling_step=record.settling_step,
         violations=record.violations,

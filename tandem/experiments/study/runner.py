@@ -59,8 +59,7 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
         case = plan.case
         name = f"{_file_name(case.name)}-seed{plan.job.config.seed}.mcap"
         want(plan.job, case.group in detailed, *([logs / name] if case.log and plan.x0 is None else []))
-        if plan.floor is not None:
-            want(plan.floor, False)
+        want(plan.floor, False)
     return wants
 
 

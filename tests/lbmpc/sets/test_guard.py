@@ -15,7 +15,7 @@ from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, points_in
 from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.guard import MOST, Guard
-from tests.helpers.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 from verification.closed_loop import Case, ClosedLoop
 
 MODEL = pendulum()
