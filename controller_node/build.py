@@ -13,7 +13,7 @@ from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
 from lbmpc.model import Model, ModelError
 from lbmpc.model import build_model as nominal_model
-from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
+from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.trial import Trial
@@ -74,6 +74,8 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     plant = model.plant
     if config.controller.oracle == "linear":
         return LinearOracle(plant.d, plant.m)
+    if config.controller.oracle == "constant":
+        return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
         try:
             return PerfectOracle(model, true_plant_of(config, get_plant))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-OracleName = Literal["linear", "l2nw", "dnn", "perfect"]
+OracleName = Literal["linear", "constant", "l2nw", "dnn", "perfect"]
 TighteningName = Literal["none", "first_step", "tube", "invariant"]
 Strategy = Literal["fifo", "reservoir", "novelty"]
 StartName = Literal["random", "zero", "pretrained"]

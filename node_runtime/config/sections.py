@@ -172,6 +172,11 @@ class AdaptationConfig(Section, frozen=True):
     trial: TrialConfig = TrialConfig()
 
 
+class ConstantConfig(Section, frozen=True):
+    gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5
+    """Share of a new label in the filtered one; 1: the last label alone."""
+
+
 class L2nwConfig(Section, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
     bandwidth: Positive = 0.5
@@ -259,6 +264,7 @@ class Config(Section, frozen=True):
     controller: ControllerConfig = ControllerConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
+    constant: ConstantConfig = ConstantConfig()
     l2nw: L2nwConfig = L2nwConfig()
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()

@@ -70,9 +70,9 @@ def test_commented_values_of_the_shipped_file_are_valid():
     [
         (
             "controller.oracle=dn",
-            "controller.oracle = 'dn' is not one of dnn, l2nw, linear, perfect; did you mean 'dnn'?",
+            "controller.oracle = 'dn' is not one of constant, dnn, l2nw, linear, perfect; did you mean 'dnn'?",
         ),
-        ("controller.oracle=7", "controller.oracle = 7 is not one of dnn, l2nw, linear"),
+        ("controller.oracle=7", "controller.oracle = 7 is not one of constant, dnn, l2nw, linear"),
         ("trainer.batch=0", "trainer.batch = 0 is not an integer of at least 1"),
         ("trainer.batch=1.5", "trainer.batch = 1.5 is not an integer of at least 1"),
         ("realtime.priority=100", "realtime.priority = 100 is not an integer of at least 0 and at most 99"),
