@@ -182,7 +182,7 @@ def margins(members: list[CaseResult]) -> list[float]:
 
 
 def _what_varies(members: list[CaseResult], plant: Plant) -> str:
-    key, value = next(iter(members[0].case.varied.items()), ("", 0.0))
+    key, value = [("", 0.0), *members[0].case.varied.items()][-1]
     name = key.rpartition(".")[2]
     if not isinstance(value, list):
         return name

@@ -46,6 +46,8 @@ class Outcome:
     """What a recorder would have seen; times are virtual and start at 0."""
     lost: str | None
     """Why the true motion could not be followed to the end; None when it could."""
+    episodes: int
+    """How many of them were followed to their end."""
 
 
 def simulate(config: Config, steps: int, progress: Progress | None = None, episodes: int = 1) -> Run:
@@ -137,22 +139,24 @@ class _LockStep:
         if (sets := self.core.certified_sets()) is not None:
             self._note(topics.SETS, sets, 0)
         self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
-        lost, seq = None, -1
+        lost, seq, ended = None, -1, 0
         try:
             for seq in range(steps * episodes):
                 if seq and seq % steps == 0:
                     self._end_episode(seq)
+                    ended += 1
                     self.plant = self._started_plant(f"{PLANT}-{seq // steps + 1}")
                 self._step(seq)
                 if progress is not None:
                     progress(seq + 1)
             self._end_episode(steps * episodes)
+            ended += 1
         except PlantError as error:
             episode = f" in episode {seq // steps + 1} of {episodes}" if episodes > 1 else ""
             lost = f"at step {seq % steps} of {steps}{episode}: {error}"
         if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
             self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
-        return Outcome(gather(self.config, self.log), lost)
+        return Outcome(gather(self.config, self.log), lost, ended)
 
     def _end_episode(self, seq: int) -> None:
         """Where the last command of the plant has led it."""
