@@ -16,6 +16,7 @@ from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
+from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
 from lbmpc.plants import Plant, PlantError, get_plant
 from lbmpc.problem import Problem, build_problem
@@ -33,6 +34,8 @@ from protocol.topics import WEIGHTS_LIMIT
 
 WEIGHTS = WEIGHTS_LIMIT // 4
 """Hidden weights at most, float32 each."""
+FILTERED = 512
+"""Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
@@ -109,7 +112,27 @@ def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config),
+        describe_filter(config, description.features),
     )
+
+
+def describe_filter(config: Config, features: int) -> Kalman | None:
+    """The filter of the last layer with so many features, at the configured rate; None where there is none.
+
+    Raises:
+        ConfigError: its covariance would be too large.
+    """
+    adaptation = config.adaptation
+    if adaptation.law != "kalman" or not adaptation.enabled:
+        return None
+    if features > FILTERED:
+        raise ConfigError(
+            f'adaptation.law = "kalman" keeps a covariance of {features} x {features} numbers; the last of '
+            f"network.hidden can have {FILTERED - 1} neurons at most with it"
+        )
+    settings = adaptation.kalman
+    kept = math.exp(-config.period / settings.memory)
+    return Kalman(settings.prior_variance, settings.label_variance, kept)
 
 
 def describe_trial(config: Config) -> Trial | None:
