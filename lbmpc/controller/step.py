@@ -204,9 +204,7 @@ def _acting(seen: Observation) -> np.ndarray | None:
 
 
 def _box(first: FirstInputs | None) -> Box | None:
-    if first is None or first.lower is None or first.upper is None:
-        return None
-    return first.lower, first.upper
+    return None if first is None else (first.lower, first.upper)
 
 
 def _begun_within(plan: Plan, first: Box | None) -> Plan:

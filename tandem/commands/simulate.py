@@ -28,7 +28,7 @@ class Simulate(Configured):
     )
 
     oracle: Annotated[
-        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+        OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
     ] = None
     """What the controller learns with."""
     steps: Annotated[int, arg(metavar="INT")] = 200

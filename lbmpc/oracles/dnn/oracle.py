@@ -27,8 +27,8 @@ class DnnOracle(NetworkExpressions):
     Args:
         description: sizes, activations and scaling.
         gamma: learning rate of the last layer; 0: it stays as it is.
-        column_bound: Wbar_i, in units of h.
-        initial_scale: standard deviation of the entries of K_0, in units of h.
+        column_bound: Wbar_i, (d,), in units of h; a number counts for every column.
+        initial_scale: standard deviation of the entries of each column of K_0, likewise.
         start: how K_0 comes about.
         refit: what happens to K when hidden layers are adopted; None: it is kept.
         trial: what hidden layers must show before and after they are adopted; None: nothing.
@@ -40,8 +40,8 @@ class DnnOracle(NetworkExpressions):
         self,
         description: NetworkDescription,
         gamma: float = 0.5,
-        column_bound: float = 0.05,
-        initial_scale: float = 1e-3,
+        column_bound: np.ndarray | float = 0.05,
+        initial_scale: np.ndarray | float = 1e-3,
         start: Start = "random",
         refit: Refit | None = None,
         trial: Trial | None = None,

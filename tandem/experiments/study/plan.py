@@ -74,6 +74,8 @@ def _floor(config: Config, case: Resolved) -> Job:
 def _what_counts(config: Config, faults: Faults) -> Config:
     """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
     unread, oracle = ["name", "bus", "log", "realtime"], config.controller.oracle
+    if oracle != "constant":
+        unread.append("constant")
     if oracle != "l2nw":
         unread.append("l2nw")
     if oracle != "dnn":
