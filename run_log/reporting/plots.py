@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lbmpc.plants import Plant
-from run_log.reporting.summary import TOLERANCE
+from run_log.reporting.performance import TOLERANCE
 from run_log.reporting.traces import Traces
 
 BLACK, BLUE, SKY, VERMILION, GREEN = "#000000", "#0072B2", "#56B4E9", "#D55E00", "#009E73"

@@ -78,6 +78,12 @@ def full_name(plant: Plant, index: int) -> str:
     return plant.names.get(plant.states[index], plant.states[index])
 
 
+def named(plant: Plant, index: int) -> str:
+    """A state for an axis: its full name, and its unit where it has one."""
+    unit = plant.units.get(plant.states[index], "")
+    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else unit})"
+
+
 def data_uri(made: Figure) -> str:
     """The figure as SVG inside a link that needs no network. The same figure gives the same text."""
     buffer = io.BytesIO()

@@ -31,6 +31,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     config: Config
     steps: int
+    episodes: int
     faults: Faults
 
     @property
@@ -62,7 +63,7 @@ def _job(config: Config, case: Resolved) -> Job:
     faults = case.faults
     if config.controller.oracle != "dnn":
         faults = msgspec.structs.replace(faults, training_seconds=0.0, trainer_dies_at=None)
-    return Job(config=_what_counts(config, faults), steps=case.steps, faults=faults)
+    return Job(config=_what_counts(config, faults), steps=case.steps, episodes=case.episodes, faults=faults)
 
 
 def _floor(config: Config, case: Resolved) -> Job:

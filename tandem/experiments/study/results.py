@@ -26,14 +26,25 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     oracle: str
     seed: int
     x0: list[float]
-    cost: float | None
-    """Sum of the squared deviations of the performance states; null where the plant was lost."""
+    J: float | None
+    """Sum of the stage costs, Q and R as densities; null where the plant was lost, as for the five after it."""
     regret: float | None
-    """Cost above that of the true h from the same start; null where either was lost."""
-    overshoot: float | None
-    settling_step: int | None
+    """J above that of the true h from the same start, as a share of it, negative where below; null where either was
+    lost."""
+    deviation: float | None
+    """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
+    overshoot: dict[str, float | None] | None
+    """Per performance state, as a share of its initial deviation; null for one that began settled."""
+    settled_s: float | None
+    """Seconds; null where not settled at the end."""
+    settled_by_state_s: dict[str, float | None] | None
     violations: int
-    infeasible_ticks: int
+    """Samples outside X or U by more than 1e-6 of a half-width."""
+    excess_between_samples: float | None
+    """Largest distance from X, as a share of a half-width; null where the truth between the samples is not known."""
+    iteration_limit_ticks: int
+    soft_ticks: int
+    fallback_ticks: int
     solve_ms: Spread | None
     """Of runs made alone, of the same oracle, horizon, network and rate."""
     lost: str | None
@@ -51,19 +62,27 @@ class CaseResult(NamedTuple):
     timing: Timing | None
 
     def values(self, name: str) -> np.ndarray:
-        """(rows,) one figure of each; what is lost is infinitely bad."""
-        given = [getattr(row, name) for row in self.rows]
-        return np.array([math.inf if value is None else value for value in given], dtype=float)
+        """(rows,) one figure of each, of the first performance state where each has its own.
+
+        What is lost, or not settled, is infinitely bad; NaN where there is no such figure, as for the overshoot of a
+        state that began settled.
+        """
+        return np.array([_value(row, name) for row in self.rows])
 
     def median(self, name: str) -> float:
-        return float(np.median(self.values(name)))
+        """Of the rows that have this figure; NaN where none has."""
+        values = self.values(name)
+        values = values[~np.isnan(values)]
+        return float(np.median(values)) if values.size else math.nan
 
     def worst(self, name: str) -> float:
-        return float(self.values(name).max())
+        values = self.values(name)
+        values = values[~np.isnan(values)]
+        return float(values.max()) if values.size else math.nan
 
     @property
     def kept(self) -> float:
-        """Share of the runs that keep all constraints on the true plant."""
+        """Share of the runs that keep all constraints on the true plant, at samples."""
         return float(np.mean([record.kept for record in self.records]))
 
     @property
@@ -73,6 +92,15 @@ class CaseResult(NamedTuple):
     @property
     def label(self) -> str:
         return self.case.label
+
+
+def _value(row: Row, name: str) -> float:
+    value = getattr(row, name)
+    if isinstance(value, dict):
+        value = next(iter(value.values()))
+    if value is not None:
+        return float(value)
+    return math.inf if row.lost is not None or name == "settled_s" else math.nan
 
 
 def collect(
@@ -92,25 +120,36 @@ def collect(
 def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Plant) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
-    known = record.cost is not None and floor.cost is not None
+    found, lost = record.performance, record.lost is not None
     return Row(
         case=plan.case.name,
         group=plan.case.group,
         oracle=config.controller.oracle,
         seed=plan.seed,
         x0=list(x0),
-        cost=record.cost,
-        regret=record.cost - floor.cost if known else None,  # type: ignore[operator]
-        overshoot=record.overshoot,
-        settling_step=record.settling_step,
-        violations=record.violations,
-        infeasible_ticks=record.infeasible_ticks,
+        J=None if lost else found.J,
+        regret=_regret(record, floor),
+        deviation=None if lost else found.deviation,
+        overshoot=None if lost else found.overshoot,
+        settled_s=None if lost else found.settled_s,
+        settled_by_state_s=None if lost else found.settled_by_state_s,
+        violations=found.constraint_violations,
+        excess_between_samples=None if lost else found.excess_between_samples,
+        iteration_limit_ticks=record.iteration_limit_ticks,
+        soft_ticks=record.soft_ticks,
+        fallback_ticks=record.fallback_ticks,
         solve_ms=spread(timing) if timing else None,
         lost=record.lost,
         weights_adopted=record.weights_adopted,
         error_first_second=record.error_first,
         error_last_second=record.error_last,
     )
+
+
+def _regret(record: Record, floor: Record | None) -> float | None:
+    if floor is None or record.lost is not None or floor.lost is not None or not floor.performance.J:
+        return None
+    return record.performance.J / floor.performance.J - 1.0
 
 
 def spread(timing: Timing) -> Spread:

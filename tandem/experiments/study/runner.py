@@ -131,7 +131,7 @@ def _leave_ctrl_c_to_the_parent() -> None:
 
 def _effort(job: Job) -> float:
     learning = 5.0 if job.config.controller.oracle == "dnn" else 1.0
-    return job.steps * job.config.controller.horizon * learning
+    return job.steps * job.episodes * job.config.controller.horizon * learning
 
 
 def _file_name(name: str) -> str:
@@ -158,7 +158,7 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
-    return Job(config=config, steps=round(seconds * config.rate), faults=Faults())
+    return Job(config=config, steps=round(seconds * config.rate), episodes=1, faults=Faults())
 
 
 def time_all(
