@@ -27,10 +27,9 @@ GRAVITY = 9.81
 PARAMETERS = {"mass": 0.486, "inertia": 0.00383, "arm": 0.25, "drag": 0.1, "wind": 0.0, "efficiency": 1.0}
 TRUTH = {"wind": 2.0, "efficiency": 0.93}
 SETTINGS = [
-    *("rate=50", "controller.horizon=50"),
+    *("rate=50", "controller.horizon_seconds=1"),
     # By Bryson's rule: 0.2 m, 0.3 rad, 1 m/s, 3 rad/s and half of the thrust at rest cost the same.
     *("controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"),
-    *("network.output_scale=1.0", "adaptation.column_bound=5.0", "adaptation.initial_scale=3e-2"),
 ]
 """A sample every 20 ms and a horizon of a second, in which it crosses half of its space."""
 

@@ -27,11 +27,12 @@ GRAVITY = 981.0
 PARAMETERS = {"area_1": 28.0, "area_2": 32.0, "outlet_1": 0.071, "outlet_2": 0.057, "leak": 0.0}
 TRUTH = {"outlet_1": 1.25 * 0.071, "outlet_2": 1.25 * 0.057, "leak": 0.01}
 SETTINGS = [
-    *("rate=0.2", "controller.horizon=24"),
-    # The lower level is what matters; all of the pump's range costs as much as 1 cm there.
+    *("rate=0.2", "controller.horizon_seconds=120"),
+    # The lower level is what matters; half of the pump's range costs as much as 1 cm there.
     *("controller.Q=[0.1, 1.0]", "controller.R=[0.01]"),
-    *("network.output_scale=0.1", "adaptation.column_bound=0.5", "adaptation.initial_scale=3e-3"),
-    "l2nw.bandwidth=5.0",
+    # Levels move by a hundredth of their half-width a second, and a trial reaches back 80 samples.
+    *("network.output_scale=0.02", "adaptation.column_bound=0.1", "adaptation.initial_scale=6e-4"),
+    *("adaptation.trial.seconds=400", "adaptation.trial.confirm=100"),
 ]
 """A sample every 5 s and a horizon of two minutes, twice the time constant of a tank."""
 

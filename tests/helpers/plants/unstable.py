@@ -13,7 +13,7 @@ import numpy as np
 
 from lbmpc.plants.base import Plant, Rhs
 
-SETTINGS = ["rate=20", "controller.horizon=60"]
+SETTINGS = ["rate=20", "controller.horizon_seconds=3"]
 
 
 def equations(rate: float) -> Rhs:
