@@ -33,7 +33,7 @@ from tandem.experiments.study.plan import Job, code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
 from tandem.experiments.study.work import Record, Traces, read, work
 from tests.helpers.paths import CONFIGS, write_namesakes
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM
 
 PLANT = get_plant("moore_greitzer")
 SHIPPED = CONFIGS / "experiments" / "paper.toml"
