@@ -15,7 +15,8 @@ from lbmpc.casadi_buffers import Bound
 from lbmpc.model import Model
 
 STEP_NORM = 0.06
-"""|a| dt of one Runge-Kutta step over a whole period, a the linearisation: right to 2e-7 of X's half-widths, and to 1e-8 over half."""
+"""|a| dt of a Runge-Kutta step over a period, a the linearisation: right to 2e-7 of X's half-widths; over half a
+period, to 1e-8."""
 MOST_STEPS = 1000
 """For a plant that is stiff beside its period; what comes out is then less exact, or not finite."""
 

@@ -22,7 +22,7 @@ HAIR = 1e-9
 """What a row of W may be exceeded by, in lengths scaled by X's half-widths: another processor rounds otherwise."""
 NARROW = 1e-7
 """A W that is narrower than this in a state, as a share of X's half-width, is taken for as wide as this there."""
-BUDGET = 400_000
+BUDGET = 100_000
 """Boxes at most."""
 
 
@@ -62,8 +62,10 @@ def _of_certificate(model: Model, said: ModelOf) -> Model:
     return replace(model, plant=plant, period=said.period, A=np.array(said.A), B=np.array(said.B))
 
 
-def prove(model: Model, certificate: Certificate, progress: Progress | None = None, budget: int = BUDGET) -> Proved:
-    """Whether h - L x - M u lies in W, in every piece, for all states of its box and all inputs allowed there.
+def prove(
+    model: Model, certificate: Certificate, progress: Progress | None = None, budget: int = BUDGET
+) -> Proved:
+    """Whether h - L x - M u lies in W, in every piece, for all states of X in its box and all inputs allowed there.
 
     Raises:
         DisturbanceError: nothing is known of the plant's flow from some of them.
@@ -102,7 +104,9 @@ class _Boxes:
         return _Boxes(*(getattr(self, one.name)[index] for one in fields(self)))
 
     def and_(self, more: _Boxes) -> _Boxes:
-        return _Boxes(*(np.concatenate([getattr(self, one.name), getattr(more, one.name)]) for one in fields(self)))
+        return _Boxes(
+            *(np.concatenate([getattr(self, one.name), getattr(more, one.name)]) for one in fields(self))
+        )
 
     @property
     def points(self) -> np.ndarray:
@@ -118,10 +122,14 @@ class _Work:
         pieces = certificate.pieces
         self._names = [piece.name for piece in pieces]
         self._slopes = [np.hstack([np.array(p.slope_x), np.array(p.slope_u)]) for p in pieces]
-        lower = np.array([[*p.x_lower, *p.u_lower] for p in pieces])
-        upper = np.array([[*p.x_upper, *p.u_upper] for p in pieces])
+        # A piece lies in X, or `lbmpc.sets.check` refuses it.
+        (x_low, x_high), (u_low, u_high) = certificate.model.X, certificate.model.U
+        lower = np.array([np.maximum([*p.x_lower, *p.u_lower], [*x_low, *u_low]) for p in pieces])
+        upper = np.array([np.minimum([*p.x_upper, *p.u_upper], [*x_high, *u_high]) for p in pieces])
         self._width = np.maximum(upper - lower, 1e-300)
-        self._boxes = _Boxes(np.arange(len(pieces)), np.full(len(pieces), ALL), np.ones(len(pieces)), lower, upper)
+        self._boxes = _Boxes(
+            np.arange(len(pieces)), np.full(len(pieces), ALL), np.ones(len(pieces)), lower, upper
+        )
         self.evaluated, self.done, self.reason = 0, 0.0, ""
 
     @property
@@ -147,7 +155,9 @@ class _Work:
         asked = (boxes.row[:, None] == ALL) | (boxes.row[:, None] == np.arange(broken.shape[1]))
         if (broken[asked] > 0.0).any():
             at = int(broken.max(axis=1).argmax())
-            self.reason = _outside(self._disturbance.model, self._names[i], forms.c[at], float(broken[at].max()))
+            self.reason = _outside(
+                self._disturbance.model, self._names[i], forms.c[at], float(broken[at].max())
+            )
             return
         box, row = np.nonzero(asked & ~(room >= 0.0))
         slope, left = slopes[box, row], boxes[box]
@@ -211,8 +221,7 @@ def _rows(W: np.ndarray, half: np.ndarray) -> _Rows | None:
 
 def _outside(model: Model, piece: str, point: np.ndarray, excess: float) -> str:
     e = np.concatenate([model.plant.x_e, model.plant.u_e])
-    state, given = (point + e)[: model.d], (point + e)[model.d :]
+    x, u = (np.array2string(part, precision=6) for part in np.split(point + e, [model.d]))
     return (
-        f"in piece {piece}, from x = {np.array2string(state, precision=6)} with u = {np.array2string(given, precision=6)}, h is "
-        f"outside of W by {excess:.3g} of X's half-widths"
+        f"in piece {piece}, from x = {x} with u = {u}, h is outside of W by {excess:.3g} of X's half-widths"
     )
