@@ -137,7 +137,7 @@ def survival(results: list[CaseResult]) -> list[Picture]:
     ax.set_xticks(range(len(places)), [f"{place:g}" for place in places])
     ax.set_ylim(-4, 104)
     ax.set_ylabel("runs that keep all constraints (%)")
-    ax.set_xlabel("margin for w_y (half-width of W; steps are not even)")
+    ax.set_xlabel("margin for w_y per second (half-width of W; steps are not even)")
     legend_above(ax)
     caption = "Share of runs that keep all true constraints, by margin."
     return [Picture(made, caption, "survival by margin and oracle")]
