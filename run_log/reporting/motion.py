@@ -57,7 +57,11 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
         )
     moving = [i for i, s in enumerate(states) if s.source != "hold"]
     first = max(moving[0] - 1, 0) if moving else len(states) - 1
-    states = states[first:]
+    return motion(states[first:], plant, run.config.period)
+
+
+def motion(states: list[PlantState], plant: Plant, period: float) -> Trajectory:
+    """The trajectory of these samples: at least one, each with the plant's number of states. period: seconds."""
     nothing = [np.nan] * plant.m
     applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
     # A plant that was started again counts its samples and its seconds from zero again.
@@ -66,16 +70,15 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
     offset, t_offset = -states[0].seq, -states[0].t
     for before, s in zip([states[0], *states], states, strict=False):
         if s.run_id != before.run_id:
-            offset, t_offset = step[-1] + 1 - s.seq, t[-1] + run.config.period - s.t
+            offset, t_offset = step[-1] + 1 - s.seq, t[-1] + period - s.t
         step.append(s.seq + offset)
         t.append(s.t + t_offset)
     known = [
-        _pieces(s, plant.m, run.config.period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
+        _pieces(s, plant.m, period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
         for before, s in pairwise(states)
     ]
-    return Trajectory(
-        np.array(step), np.array(t), np.array([s.x for s in states]), np.array(applied), ((), *known)
-    )
+    x = np.array([s.x for s in states])
+    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known))
 
 
 def _pieces(state: PlantState, m: int, period: float) -> Pieces:

@@ -110,7 +110,7 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
         "case",
         "runs",
         "keep X and U at samples",
-        "excess between (%)",
+        "excess, also between samples (%)",
         "J",
         *(["regret (%)", "worst"] if regret else ["worst J"]),
         "deviation",
