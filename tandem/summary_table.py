@@ -24,6 +24,7 @@ MEANING = {
     "iteration_limit_ticks": "the solver stopped before it had converged",
     "soft_ticks": "a soft state constraint gave way",
     "fallback_ticks": "input not from the solver",
+    "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
     "J": "sum of the stage costs, Q and R per second",
     "deviation": "integral of the performance states' squared deviations",
     "overshoot": "share of the state's own initial deviation",
@@ -67,7 +68,11 @@ def table(summary: Summary) -> Table:
     """The same for a person, with what else there is to know."""
     columns = Column(style="bold"), Column(justify="right"), Column(style="dim")
     shown = Table(*columns, show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name, value in msgspec.to_builtins(summary).items():
+    figures = msgspec.to_builtins(summary)
+    episodes = figures.pop("episodes")
+    if len(episodes) > 1:
+        figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
+    for name, value in figures.items():
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
     return shown

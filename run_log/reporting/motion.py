@@ -17,8 +17,13 @@ Pieces = tuple[tuple[float, tuple[float, ...]], ...]
 
 
 class Trajectory(msgspec.Struct, frozen=True):
-    """The plant's true motion from the sample that the first command answers; n samples, d states, m inputs."""
+    """The plant's true motion from the sample that the first command answers; n samples, d states, m inputs.
 
+    An episode is the motion of one start of the plant, likewise from the sample that its first command answers.
+    """
+
+    episode: np.ndarray
+    """(n,) which start of the plant it is, from 0 on."""
     step: np.ndarray
     """(n,) samples since the start."""
     t: np.ndarray
@@ -36,12 +41,17 @@ class Trajectory(msgspec.Struct, frozen=True):
         applied = self.applied[within].copy()
         # What acted before the first sample is not of this part.
         applied[:1] = np.nan
-        step, t = self.step[within], self.t[within]
-        return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, ((), *self.pieces[within][1:]))
+        step, t, pieces = self.step[within], self.t[within], ((), *self.pieces[within][1:])
+        return Trajectory(self.episode[within], step - step[:1], t - t[:1], self.x[within], applied, pieces)
+
+    def episodes(self) -> list[Trajectory]:
+        """Each of them as a trajectory of its own."""
+        begins = [0, *(np.flatnonzero(np.diff(self.episode)) + 1).tolist(), len(self.episode)]
+        return [self.part(first, behind - 1) for first, behind in pairwise(begins)]
 
 
 def trajectory(run: Run, plant: Plant) -> Trajectory:
-    """The true motion, without the hold before it.
+    """The true motion, without the hold before it, and without the hold at each later start of the plant.
 
     States of strangers (plants that no tick of the log answers) are left out.
 
@@ -55,30 +65,42 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
         raise LogError(
             f"{run.path}: holds no state of a plant with {plant.d} states ({', '.join(plant.states)})"
         )
-    moving = [i for i, s in enumerate(states) if s.source != "hold"]
-    first = max(moving[0] - 1, 0) if moving else len(states) - 1
-    return motion(states[first:], plant, run.config.period)
+    starts: dict[str, list[PlantState]] = {}
+    for s in states:
+        starts.setdefault(s.run_id, []).append(s)
+    moved = [found for one in starts.values() if (found := _after_the_hold(one))]
+    # Of a plant that never moved its last sample is all there is.
+    return motion(moved or [states[-1:]], plant, run.config.period)
 
 
-def motion(states: list[PlantState], plant: Plant, period: float) -> Trajectory:
-    """The trajectory of these samples: at least one, each with the plant's number of states. period: seconds."""
+def motion(episodes: list[list[PlantState]], plant: Plant, period: float) -> Trajectory:
+    """The trajectory of these samples, each with the plant's number of states; none of the lists is empty."""
+    states = [s for one in episodes for s in one]
     nothing = [np.nan] * plant.m
     applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
-    # A plant that was started again counts its samples and its seconds from zero again.
+    # A plant that was started again counts its samples from zero again; on another machine its seconds too.
     step: list[int] = []
     t: list[float] = []
     offset, t_offset = -states[0].seq, -states[0].t
     for before, s in zip([states[0], *states], states, strict=False):
         if s.run_id != before.run_id:
-            offset, t_offset = step[-1] + 1 - s.seq, t[-1] + period - s.t
+            offset = step[-1] + 1 - s.seq
+            t_offset = t_offset if s.t >= before.t else t[-1] + period - s.t
         step.append(s.seq + offset)
         t.append(s.t + t_offset)
     known = [
         _pieces(s, plant.m, period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
         for before, s in pairwise(states)
     ]
+    episode = np.repeat(np.arange(len(episodes)), [len(one) for one in episodes])
     x = np.array([s.x for s in states])
-    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known))
+    return Trajectory(episode, np.array(step), np.array(t), x, np.array(applied), ((), *known))
+
+
+def _after_the_hold(states: list[PlantState]) -> list[PlantState]:
+    """From the sample that the first command answers on; nothing where none came."""
+    moving = next((i for i, s in enumerate(states) if s.source != "hold"), None)
+    return [] if moving is None else states[max(moving - 1, 0) :]
 
 
 def _pieces(state: PlantState, m: int, period: float) -> Pieces:

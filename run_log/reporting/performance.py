@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from statistics import fmean
+
 import msgspec
 import numpy as np
 
@@ -19,7 +22,10 @@ FARTHEST = 1e100
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names."""
+    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names.
+
+    Of several episodes: the mean of J and of the deviation, the sum of the violations, of all else the worst.
+    """
 
     J: float
     """Sum of the stage costs, dx' Q dx + du' R du times the period, with the densities Q and R of the configuration
@@ -81,6 +87,23 @@ def performance(motion: Trajectory, plant: Plant, config: Config, truth: Plant) 
     )
 
 
+def of_episodes(every: Sequence[Performance]) -> Performance:
+    """The figures of several episodes together; of a single one its own."""
+    names = list(every[0].overshoot)
+    overshoots = {name: [v for one in every if (v := one.overshoot[name]) is not None] for name in names}
+    return Performance(
+        J=fmean(one.J for one in every),
+        deviation=fmean(one.deviation for one in every),
+        overshoot={name: max(values, default=None) for name, values in overshoots.items()},
+        settled_s=_largest([one.settled_s for one in every]),
+        settled_by_state_s={
+            name: _largest([one.settled_by_state_s[name] for one in every]) for name in names
+        },
+        constraint_violations=sum(one.constraint_violations for one in every),
+        excess_between_samples=_largest([one.excess_between_samples for one in every]),
+    )
+
+
 def outside(motion: Trajectory, plant: Plant) -> np.ndarray:
     """(n,) whether the true state or the applied input is outside X or U by more than 1e-6 of a half-width."""
     x, u = motion.x, motion.applied
@@ -88,6 +111,12 @@ def outside(motion: Trajectory, plant: Plant) -> np.ndarray:
     state = (x < plant.x_min - x_room) | (x > plant.x_max + x_room)
     applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false where there was none
     return np.asarray(state.any(axis=1) | applied.any(axis=1))
+
+
+def _largest(values: list[float | None]) -> float | None:
+    """None where one of them is."""
+    known = [value for value in values if value is not None]
+    return max(known) if len(known) == len(values) else None
 
 
 def _overshoot(dx: np.ndarray, began_off: bool) -> float | None:

@@ -9,7 +9,7 @@ from lbmpc.solver.solution import Status
 from protocol import messages as m
 from run_log.reading.gaps import lost_ticks
 from run_log.reporting.motion import trajectory
-from run_log.reporting.performance import Performance, performance
+from run_log.reporting.performance import Performance, of_episodes, performance
 from run_log.run import Run, plant_of
 
 SOFT = 1e-9
@@ -31,8 +31,13 @@ class PredictionError(msgspec.Struct, frozen=True):
 
 
 class Summary(Performance, frozen=True, kw_only=True):
-    """Figures of the true plant (from its own states after the hold) and of the control loop."""
+    """Figures of the true plant (from its own states after the hold) and of the control loop.
 
+    Each start of the plant is an episode; those of the plant are of all of them, as `Performance` says.
+    """
+
+    episodes: list[Performance]
+    """Each by itself."""
     ticks: int
     late_ticks: int
     """Ticks that began late, or ended after their period."""
@@ -67,8 +72,11 @@ def summarise(run: Run) -> Summary:
     results = [r for r in run.results if r.run_id in controllers]
     margins = [r.set_margin for r in results if r.set_margin is not None]
     timings = [timing for timing in run.timings if timing.run_id in controllers]
+    truth = plant.varied(**run.config.plant.truth) if run.config.plant.truth else plant
+    episodes = [performance(one, plant, run.config, truth) for one in trajectory(run, plant).episodes()]
     return Summary(
-        **msgspec.structs.asdict(performance(trajectory(run, plant), plant, run.config, truth=plant)),
+        **msgspec.structs.asdict(of_episodes(episodes)),
+        episodes=episodes,
         ticks=len(ticks),
         late_ticks=_late(run.config.period, ticks, timings),
         skipped_slots=sum(tick.skipped for tick in ticks),

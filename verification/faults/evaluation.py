@@ -49,8 +49,8 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     after = [one for one in moving if one.state.t > fault_at]
     # What a late command did before the fault, the fault has not done.
     judged = after or moving
-    known = motion([one.state for one in judged], plant, config.period)
-    every = motion([one.state for one in moving], plant, config.period)
+    known = motion([[one.state for one in judged]], plant, config.period)
+    every = motion([[one.state for one in moving]], plant, config.period)
     counted = every.part(0, min(round(seconds * config.rate), len(every.step) - 1))
 
     back_at = _back_at(rig, fault_at)

@@ -105,13 +105,16 @@ def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
 def _table(results: list[CaseResult], plant: Plant) -> Table:
     """A row for each case: medians, worst cases."""
     regret = any(row.regret is not None for result in results for row in result.rows)
+    several = any(result.case.episodes > 1 for result in results)
     state = plant.states[plant.performance[0]]
     head = [
         "case",
         "runs",
         "keep X and U at samples",
         "excess, also between samples (%)",
-        "J",
+        *(["J in the first"] if several else []),
+        *(["its regret (%)"] if several and regret else []),
+        "J in the later" if several else "J",
         *(["regret (%)", "worst"] if regret else ["worst J"]),
         "deviation",
         f"overshoot of {state} (%)",
@@ -133,6 +136,8 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
                 str(len(result.rows)),
                 f"{result.kept:.0%}",
                 _percent(result.worst("excess_between_samples")),
+                *([_number(result.median("J_first"))] if several else []),
+                *([_percent(result.median("regret_first"), signed=True)] if several and regret else []),
                 _number(result.median("J")),
                 *([_percent(result.median("regret"), signed=True)] if regret else []),
                 _percent(result.worst("regret"), signed=True) if regret else _number(result.worst("J")),
@@ -144,6 +149,10 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
                 times,
             ]
         )
+    of_several = (
+        "Of several episodes, all that does not say first is of the later ones: J and deviation are their mean, "
+        "overshoot and settling the worst of them; constraints and ticks are those of all. "
+    )
     note = (
         "Medians over the runs, where it does not say worst; the excess is the worst run's. Excess: the largest "
         "distance of the true motion from X, between samples too, as a share of the half-width; – where it is not "
@@ -152,7 +161,7 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
         "ticks in which a soft constraint gave way, and ticks whose input did not come from the solver. Solve times "
         "were measured alone, from the plant's own x0, once for every oracle, horizon, network and rate."
     )
-    return Table(head, body, note)
+    return Table(head, body, of_several * several + note)
 
 
 def _bands(plant: Plant) -> str:

@@ -9,6 +9,7 @@ from matplotlib.ticker import NullLocator
 
 from lbmpc.plants import Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
+from tandem.experiments.reporting.pictures_by_episode import episodes
 from tandem.experiments.reporting.pictures_over_time import lemma, recovery, trajectories
 from tandem.experiments.reporting.style import Picture, figure, legend_above, looks, named
 from tandem.experiments.study.declaration import Picture as Kind
@@ -21,6 +22,8 @@ WIDE = 50.0
 def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | None) -> list[Picture]:
     """The pictures of one group."""
     match kind:
+        case "episodes":
+            return episodes(results)
         case "trajectories":
             return trajectories(results, plant)
         case "states":
@@ -165,27 +168,27 @@ def survival(results: list[CaseResult], plant: Plant) -> list[Picture]:
 
 
 def by_family(results: list[CaseResult]) -> dict[str, list[CaseResult]]:
-    """Cases that one declaration's `vary` made, together."""
+    """Cases that differ in the last of what varies alone, together."""
     families: dict[str, list[CaseResult]] = {}
     for result in results:
-        families.setdefault(result.case.name.partition(": ")[0], []).append(result)
+        families.setdefault(result.case.family, []).append(result)
     return families
 
 
 def family_label(member: CaseResult) -> str:
-    return member.label.partition(": ")[0]
+    return member.case.family
 
 
 def margins(members: list[CaseResult]) -> list[float]:
     """What varies from member to member: a number, or the one entry of a list that does."""
-    values: list[Any] = [next(iter(member.case.varied.values()), 0.0) for member in members]
+    values: list[Any] = [[0.0, *member.case.varied.values()][-1] for member in members]
     if not isinstance(values[0], list):
         return [float(value) for value in values]
     return [value[_varying(values)] for value in values]
 
 
 def _what_varies(members: list[CaseResult], plant: Plant) -> str:
-    key, value = next(iter(members[0].case.varied.items()), ("", 0.0))
+    key, value = [("", 0.0), *members[0].case.varied.items()][-1]
     name = key.rpartition(".")[2]
     if not isinstance(value, list):
         return name

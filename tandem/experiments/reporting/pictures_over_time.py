@@ -112,7 +112,8 @@ def recovery(results: list[CaseResult], plant: Plant) -> list[Picture]:
         drift = same[0].case.faults.drift
         said = "no change"
         if drift is not None:
-            values = ", ".join(f"{n} = {plant.parameters[n]:g} to {v:g}" for n, v in drift.to.items())
+            before = {**plant.parameters, **same[0].case.config.plant.truth}
+            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" for n, v in drift.to.items())
             when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
             said = f"{values} {when}"
             for ax in (above, below):

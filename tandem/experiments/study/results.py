@@ -11,6 +11,7 @@ import numpy as np
 
 from lbmpc.plants import Plant
 from node_runtime import provenance
+from run_log.reporting.performance import of_episodes
 from run_log.reporting.summary import Spread
 from tandem.experiments.study.declaration import Declaration, Resolved
 from tandem.experiments.study.plan import RowPlan
@@ -19,7 +20,11 @@ from tandem.experiments.study.work import Record
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, as `summary.json` has it."""
+    """One run, as `summary.json` has it.
+
+    Of several episodes, J, regret, deviation, overshoot and settling are those from the second one on: what the run
+    came to with a memory. J and the deviation are their mean, overshoot and settling the worst.
+    """
 
     case: str
     group: str
@@ -30,9 +35,12 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """Sum of the stage costs, Q and R as densities; null where the plant was lost, as for the five after it."""
     regret: float | None
     """J above that of the true h from the same start, as a share of it, negative where below; null where either was
-    lost, or the plant drifts."""
+    lost."""
     deviation: float | None
     """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
+    J_by_episode: list[float | None]
+    regret_by_episode: list[float | None]
+    """Of each episode; null where the plant was lost before its end."""
     overshoot: dict[str, float | None] | None
     """Per performance state, as a share of its initial deviation; null for one that began settled."""
     settled_s: float | None
@@ -51,6 +59,14 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     weights_adopted: int
     error_first_second: float | None
     error_last_second: float | None
+
+    @property
+    def J_first(self) -> float | None:
+        return self.J_by_episode[0]
+
+    @property
+    def regret_first(self) -> float | None:
+        return self.regret_by_episode[0]
 
 
 class CaseResult(NamedTuple):
@@ -110,32 +126,34 @@ def collect(
     cases: dict[str, CaseResult] = {}
     for plan in plans:
         case, record = plan.case, records[plan.job.key]
-        floor = records[plan.floor.key] if plan.floor is not None else None
-        timing = timings.get(case.name)
+        floor, timing = records[plan.floor.key], timings.get(case.name)
         result = cases.setdefault(case.name, CaseResult(case, [], [], timing))
         result.rows.append(_row(plan, record, floor, timing, plant))
         result.records.append(record)
     return list(cases.values())
 
 
-def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | None, plant: Plant) -> Row:
+def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Plant) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
-    found, lost = record.performance, record.lost is not None
+    found, floors = _figures(record), _figures(floor)
+    J, least = _J_by_episode(record), _J_by_episode(floor)
     return Row(
         case=plan.case.name,
         group=plan.case.group,
         oracle=config.controller.oracle,
         seed=plan.seed,
         x0=list(x0),
-        J=None if lost else found.J,
-        regret=_regret(record, floor),
-        deviation=None if lost else found.deviation,
-        overshoot=None if lost else found.overshoot,
-        settled_s=None if lost else found.settled_s,
-        settled_by_state_s=None if lost else found.settled_by_state_s,
-        violations=found.constraint_violations,
-        excess_between_samples=None if lost else found.excess_between_samples,
+        J=found.get("J"),
+        regret=_regret(found.get("J"), floors.get("J")),
+        deviation=found.get("deviation"),
+        J_by_episode=J,
+        regret_by_episode=[_regret(own, its) for own, its in zip(J, least, strict=True)],
+        overshoot=found.get("overshoot"),
+        settled_s=found.get("settled_s"),
+        settled_by_state_s=found.get("settled_by_state_s"),
+        violations=record.violations,
+        excess_between_samples=record.excess_between_samples if found else None,
         iteration_limit_ticks=record.iteration_limit_ticks,
         soft_ticks=record.soft_ticks,
         fallback_ticks=record.fallback_ticks,
@@ -147,10 +165,19 @@ def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | N
     )
 
 
-def _regret(record: Record, floor: Record | None) -> float | None:
-    if floor is None or record.lost is not None or floor.lost is not None or not floor.performance.J:
-        return None
-    return record.performance.J / floor.performance.J - 1.0
+def _figures(record: Record) -> dict[str, Any]:
+    """Of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
+    if record.lost is not None:
+        return {}
+    return msgspec.structs.asdict(of_episodes(record.episodes[1:] or record.episodes))
+
+
+def _J_by_episode(record: Record) -> list[float | None]:
+    return [*(one.J for one in record.episodes), *[None] * (record.job.episodes - len(record.episodes))]
+
+
+def _regret(J: float | None, floor: float | None) -> float | None:
+    return None if J is None or not floor else J / floor - 1.0
 
 
 def spread(timing: Timing) -> Spread:

@@ -37,8 +37,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     job: Job
     lost: str | None
     """Why the true motion could not be followed to the end."""
-    performance: Performance
-    """Of the motion as far as it could be followed."""
+    episodes: list[Performance]
+    """Those that could be followed to their end."""
+    violations: int
+    """Samples outside X or U, in all that could be followed."""
+    excess_between_samples: float | None
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
@@ -52,7 +55,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def kept(self) -> bool:
         """All constraints, at all samples, on the true plant."""
-        return self.lost is None and self.performance.constraint_violations == 0
+        return self.lost is None and self.violations == 0
 
 
 def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -> None:
@@ -62,7 +65,7 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
         ConfigError: the job's configuration admits no controller.
         OSError: something else than a file has the name of a log.
     """
-    outcome = follow(job.config, job.steps, job.faults)
+    outcome = follow(job.config, job.steps, job.faults, episodes=job.episodes)
     for log in logs:
         require_regular(log)
         partial = log.with_suffix(".partial")
@@ -78,7 +81,9 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
     return Record(
         job=job,
         lost=outcome.lost,
-        performance=Performance(**{name: getattr(summary, name) for name in Performance.__struct_fields__}),
+        episodes=summary.episodes[: outcome.episodes],
+        violations=summary.constraint_violations,
+        excess_between_samples=summary.excess_between_samples,
         iteration_limit_ticks=summary.iteration_limit_ticks,
         soft_ticks=summary.soft_ticks,
         fallback_ticks=summary.fallback_ticks,

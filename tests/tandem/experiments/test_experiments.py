@@ -33,7 +33,7 @@ from tandem.experiments.study.plan import Job, code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
 from tandem.experiments.study.work import Record, Traces, read, work
 from tests.helpers.paths import CONFIGS, write_namesakes
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM
 
 PLANT = get_plant("moore_greitzer")
 SHIPPED = CONFIGS / "experiments" / "paper.toml"
@@ -41,7 +41,7 @@ SMALL = """
 name = "small"
 title = "A small one"
 steps = 30
-[base]
+[set]
 controller = { horizon = 15, solver = { compile = "never" } }
 network = { hidden = [6] }
 trainer = { steps = 5 }
