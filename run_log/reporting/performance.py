@@ -96,7 +96,9 @@ def of_episodes(every: Sequence[Performance]) -> Performance:
         deviation=fmean(one.deviation for one in every),
         overshoot={name: max(values, default=None) for name, values in overshoots.items()},
         settled_s=_largest([one.settled_s for one in every]),
-        settled_by_state_s={name: _largest([one.settled_by_state_s[name] for one in every]) for name in names},
+        settled_by_state_s={
+            name: _largest([one.settled_by_state_s[name] for one in every]) for name in names
+        },
         constraint_violations=sum(one.constraint_violations for one in every),
         excess_between_samples=_largest([one.excess_between_samples for one in every]),
     )

@@ -65,7 +65,9 @@ def _panel(result: CaseResult) -> str:
 
 def _line(ax: Axes, result: CaseResult, look: Look) -> None:
     """regret: (runs, episodes), percent."""
-    regret = np.array([[np.nan if r is None else 100 * r for r in row.regret_by_episode] for row in result.rows])
+    regret = np.array(
+        [[np.nan if r is None else 100 * r for r in row.regret_by_episode] for row in result.rows]
+    )
     regret = np.minimum(regret, LARGEST)
     known = ~np.isnan(regret).all(axis=0)
     if not known.any():

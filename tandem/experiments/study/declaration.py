@@ -202,9 +202,7 @@ def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick:
         few = declared.quick
         seeds, x0s = seeds[: few.seeds], x0s[: few.x0s]
         episodes = min(episodes, few.episodes)
-        vary = {
-            key: values if key == ORACLE else _spread(values, few.values) for key, values in vary.items()
-        }
+        vary = {key: values if key == ORACLE else _spread(values, few.values) for key, values in vary.items()}
     made = []
     for values in itertools.product(*vary.values()):
         varied = dict(zip(vary, values, strict=True))

@@ -16,7 +16,7 @@ from lbmpc.solver.gauss_newton import Solver
 from node_runtime.config.sections import load
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.lockstep import follow
-from tests.helpers.integrator import INTEGRATOR
+from tests.helpers.plants.integrator import INTEGRATOR
 
 LABELS = st.lists(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=2), min_size=1, max_size=20)
 X, U = np.zeros(2), np.zeros(1)
