@@ -23,8 +23,9 @@ STEP_NORM = 0.4
 """At most so much of |a| dt, a the linearisation, in one integration step: h is then right to 1e-9."""
 MOST_STEPS = 400
 """Of integration in a period. More are a plant far too fast for its period, and would fill the memory."""
-LEAST = 1e-3
-"""States that must stay positive are not let below this in the expression, or a wild plan would make it NaN."""
+LEAST = 2e-3
+"""Of their half-width: states that must stay positive are not let below this in the expression, or a wild plan would
+make it NaN."""
 
 
 class PerfectOracle(Oracle):
@@ -76,7 +77,8 @@ def _functions(model: Model, truth: Plant) -> tuple[ca.Function, ca.Function]:
     plant, d = model.plant, model.d
     xu, parameters = ca.SX.sym("xu", d + model.m), ca.SX.sym("parameters", len(truth.parameters))
     low = np.full(d, -np.inf)
-    low[[domain.state for domain in plant.positive]] = LEAST
+    positive = [domain.state for domain in plant.positive]
+    low[positive] = LEAST * plant.x_scale[positive]
     start = ca.fmax(xu[:d] + plant.x_e, low)
     u = xu[d:] + plant.u_e
     steps = _steps(truth, model.period)

@@ -171,9 +171,10 @@ def _array(value: Any) -> Any:
 
 
 class Truth:
-    """The plant's true motion, integrated to a local error below 1e-9 over a sampling period.
+    """The plant's true motion, integrated to a local error below 1e-9 half-widths over a sampling period.
 
-    DOP853 (order 8, scipy) at rtol = atol = 1e-12. Deterministic: the same numbers in, the same numbers out.
+    DOP853 (order 8, scipy) at rtol = 1e-12 and atol = 1e-12 half-widths. Deterministic: the same numbers in, the same
+    numbers out.
     """
 
     def __init__(self, plant: Plant):
@@ -215,7 +216,7 @@ class Truth:
             np.asarray(x, dtype=float),
             dt,
             rtol=INTEGRATION_TOLERANCE,
-            atol=INTEGRATION_TOLERANCE,
+            atol=INTEGRATION_TOLERANCE * self.plant.x_scale,
         )
         while solver.status == "running":
             trouble = solver.step()
@@ -230,7 +231,9 @@ class Truth:
         inside[:] = x
         for domain in self.plant.positive:
             # A trial stage may leave the domain where the true motion does not; what is accepted is checked.
-            inside[domain.state] = max(inside[domain.state], 1e-12)
+            inside[domain.state] = max(
+                inside[domain.state], INTEGRATION_TOLERANCE * self.plant.x_scale[domain.state]
+            )
         self._f()
         dx = self._f.outputs["dx"][:, 0]
         if not np.isfinite(dx).all():
@@ -283,7 +286,7 @@ def _whole_step(plant: Plant) -> ca.Function:
     x, u, dt = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m), ca.SX.sym("dt")
     after, slopes = dop853(f, x, u, dt)
     slopes = [*slopes, f(after, u)]
-    scale = INTEGRATION_TOLERANCE * (1 + ca.fmax(ca.fabs(x), ca.fabs(after)))
+    scale = INTEGRATION_TOLERANCE * (plant.x_scale + ca.fmax(ca.fabs(x), ca.fabs(after)))
     fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (method.E5, method.E3))
     bound = plant.d * (fifth + 0.01 * third)
     # Both estimates are exactly zero where nothing moves.
