@@ -26,6 +26,10 @@ ROUNDING = 1e-12
 """Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
+LARGEST = 1e60
+"""Of any number in a certificate: a product of five of them is finite."""
+
+
 class CertificateError(SetError):
     """A certificate cannot be used here; the text says what differs."""
 
@@ -177,6 +181,8 @@ def _require_shapes(certificate: Certificate) -> None:
             _require(getattr(piece, name), f"piece {piece.name!r}: {name}", shape)
         if not (rows and len(piece.W) and 0 <= piece.target < len(certificate.pieces)):
             raise CertificateError(f"piece {piece.name!r}: no rows, no W, or a target that is not there")
+        if not (np.abs(np.array(piece.G)).max(axis=1) >= 1 / LARGEST).all():
+            raise CertificateError(f"piece {piece.name!r}: a row of G has no direction")
         lower, upper = np.array(piece.u_lower), np.array(piece.u_upper)
         if not ((said.U[0] <= lower) & (lower <= upper) & (upper <= said.U[1])).all():
             raise CertificateError(
@@ -191,5 +197,5 @@ def _require(value: object, what: str, shape: tuple[int, ...]) -> None:
         raise CertificateError(f"{what}: its rows have different lengths") from error
     if array.shape != shape:
         raise CertificateError(f"{what} has shape {array.shape}, not {shape}")
-    if not np.isfinite(array).all():
-        raise CertificateError(f"{what}: not finite")
+    if not (np.abs(array) <= LARGEST).all():
+        raise CertificateError(f"{what}: not finite, or beyond {LARGEST:g}")
