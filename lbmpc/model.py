@@ -11,12 +11,13 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import expm, solve_discrete_are
 
 from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.base import Plant
 from lbmpc.plants.inspection import PlantDefinitionError, require_model
 from lbmpc.pole_placement import place
+from lbmpc.terminal_cost import TOLERANCE, TerminalCost, shortfall, terminal_cost
 
 Pieces = tuple[tuple[float, np.ndarray], ...]
 """Stretches of time under one input each: (seconds, u (m,))."""
@@ -48,9 +49,13 @@ class Model:
     A: np.ndarray
     B: np.ndarray
     Q: np.ndarray
+    """Weight of the states of one stage: its density times the period."""
     R: np.ndarray
+    """Weight of the inputs of one stage, likewise."""
     K: np.ndarray
+    """Feedback of the tubes and of the fallback."""
     P: np.ndarray
+    """Weight of the last state, as `lbmpc.terminal_cost` says."""
 
     @property
     def d(self) -> int:
@@ -64,6 +69,15 @@ class Model:
     def closed_loop(self) -> np.ndarray:
         """A + BK, Schur stable."""
         return self.A + self.B @ self.K
+
+    @cached_property
+    def cost_scale(self) -> float:
+        """What the cost is counted in: x'|P|x + u'Ru with every state and input at its half-width.
+
+        That is a bound on the cost to go from anywhere in X, and one input at the end of its range.
+        """
+        x, u = self.plant.x_scale, self.plant.u_scale
+        return float(x @ np.abs(self.P) @ x + u @ self.R @ u)
 
     def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray, pieces: Pieces = ()) -> np.ndarray:
         """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), with the input that really was applied.
@@ -94,7 +108,7 @@ class Model:
         Up to two periods by a series: `discretise` to rounding, in a tenth of the time.
         """
         if not 0.0 <= seconds <= 2.0 * self.period:
-            phi, gamma = discretise(self.a, self.b, seconds)
+            phi, gamma = discretise(self.a, self.b, seconds, balanced(self.plant))
             return phi @ x + gamma @ u
         held = self._held
         inputs = held.inputs
@@ -106,11 +120,12 @@ class Model:
     def _held(self) -> Bound:
         """(x, u, share) -> the state after this share of a period.
 
-        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings) is a polynomial in the share; squaring does the rest.
+        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings), in balanced units, is a polynomial in the share;
+        squaring does the rest.
         """
         d, m = self.b.shape
-        block = np.zeros((d + m, d + m))
-        block[:d, :d], block[:d, d:] = self.a * self.period, self.b * self.period
+        units = balanced(self.plant)
+        block = _block(self.a, self.b) * self.period * units / units[:, None]
         squarings = max(0, math.ceil(math.log2(max(np.abs(block).sum(axis=0).max(), 1e-300) / SERIES_NORM)))
         block /= 2.0**squarings
         terms = [np.eye(d + m)]
@@ -125,7 +140,7 @@ class Model:
         power = held(part)
         for _ in range(squarings):
             power = power @ power
-        after = power[:d, :d] @ x + power[:d, d:] @ u
+        after = (power[:d, :d] @ (x / units[:d]) + power[:d, d:] @ (u / units[d:])) * units[:d]
         return Bound(ca.Function("held", [x, u, part], [after], ["x", "u", "share"], ["after"]))
 
 
@@ -135,34 +150,78 @@ def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     return a, b
 
 
-def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact zero-order hold: exp([[a, b], [0, 0]] T)."""
+def balanced(plant: Plant) -> np.ndarray:
+    """Units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
+
+    A state in pascals beside one in metres would otherwise cost digits. Powers of two: going there and back is exact.
+    """
+    return np.exp2(np.rint(np.log2(np.concatenate([plant.x_scale, plant.u_scale]))))
+
+
+def discretise(
+    a: np.ndarray, b: np.ndarray, period: float, units: np.ndarray | float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exact zero-order hold: exp([[a, b], [0, 0]] T), computed in these units of (x, u), (d + m,)."""
     d, m = b.shape
-    block = np.zeros((d + m, d + m))
-    block[:d, :d], block[:d, d:] = a, b
-    exponential = expm(block * period)
+    units = np.broadcast_to(units, d + m)
+    exponential = expm(_block(a, b) * period * units / units[:, None]) * units[:, None] / units
     return exponential[:d, :d], exponential[:d, d:]
 
 
-def build_model(
-    plant: Plant, period: float, Q: np.ndarray | None = None, R: np.ndarray | None = None
-) -> Model:
-    """The model at a sampling period (seconds), with diagonal weights Q (d,) and R (m,), ones by default.
+def _block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[[a, b], [0, 0]]."""
+    return np.vstack([np.hstack([a, b]), np.zeros((b.shape[1], sum(b.shape)))])
 
-    K places the plant's own closed-loop poles, mapped by exp(p T), or is the LQR gain when it names none. P solves
-    (A+BK)' P (A+BK) - P = -(Q + K'RK).
+
+def build_model(
+    plant: Plant,
+    period: float,
+    Q: np.ndarray | None = None,
+    R: np.ndarray | None = None,
+    terminal: TerminalCost = "riccati",
+) -> Model:
+    """The model at a sampling period T.
+
+    K places the plant's own closed-loop poles, mapped by exp(p T), or is the LQR gain when it names none.
+
+    Args:
+        plant: what is linearised.
+        period: T in seconds.
+        Q, R: diagonals of the weights as densities, per second, (d,) and (m,); ones by default. A stage weighs T times
+            as much, so that the cost of a motion does not depend on how often it is sampled.
+        terminal: the equation for P.
 
     Raises:
-        ModelError: the plant cannot be used as it is described, is not stabilisable, or weights of the wrong length.
+        ModelError: the plant cannot be used as it is described, is not stabilisable, weights of the wrong length, or no
+            P that bounds what comes after the horizon.
     """
     try:
         require_model(plant)
     except PlantDefinitionError as error:
         raise ModelError(str(error)) from error
     a_c, b_c = linearise(plant)
-    a, b = discretise(a_c, b_c, period)
-    q = np.diag(_weights("Q", Q, plant.d))
-    r = np.diag(_weights("R", R, plant.m))
+    units = balanced(plant)
+    A, B = discretise(a_c, b_c, period, units)
+    q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)
+    x, u = units[: plant.d], units[plant.d :]
+    a, b = A * x / x[:, None], B * u / x[:, None]
+    k, p = _gain_and_terminal_weight(plant, period, terminal, a, b, np.diag(q * x**2), np.diag(r * u**2), x)
+    return Model(
+        plant, period, a_c, b_c, A, B, np.diag(q), np.diag(r), k * u[:, None] / x, p / np.outer(x, x)
+    )
+
+
+def _gain_and_terminal_weight(
+    plant: Plant,
+    period: float,
+    terminal: TerminalCost,
+    a: np.ndarray,
+    b: np.ndarray,
+    q: np.ndarray,
+    r: np.ndarray,
+    x: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """K and P of the model in the units x, (d,). Raises `ModelError`."""
     try:
         if plant.poles is not None:
             k = place(a, b, [_real(np.exp(p * period)) for p in plant.poles])
@@ -177,8 +236,36 @@ def build_model(
         raise ModelError(
             f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})"
         )
-    p = solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
-    return Model(plant, period, a_c, b_c, a, b, q, r, k, 0.5 * (p + p.T))
+    return k, _terminal_weight(plant, period, terminal, a, b, q, r, k, plant.x_scale / x)
+
+
+def _terminal_weight(
+    plant: Plant,
+    period: float,
+    kind: TerminalCost,
+    a: np.ndarray,
+    b: np.ndarray,
+    q: np.ndarray,
+    r: np.ndarray,
+    k: np.ndarray,
+    scale: np.ndarray,
+) -> np.ndarray:
+    """P of that name, of which it is certain that it bounds what comes after the horizon. Raises `ModelError`."""
+    where = f"{plant.name}: the terminal cost {kind!r} at a period of {period:g} s"
+    remedy = (
+        f"take {'lyapunov' if kind == 'riccati' else 'riccati'!r} (controller.terminal), or a shorter period"
+    )
+    try:
+        p, k_f = terminal_cost(kind, a, b, q, r, k, period)
+        missing = shortfall(p, k_f, a, b, q, r, scale)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(f"{where} has no solution: {error}; {remedy}") from error
+    if not missing <= TOLERANCE:
+        raise ModelError(
+            f"{where} does not bound what comes after the horizon: P - A_f'P A_f is smaller than Q + K_f'R K_f by "
+            f"{missing:.2g} of P; {remedy}"
+        )
+    return p
 
 
 def _weights(name: str, given: np.ndarray | None, length: int) -> np.ndarray:

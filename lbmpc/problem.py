@@ -11,7 +11,6 @@ conditioned. The constraints do not see the oracle: in v they are linear, with c
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,7 +33,7 @@ class Problem:
     """(e:LBMPC) for one model, oracle and horizon.
 
     `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty
-    `penalty` per unit of violation relative to `scale` of its row, unless a set guarantees that they can be kept.
+    `penalty` times the model's `cost_scale` per half-width of violation, unless a set guarantees that they can be kept.
     """
 
     model: Model
@@ -55,11 +54,10 @@ def build_problem(
     horizon: int,
     tightening: Tightening = "first_step",
     W: np.ndarray | None = None,
-    penalty: float = 1e4,
+    penalty: float = 100.0,
     certificate: Certificate | None = None,
-    guard_of: Callable[[Certificate], Guard] = Guard,
 ) -> Problem:
-    """Lay out the constraints of the named tightening.
+    """Lay out the constraints of the named tightening; W (d,) as h of one period.
 
     * `none`: plain X and U.
     * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows soft.
@@ -83,7 +81,7 @@ def build_problem(
             raise CertificateError(
                 f"these sets are an approximation ({certificate.kind}) that claims nothing"
             )
-        guard = guard_of(certificate)
+        guard = Guard(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
     n = horizon
     if tightening == "tube":

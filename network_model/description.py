@@ -11,7 +11,7 @@ leading 1, the output layer's included. How the hidden layers act on the window 
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -35,8 +35,6 @@ Window = Annotated[int, msgspec.Meta(ge=1, le=64)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 LAYERS = 32
 """Hidden layers at most: a description comes from elsewhere, and memory is taken by it."""
-# Fields that came later are left out of the hash at these values: weights in older logs keep their network's hash.
-_FIRST: dict[str, Any] = {"architecture": "mlp", "window": 1, "options": {}}
 
 
 class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -105,9 +103,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     def sha256(self) -> str:
         """Of all fields."""
-        fields = msgspec.to_builtins(self)
-        kept = {name: value for name, value in fields.items() if name not in _FIRST or value != _FIRST[name]}
-        return hashlib.sha256(msgspec.json.encode(kept)).hexdigest()
+        return hashlib.sha256(msgspec.json.encode(self)).hexdigest()
 
 
 def initial_hidden(description: NetworkDescription, rng: np.random.Generator) -> list[np.ndarray]:

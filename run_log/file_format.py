@@ -12,7 +12,7 @@ from run_log.errors import LogError
 
 PROFILE = "tandem"
 """The MCAP profile: what tells our logs from other MCAP files."""
-VERSIONS = {1: "0.1.0"}
+VERSIONS = {1: "0.1.0", 2: "0.2.0"}
 """By format: the version of Tandem that brought it. A new line is due when an older reader would be misled."""
 FORMAT = max(VERSIONS)
 """Of the logs that are written now: which channels, attachments and metadata there are."""

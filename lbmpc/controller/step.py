@@ -103,6 +103,8 @@ class Controller:
         verdict = Verdict("none")
         if seen.hidden is not None:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
+        if seen.truth:
+            oracle = self.oracle.told(oracle, seen.truth)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
@@ -215,9 +217,7 @@ def _acting(seen: Observation) -> np.ndarray | None:
 
 
 def _box(first: FirstInputs | None) -> Box | None:
-    if first is None or first.lower is None or first.upper is None:
-        return None
-    return first.lower, first.upper
+    return None if first is None else (first.lower, first.upper)
 
 
 def _begun_within(plan: Plan, first: Box | None) -> Plan:

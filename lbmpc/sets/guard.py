@@ -43,9 +43,8 @@ class FirstInputs:
     -1 outside.
     """
 
-    lower: np.ndarray | None
-    upper: np.ndarray | None
-    """None where a guard says nothing."""
+    lower: np.ndarray
+    upper: np.ndarray
     margin: float
     piece: int
 
@@ -186,7 +185,7 @@ class Guard:
         distance, _ = rows.farthest(room, self._most)
         return None if distance < 0.0 else rows.within(room, self._share * distance)
 
-    def _outside(self, rows: InputRows, x: np.ndarray) -> Bounds | tuple[None, None]:
+    def _outside(self, rows: InputRows, x: np.ndarray) -> Bounds:
         found = self._inside(rows, x)
         if found is not None:
             return found

@@ -19,6 +19,7 @@ from network_model.description import LAYERS, Width
 from network_model.operations import BOUNDED, Activation
 from network_model.registry import get_architecture
 from node_runtime.config import literals, strict
+from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, Fail
 from protocol.codec import first_non_finite
 
@@ -30,6 +31,7 @@ Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 LONGEST_PERIOD = 1e6
+LONGEST_HORIZON = 1000
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
@@ -49,6 +51,8 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
@@ -60,9 +64,10 @@ class SolverConfig(Section, frozen=True):
     """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
     max_iterations: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
     tolerance: Positive = 1e-6
-    """Converged when no input of the plan moves by more than this (input units)."""
-    penalty: Positive = 1e4
-    """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
+    """Converged when no input of the plan moves by more than this share of its half-width."""
+    penalty: Positive = 100.0
+    """Exact-penalty weight on soft state constraints: what a violation of one half-width costs, in units of the cost to
+    go x'Px with every state at its half-width."""
 
 
 class BackupConfig(Section, frozen=True):
@@ -75,20 +80,23 @@ class BackupConfig(Section, frozen=True):
 
 
 class ControllerConfig(Section, frozen=True):
-    horizon: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 60
+    horizon: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_HORIZON)] = 60
+    """N, steps of the prediction."""
+    horizon_seconds: Seconds | None = None
+    """The horizon in seconds instead. Where a configuration is read it becomes `horizon`, and is None ever after."""
     oracle: literals.OracleName = "dnn"
     tightening: literals.TighteningName = "first_step"
     sets: str | None = None
     """File of certified sets for "invariant"; None: those that `tandem sets compute` left in the cache."""
-    guard: literals.GuardName = "half"
-    """Distance that "invariant" keeps from the sets' boundary: half of what some input keeps; "steps": 0.02, 0.005,
-    0.001 or none, and outside no bounds at all, as runs recorded before this key did."""
     W: list[NonNegative] | None = None
-    """Half-widths of the disturbance box used for tightening, as h; None: the plant's own, times the period."""
+    """Half-widths of the disturbance box used for tightening, as h per second of period; None: the plant's own."""
     Q: list[NonNegative] | None = None
-    """Diagonal state weights; None: ones."""
+    """Diagonal state weights, per second: a stage has Q / rate; None: ones."""
     R: list[Positive] | None = None
-    """Diagonal input weights; None: ones."""
+    """Diagonal input weights, per second; None: ones."""
+    terminal: literals.TerminalName = "riccati"
+    """P of the terminal cost: of the LQR with the stage weights, of the feedback K ("lyapunov"), or the one of the
+    reimplementation of Aswani et al. (`lbmpc.terminal_cost`)."""
     keyframe_every: Count = 100
     """Ticks between keyframes in the log."""
     late_fraction: Unit = 0.2
@@ -116,8 +124,9 @@ class NetworkConfig(Section, frozen=True):
     )
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
-    output_scale: Positive = 0.2
-    """h per second of period that counts as 1 for the network: h of a sampled plant grows with the period."""
+    output_scale: Positive = 0.4
+    """h that counts as 1 for the network, in half-widths of each state per second of period: h of a sampled plant grows
+    with the period."""
     max_layer_norm: Positive = 100.0
 
 
@@ -148,26 +157,46 @@ class TrialConfig(Section, frozen=True):
     """The same for a set that was adopted: what K has not learned yet is no reason to roll back."""
 
 
+class KalmanConfig(Section, frozen=True):
+    """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
+
+    prior_variance: Positive = 0.02
+    """Of each entry of K, before the first sample."""
+    label_variance: Positive = 0.01
+    """Of each entry of a label: measuring noise, and what the features cannot explain."""
+    memory: Seconds = 10.0
+    """Seconds in which what is known fades towards the prior, by a factor of e."""
+
+
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
+    law: literals.LawName = "gradient"
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
     gamma: Unit = 0.8
-    """Learning rate of the last layer, 0 < gamma < 1."""
-    column_bound: Positive = 1.0
-    """Bound on the norm of each column of K, as h per second of period."""
-    initial_scale: NonNegative = 6e-3
-    """Standard deviation of the entries of K_0, as h per second of period."""
+    """Learning rate of the gradient law, 0 < gamma < 1."""
+    column_bound: Positive = 2.0
+    """Bound on the norm of each column of K, as h, in half-widths of its state per second of period."""
+    initial_scale: NonNegative = 1.2e-2
+    """Standard deviation of the entries of K_0, likewise."""
     start: literals.StartName = "random"
     """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
     at_adoption: literals.AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
+    kalman: KalmanConfig = KalmanConfig()
     refit: RefitConfig = RefitConfig()
     trial: TrialConfig = TrialConfig()
 
 
+class ConstantConfig(Section, frozen=True):
+    gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5
+    """Share of a new label in the filtered one; 1: the last label alone."""
+
+
 class L2nwConfig(Section, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
-    bandwidth: Positive = 0.5
+    bandwidth: Positive = 1.0
+    """Of the Gaussian kernel, in half-widths of each of its variables."""
     regularisation: Positive = 1e-3
     variables: list[str] | None = None
     """Names of the states and inputs the kernel sees; None: the plant's own choice."""
@@ -252,6 +281,7 @@ class Config(Section, frozen=True):
     controller: ControllerConfig = ControllerConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
+    constant: ConstantConfig = ConstantConfig()
     l2nw: L2nwConfig = L2nwConfig()
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()
@@ -276,14 +306,16 @@ class Config(Section, frozen=True):
 
 
 def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Read a TOML file (None: all defaults) and apply `section.key=value` overrides on top.
+    """Read a TOML file, or the shipped configuration of that name, and apply `section.key=value` overrides on top.
+
+    None: all defaults.
 
     Raises:
         ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
     """
-    return _overridden(
-        strict.load_tree(path), overrides or [], str(path) if path is not None else "configuration"
-    )
+    if path is None:
+        return _overridden({}, overrides or [], "configuration")
+    return _overridden(strict.load_tree(config_file(path)), overrides or [], str(path))
 
 
 def override(config: Config, assignments: list[str]) -> Config:
@@ -325,6 +357,7 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
             f"one of {', '.join(BOUNDED)}",
         )
     _check_architecture(config.network, fail)
+    config = _with_horizon(config, tree, fail, origins or {})
     delay = config.controller.input_delay_ms
     if delay is not None and delay > 500.0 * config.period:
         fail(
@@ -342,6 +375,28 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
         if place.name in {earlier.name for earlier in config.trainer.fleet[:i]}:
             fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is there twice")
     return config
+
+
+def _with_horizon(config: Config, tree: dict[str, Any], fail: Fail, origins: Mapping[str, str]) -> Config:
+    """With `horizon_seconds` as steps. Of the two keys that say the same, one in `origins` comes after the file."""
+    controller = config.controller
+    seconds, named = controller.horizon_seconds, "controller.horizon_seconds"
+    if seconds is None:
+        return config
+    steps = max(1, round(seconds * config.rate))
+    if tree["controller"].get("horizon") is not None:
+        later = [key for key in ("controller.horizon", named) if key in origins]
+        if len(later) != 1:
+            fail(named, f"controller.horizon and {named} are both given; leave one of them out")
+        if later != [named]:
+            steps = controller.horizon
+    if steps > LONGEST_HORIZON:
+        fail(
+            named,
+            f"{named} = {seconds:g} is {steps} steps at rate = {config.rate:g} Hz; at most {LONGEST_HORIZON}",
+        )
+    settled = msgspec.structs.replace(controller, horizon=steps, horizon_seconds=None)
+    return msgspec.structs.replace(config, controller=settled)
 
 
 def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
@@ -398,10 +453,6 @@ def from_json(text: str) -> Config:
         raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ConfigError("the log's configuration is not a table")
-    controller = tree.setdefault("controller", {})
-    if isinstance(controller, dict):
-        # Logs from before the key: replays must find what was in force.
-        controller.setdefault("guard", "steps")
     return _checked(tree, "the log's configuration")
 
 

@@ -30,10 +30,8 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the text says what, where and what would be right."""
 
 
-def load_tree(path: str | Path | None) -> dict[str, Any]:
-    """What a TOML file gives, unchecked; {} for None. Raises `ConfigError` for a file that cannot be read."""
-    if path is None:
-        return {}
+def load_tree(path: str | Path) -> dict[str, Any]:
+    """What a TOML file gives, unchecked. Raises `ConfigError` for a file that cannot be read."""
     try:
         # Windows' editors begin a file with a byte order mark, which TOML does not know.
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))

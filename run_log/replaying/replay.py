@@ -22,7 +22,7 @@ from run_log.run import Run
 ROUNDING = 1e-7
 """Units of u: the inputs of a log from another machine or build come out as near as this."""
 SAID = ("machine", "processor", "kernels", "blas")
-"""What a log says of the arithmetic that it was made with, beside versions; older logs lack some."""
+"""What a log says of the arithmetic that it was made with, beside versions; a log may lack it."""
 Progress = Callable[[int, int], None]
 
 

@@ -66,19 +66,21 @@ class Configured(Command):
     KEYS: ClassVar[tuple[tuple[str, str], ...]] = ()
     """(option, key of the configuration that it stands for). An option of None changes nothing."""
 
-    config: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: the shipped values)")
-    ] = None
-    """Configuration in TOML; `tandem config show` prints one with all keys."""
+    config: Annotated[Path | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: compressor)")] = (
+        None
+    )
+    """A shipped configuration (compressor, compressor-cheap, published), or your own in TOML; a file of that name comes
+    first. `tandem config show` prints one with all keys."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Change one value of the configuration."""
 
     def resolve(self) -> tuple[Config, dict[str, Any]]:
         """The configuration: file, then --set, then the command's options. And the tree as it was given."""
         from node_runtime.config.sections import from_tree
+        from node_runtime.config.shipped import config_file
         from node_runtime.config.strict import ConfigError, apply_override, load_tree
 
-        tree = load_tree(self.config)
+        tree = {} if self.config is None else load_tree(config_file(self.config))
         origins = {apply_override(tree, text): f"--set {text}" for text in self.set}
         for option, key in self.KEYS:
             value = getattr(self, option)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
 
-from lbmpc.model import ModelError, build_model, discretise, linearise
+from lbmpc.model import Model, ModelError, build_model, discretise, linearise
 from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
+from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.science import compressor
 
 
@@ -60,20 +62,85 @@ def test_K_is_that_of_the_published_example() -> None:
     np.testing.assert_allclose(compressor(0.05).K[0], [-2.7709, 1.9127, 0.1605, 0.00005], atol=5e-5)
 
 
-def test_P_solves_the_lyapunov_equation() -> None:
+def lqr_gain(model: Model) -> np.ndarray:
+    """The gain that is greedy for |x|_P^2 as the cost-to-go, (m, d)."""
+    A, B, P = model.A, model.B, model.P
+    return -np.linalg.solve(model.R + B.T @ P @ B, B.T @ P @ A)
+
+
+def decrease(model: Model, gain: np.ndarray) -> np.ndarray:
+    """P - A_f'P A_f - (Q + K_f'R K_f), by the definition."""
+    closed = model.A + model.B @ gain
+    return model.P - closed.T @ model.P @ closed - model.Q - gain.T @ model.R @ gain
+
+
+def least(matrix: np.ndarray) -> float:
+    return float(np.linalg.eigvalsh(matrix).min())
+
+
+def test_weights_are_per_second() -> None:
+    """A cost is an integral: what a motion costs does not depend on how often it is sampled."""
+    for period in (0.05, 0.01):
+        model = build_model(PLANT, period, Q=np.array([1.0, 2.0, 0.5, 0.0]), R=np.array([3.0]))
+        np.testing.assert_allclose(np.diag(model.Q), period * np.array([1.0, 2.0, 0.5, 0.0]))
+        np.testing.assert_allclose(model.R, [[3.0 * period]])
+    coarse, fine = (build_model(PLANT, period, Q=np.array([1.0, 1.0, 1.0, 0.0])) for period in (0.002, 0.001))
+    np.testing.assert_allclose(coarse.P[:2, :2], fine.P[:2, :2], rtol=2e-3)
+
+
+def test_P_is_by_default_the_cost_of_the_lqr() -> None:
     model = compressor()
-    f = model.closed_loop
-    right = -(model.Q + model.K.T @ model.R @ model.K)
-    np.testing.assert_allclose(f.T @ model.P @ f - model.P, right, atol=1e-8)
-    assert np.linalg.eigvalsh(model.P).min() > 0
+    np.testing.assert_allclose(decrease(model, lqr_gain(model)), 0.0, atol=1e-10)
+    # No other gain costs less; the placed K, for one, costs more.
+    assert least(-decrease(model, model.K)) > -1e-10
+    assert least(decrease(model, model.K)) < -0.1
+
+
+def test_P_can_be_the_cost_of_K() -> None:
+    model = build_model(PLANT, 0.05, terminal="lyapunov")
+    np.testing.assert_allclose(decrease(model, model.K), 0.0, atol=1e-10)
+    assert least(model.P - compressor().P) > 0
+
+
+def test_the_published_P_is_not_multiplied_by_the_period() -> None:
+    """Of (A + BK, B) with weights of 1 a sample, as the reimplementation of Aswani et al. has it at 100 Hz."""
+    model = build_model(PLANT, 0.01, terminal="published")
+    closed, B, P = model.closed_loop, model.B, model.P
+    gain = np.linalg.solve(np.eye(1) + B.T @ P @ B, B.T @ P @ closed)
+    np.testing.assert_allclose(closed.T @ P @ (closed - B @ gain) + np.eye(4), P, rtol=1e-7)
+    # The input that counts there is c = v - K x, so P bounds what comes after N with room to spare.
+    assert least(decrease(model, lqr_gain(model))) > 0
+    assert least(decrease(model, model.K)) < -1.0
+
+
+def test_a_terminal_cost_that_bounds_nothing_is_refused_with_what_helps() -> None:
+    with pytest.raises(
+        ModelError, match=r"'published' at a period of 0\.5 s does not bound .* take 'riccati'"
+    ):
+        build_model(PLANT, 0.5, terminal="published")
+
+
+def test_numbers_that_give_no_P_are_refused() -> None:
+    """A plant that grows by e^10 to e^15 a period: what the equations give is not even positive."""
+    for growth in (100.0, 150.0):
+        steep = dataclasses.replace(
+            PENDULUM,
+            rhs=lambda x, u, a=growth: [a * x[0] + x[1], a * x[1] + u[0]],
+            x0=np.zeros(2),
+            poles=(-1.0, -2.0),
+        )
+        for terminal, other in (("riccati", "lyapunov"), ("lyapunov", "riccati")):
+            with (
+                warnings.catch_warnings(action="ignore"),
+                pytest.raises(ModelError, match=f"'{terminal}' at .* take '{other}'"),
+            ):
+                build_model(steep, 0.1, terminal=terminal)  # type: ignore[arg-type]
 
 
 def test_without_poles_K_is_the_lqr_gain() -> None:
     model = build_model(dataclasses.replace(PLANT, poles=None), 0.05)
     assert np.abs(np.linalg.eigvals(model.closed_loop)).max() < 1
-    # The LQR gain is the one that is greedy for its own cost-to-go.
-    gain = np.linalg.solve(model.R + model.B.T @ model.P @ model.B, model.B.T @ model.P @ model.A)
-    np.testing.assert_allclose(-gain, model.K, atol=1e-7)
+    np.testing.assert_allclose(lqr_gain(model), model.K, atol=1e-7)
 
 
 def test_what_is_no_equilibrium_is_refused() -> None:

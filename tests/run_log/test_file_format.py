@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Header
 from mcap.writer import Writer
 
 from node_runtime.config.sections import Config, override
 from run_log.errors import LogError
-from run_log.file_format import FORMAT, IDENTITY, PROFILE, VERSIONS, check_header
+from run_log.file_format import FORMAT, IDENTITY, PROFILE, VERSIONS
 from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
+from tests.helpers.paths import CONFIGS
 from tests.helpers.run_log_samples import synthetic, write
 
 
@@ -37,8 +38,8 @@ def test_a_log_says_its_format_and_recovery_keeps_it(tmp_path: Path) -> None:
     config = override(Config(), ["log.chunk_bytes=8192"])
     whole = write(tmp_path / "run.mcap", config, synthetic(config, 30)[1])
     library, number = stated(whole)
-    assert library.startswith("tandem log 1; mcap-python/")
-    assert number == "1"
+    assert library.startswith("tandem log 2; mcap-python/")
+    assert number == "2"
     cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
     cut.write_bytes(whole.read_bytes()[:-1000])
     recover(cut, saved)
@@ -56,14 +57,19 @@ def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> N
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_a_log_of_an_older_format_names_the_version_that_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a later Tandem says of today's logs, should it no longer read them."""
-    monkeypatch.setitem(VERSIONS, 2, "0.2.0")
-    monkeypatch.setattr("run_log.file_format.READABLE", (2, 3))
-    with pytest.raises(
-        LogError, match=r"format 1, and this version reads format 2, 3; Tandem 0\.1\.0 reads it"
-    ):
-        check_header(Path("old.mcap"), Header(profile=PROFILE, library="tandem log 1; mcap-python/1.6.0"))
+def test_a_log_of_an_older_format_names_the_version_that_reads_it(tmp_path: Path) -> None:
+    path = log_of(tmp_path / "old.mcap", "tandem log 1; mcap-python/1.6.0")
+    said = r"old\.mcap: is a log of format 1, and this version reads format 2; Tandem 0\.1\.0 reads it"
+    with pytest.raises(LogError, match=said):
+        read_run(path)
+    with pytest.raises(LogError, match=said):
+        recover(path, tmp_path / "out.mcap")
+
+
+def test_the_format_is_that_of_this_version_or_an_earlier_one() -> None:
+    """The number goes up together with the version that the package will be released as."""
+    ours = tomllib.loads((CONFIGS.parent / "pyproject.toml").read_text())["project"]["version"]
+    assert [int(n) for n in VERSIONS[FORMAT].split(".")] <= [int(n) for n in ours.split(".")]
 
 
 @pytest.mark.parametrize("library", ["", "tandem log", "tandem log one; x", "another; tandem log 1; x"])

@@ -99,7 +99,7 @@ def test_from_the_middle(run: Run, from_tick: int, first: int) -> None:
     assert (found.first_tick, found.ticks) == (first, STEPS - first)
 
 
-@pytest.mark.parametrize("oracle", ["linear", "l2nw"])
+@pytest.mark.parametrize("oracle", ["linear", "constant", "l2nw"])
 def test_other_oracles(config: Config, oracle: str) -> None:
     run = simulate(override(config, [f"controller.oracle={oracle}"]), 40)
     assert replay(run).equal
@@ -509,7 +509,7 @@ def test_a_log_says_what_its_arithmetic_depended_on(run: Run) -> None:
         ({"blas": None, "processor": None}, 1e-12, True, None, "the log does not say its processor, blas: "),
         ({}, 1e-12, True, False, ""),
     ],
-    ids=["other kernel", "no compiler", "too far", "an older log", "this machine"],
+    ids=["other kernel", "no compiler", "too far", "says nothing of it", "this machine"],
 )
 def test_a_difference_by_rounding_is_called_that_and_explained(
     run: Run, facts: dict[str, str | None], by: float, rounding: bool, elsewhere: bool | None, note: str

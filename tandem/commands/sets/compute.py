@@ -44,9 +44,8 @@ class SetsCompute(Configured):
     def run(self) -> int:
         """0: written; 3: there are no such sets, and why."""
         config, _ = self.resolve()
-        import numpy as np
 
-        from controller_node.build import build_model
+        from controller_node.build import build_model, given_disturbance
         from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
         from lbmpc.sets.enclosures.disturbance import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
@@ -59,7 +58,7 @@ class SetsCompute(Configured):
         except OSError as error:
             raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
         model = build_model(config)
-        W = None if config.controller.W is None else np.array(config.controller.W, dtype=float)
+        W = given_disturbance(config)
         start = start_of(config, model)
         kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)
         made: list[tuple[Kind, CertifiedSets | str, bool]] = []

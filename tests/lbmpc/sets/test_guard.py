@@ -15,8 +15,7 @@ from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, points_in
 from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.guard import MOST, Guard
-from lbmpc.sets.stepped_guard import SteppedGuard
-from tests.helpers.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 from verification.closed_loop import Case, ClosedLoop
 
 MODEL = pendulum()
@@ -120,21 +119,6 @@ def test_two_inputs_outside_lead_least_far_out() -> None:
         assert room(certificate, 0, x, first.lower) >= min(best, 0.0) - 1e-8
         seen += 1
     assert seen
-
-
-def test_the_guard_of_old_logs_has_its_steps_and_is_silent_outside(family: Certificate) -> None:
-    old, new = SteppedGuard(family), Guard(family)
-    outside = np.array([0.75, 0.0])
-    assert old.first_inputs(outside).lower is None
-    assert old.first_inputs(outside).margin == new.first_inputs(outside).margin
-    kept = []
-    for x in states(family, np.random.default_rng(5)):
-        first = old.first_inputs(x)
-        if first.piece >= 0 and first.lower is not None and first.upper is not None:
-            assert new.first_inputs(x).piece == first.piece
-            kept += [room(family, first.piece, x, u) for u in (first.lower, first.upper)]
-    # The cliff: where not even 0.001 can be kept, nothing is.
-    assert min(kept) < 1e-8
 
 
 @pytest.mark.parametrize("inputs", ["random", "bang-bang"])

@@ -9,7 +9,7 @@ from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
 from lbmpc.plants.base import Truth
 from lbmpc.sets.motion import Motion
-from tests.helpers.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
 

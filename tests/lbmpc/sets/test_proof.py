@@ -14,7 +14,7 @@ from lbmpc.sets.construct import construct
 from lbmpc.sets.enclosures.affine_forms import DisturbanceError
 from lbmpc.sets.enclosures.proof import prove
 from lbmpc.sets.invariance.approach import one_period
-from tests.helpers.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 MODEL = pendulum()
 HALF = MODEL.plant.x_scale

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import tomllib
@@ -12,7 +11,7 @@ import pytest
 from msgspec import inspect
 
 from lbmpc.plants import get_plant
-from node_runtime.config.plant import plant_of
+from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import (
     Config,
     from_json,
@@ -54,12 +53,15 @@ def test_shipped_file_names_every_key():
 
 def test_commented_values_of_the_shipped_file_are_valid():
     text = re.sub(r"(?m)^# (\w+ = )", r"\1", SHIPPED.read_text())
+    # Of the two ways to give the horizon, the one that is a comment.
+    text = re.sub(r"(?m)^horizon = .*", "", text)
     shown = from_tree(tomllib.loads(text))
     assert shown.plant.x0 is not None
     assert shown.controller.W is not None
     plant = plant_of(shown, get_plant)
     assert shown.plant.x0 == plant.x0.tolist()
-    assert pytest.approx(plant.W * shown.period) == shown.controller.W
+    assert shown.controller.horizon == Config().controller.horizon
+    assert plant.W.tolist() == shown.controller.W
     assert tuple(shown.l2nw.variables or ()) == plant.kernel
 
 
@@ -68,9 +70,9 @@ def test_commented_values_of_the_shipped_file_are_valid():
     [
         (
             "controller.oracle=dn",
-            "controller.oracle = 'dn' is not one of dnn, l2nw, linear, perfect; did you mean 'dnn'?",
+            "controller.oracle = 'dn' is not one of constant, dnn, l2nw, linear, perfect; did you mean 'dnn'?",
         ),
-        ("controller.oracle=7", "controller.oracle = 7 is not one of dnn, l2nw, linear"),
+        ("controller.oracle=7", "controller.oracle = 7 is not one of constant, dnn, l2nw, linear"),
         ("trainer.batch=0", "trainer.batch = 0 is not an integer of at least 1"),
         ("trainer.batch=1.5", "trainer.batch = 1.5 is not an integer of at least 1"),
         ("realtime.priority=100", "realtime.priority = 100 is not an integer of at least 0 and at most 99"),
@@ -171,11 +173,26 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
         ("controller.R=[1.0, 1.0]", "controller.R has 2 entries; moore_greitzer has 1 inputs (u)"),
         ('l2nw.variables=["z", "q"]', "l2nw.variables: 'q' is not one of moore_greitzer's z, y, r, rdot, u"),
         ("l2nw.variables=[]", "l2nw.variables is empty"),
+        (
+            "plant.truth.slop=1.4",
+            "plant.truth: moore_greitzer has no parameter 'slop'; did you mean 'slope'?",
+        ),
+        ("plant.truth.mass=1.4", "no parameter 'mass'; it has beta, z_c, slope"),
+        ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),
     ],
 )
 def test_what_the_plant_does_not_have(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
         plant_of(override(Config(), [given]), get_plant)
+
+
+def test_a_wrong_model_has_a_true_plant_beside_it():
+    config = override(Config(), ["plant.truth.slope=1.4"])
+    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    assert model is get_plant("moore_greitzer")
+    assert truth.parameters == {**model.parameters, "slope": 1.4}
+    assert (truth.x_e == model.x_e).all()
+    assert true_plant_of(Config(), get_plant) is model
 
 
 def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -223,6 +240,7 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "Q",
         "R",
         "x0",
+        "truth",
         "options",
         "output_scale",
         "max_layer_norm",
@@ -262,14 +280,35 @@ def test_a_log_is_held_to_the_same_limits() -> None:
         from_json('{"controller": {"horizon": 2000000000}}')
 
 
-def test_a_log_from_before_a_key_says_what_was_in_force_then():
-    tree = to_tree(Config())
-    del tree["controller"]["guard"], tree["controller"]["input_delay_ms"]
-    old = from_json(json.dumps(tree))
-    assert old.controller.guard == "steps"
-    assert old.controller.input_delay_ms is None
-    assert Config().controller.guard == "half"
-    assert from_json(to_json(Config())) == Config()
+def test_the_horizon_in_seconds_becomes_steps_and_nothing_else_stays() -> None:
+    for rate, seconds, steps in ((20.0, 3.0, 60), (100.0, 1.0, 100), (30.0, 0.05, 2), (1.0, 0.1, 1)):
+        config = load(None, [f"rate={rate}", f"controller.horizon_seconds={seconds}"])
+        assert config.controller.horizon == steps
+        assert config.controller.horizon_seconds is None
+        assert tomllib.loads(to_toml(config))["controller"]["horizon"] == steps
+        assert from_json(to_json(config)) == config
+
+
+def test_the_horizon_is_given_once(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text("[controller]\nhorizon = 20\nhorizon_seconds = 2.0\n")
+    with pytest.raises(
+        ConfigError, match=r"c\.toml: controller\.horizon and .*horizon_seconds are both given"
+    ):
+        load(file)
+    both = ["controller.horizon=20", "controller.horizon_seconds=2"]
+    with pytest.raises(ConfigError, match=r"--set controller\.horizon_seconds=2: .* both given"):
+        load(None, both)
+    # What is said later, beside the file, changes it whichever of the two it is.
+    for text in ("horizon = 20", "horizon_seconds = 2.0"):
+        file.write_text(f"[controller]\n{text}\n")
+        assert [load(file, [one]).controller.horizon for one in both] == [20, 40]
+    settled = load(file)
+    assert override(settled, [both[1], "rate=50"]).controller.horizon == 100
+    with pytest.raises(
+        ConfigError, match=r"horizon_seconds = 2 is 2000 steps at rate = 1000 Hz; at most 1000"
+    ):
+        override(settled, [both[1], "rate=1000"])
 
 
 def test_a_delay_of_more_than_half_a_period_is_refused():
@@ -278,3 +317,38 @@ def test_a_delay_of_more_than_half_a_period_is_refused():
         ConfigError, match=r"input_delay_ms = 5 is more than half a period, 0\.5 ms at rate = 1000 Hz"
     ):
         override(Config(), ["controller.input_delay_ms=5", "rate=1000"])
+
+
+def test_shipped_configurations_are_found_by_name_and_a_file_of_that_name_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in sorted(CONFIGS.glob("*.toml")):
+        assert load(file.stem) == load(file)
+    assert load("published").rate == 100.0
+    (tmp_path / "published").mkdir()
+    assert load("published").rate == 100.0
+    (tmp_path / "compressor").write_text("rate = 33.0")
+    assert load("compressor").rate == 33.0
+    with pytest.raises(
+        ConfigError, match=r"compresor: no such file, and no shipped .* did you mean 'compressor'"
+    ):
+        load("compresor")
+    with pytest.raises(ConfigError, match=r"published\.toml: cannot be read"):
+        load("published.toml")
+
+
+@pytest.mark.parametrize("name", ["compressor-cheap", "published"])
+def test_a_derived_configuration_holds_only_what_differs(name: str) -> None:
+    """And each of its keys does: a value that is the default anyway would go stale there."""
+
+    def leaves(tree: dict, path: str = "") -> dict[str, object]:
+        found: dict[str, object] = {}
+        for key, value in tree.items():
+            found |= leaves(value, f"{path}{key}.") if isinstance(value, dict) else {path + key: value}
+        return found
+
+    given = tomllib.loads((CONFIGS / f"{name}.toml").read_text())
+    default = leaves(to_tree(Config()))
+    assert [key for key, value in leaves(given).items() if default[key] == value] == []
+    plant_of(load(name), get_plant)

@@ -41,7 +41,7 @@ from run_log.writing.save import save
 from tandem.cli import main
 from tandem.experiments.simulation.lockstep import simulate
 from tandem.live.monitor import Monitor
-from tests.helpers.pendulum import PENDULUM, pendulum
+from tests.helpers.plants.pendulum import PENDULUM, pendulum
 from tests.helpers.science import compressor
 
 START = [0.62, 0.0]
