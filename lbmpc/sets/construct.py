@@ -11,6 +11,7 @@ from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
 from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
 from lbmpc.sets.geometry.operations import Body, body, body_of
+from lbmpc.sets.geometry.polytope import SetError
 from lbmpc.sets.invariance.regions import ControllableSet, controllable_sets
 from lbmpc.sets.invariance.robust_control import Stage, UncertainSystem, predecessor, predecessor_iteration
 
@@ -83,8 +84,21 @@ def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
 
 
 def whole(model: Model) -> Region:
-    """All of X and U."""
-    X, U = state_set(model), input_set(model)
+    """All of X and U. Raises `SetError` where they have no end."""
+    X, U, plant = state_set(model), input_set(model), model.plant
+    open_ends = [
+        f"{name} {end}"
+        for names, lower, upper in ((plant.states, X.lower, X.upper), (plant.inputs, U.lower, U.upper))
+        for name, low, high in zip(names, lower, upper, strict=True)
+        for end, bound in (("below", low), ("above", high))
+        if not np.isfinite(bound)
+    ]
+    if open_ends:
+        raise SetError(
+            f"{plant.name}: not bounded: {', '.join(open_ends)}. The model error h is bounded over all of X and U, so "
+            "certified sets need a finite x_min, x_max, u_min and u_max of each state and input. Give the plant such "
+            "bounds, as wide as its use; its `scale` is no bound"
+        )
     return Region(X.lower, X.upper, U.lower, U.upper)
 
 
