@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lbmpc.problem import Problem
+from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.least_distance import (
     NO_ROWS,
     PRIMAL_TOLERANCE,
@@ -47,10 +48,9 @@ class Rows:
         )
         self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
         plant = problem.model.plant
-        # A row f counts in shares of its range over the half-widths, |f|' scale: for a box, the half-width itself.
-        # Tightening must not make a violation weigh more.
+        # Of the plain sets' half-widths: tightening must not make a violation weigh more.
         of_inputs, of_states, of_terminal = (
-            np.abs(F) @ half
+            row_ranges(F, half)
             for F, half in (
                 (self.input_rows, plant.u_scale),
                 (self.state_rows, plant.x_scale),
@@ -59,7 +59,7 @@ class Rows:
         )
         scale = np.concatenate([np.tile(of_inputs, n), np.tile(of_states, n), of_terminal])
         soft = np.arange(len(self.lower)) >= self.count_inputs
-        self.penalty = Penalty(soft, np.maximum(scale, np.finfo(float).tiny), problem.penalty)
+        self.penalty = Penalty(soft, scale, problem.penalty)
         self._hard = replace(self.penalty, soft=np.zeros_like(soft))
         self.names = [
             f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
