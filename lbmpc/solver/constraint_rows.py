@@ -10,7 +10,6 @@ from lbmpc.problem import Problem
 from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.least_distance import (
     NO_ROWS,
-    PRIMAL_TOLERANCE,
     Nearest,
     Penalty,
     Shown,
@@ -18,6 +17,8 @@ from lbmpc.solver.least_distance import (
     violation,
 )
 
+KEPT = 1e-7
+"""A row that is off by less of its scale counts as kept: that much a QP's own tolerance may leave."""
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds, (m,) each."""
 
@@ -119,4 +120,4 @@ class Rows:
         states = (outside / self.penalty.scale)[self.count_inputs :]
         worst = int(states.argmax())
         slack = float(states[worst])
-        return (slack, self.names[worst]) if slack > PRIMAL_TOLERANCE else (0.0, "")
+        return (slack, self.names[worst]) if slack > KEPT else (0.0, "")
