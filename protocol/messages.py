@@ -157,6 +157,8 @@ class Tick(Message, frozen=True):
     state: PlantState | None
     weights: HiddenWeights | None
     """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
 
 
 class TickResult(Message, frozen=True):

@@ -20,6 +20,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.problem import Problem
 from lbmpc.sets.guard import FirstInputs
+from lbmpc.sets.motion import Motion
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
 
@@ -64,6 +65,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self._first_delay = self._acceptable(input_delay)
+        self._motion = None if problem.guard is None else Motion(self.model)
         self.oracle = problem.oracle
         self._absurd = ABSURD * self.model.plant.x_scale
 
@@ -102,6 +104,8 @@ class Controller:
         verdict = Verdict("none")
         if seen.hidden is not None:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
+        if seen.truth:
+            oracle = self.oracle.told(oracle, seen.truth)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
@@ -146,11 +150,14 @@ class Controller:
         """The state, (d,), at which the command that is being computed will begin to act.
 
         Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance.
+        between sample and command would be a disturbance. With certified sets the plant's own equations say where:
+        an error of the oracle's would be one of the state that the sets are asked about, and they hold for any oracle.
         """
         acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:
             return seen.x
+        if self._motion is not None and (there := self._motion.after(seen.x, acting, delay)) is not None:
+            return there
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
         return self.model.ahead(seen.x, acting, delay) + drift
 

@@ -5,6 +5,7 @@ Bring your own plant as one file beside this one: give `rhs` in CasADi operation
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -81,7 +82,7 @@ class Plant:
     parameters: Mapping[str, float] = field(default_factory=dict)
     """What the equations are built with, by name; empty where they cannot be varied."""
     equations: Callable[..., Rhs] | None = None
-    """`rhs` from `parameters`, given by name."""
+    """`rhs` from `parameters`, given by name: numbers, or CasADi symbols."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
@@ -94,14 +95,23 @@ class Plant:
         """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
 
         Raises:
-            KeyError: there is no such parameter; names those there are.
+            KeyError: there is no such parameter; names the nearest, or those there are.
+            PlantError: with these parameters dx/dt is not finite at (x_e, u_e).
         """
-        unknown = [name for name in changes if name not in self.parameters]
-        if unknown or self.equations is None:
-            known = ", ".join(self.parameters) or "none that can be varied"
-            raise KeyError(f"{self.name} has no parameter {', '.join(unknown)}; it has {known}")
+        for name in changes:
+            if self.equations is None or name not in self.parameters:
+                near = difflib.get_close_matches(name, self.parameters, n=1)
+                known = ", ".join(self.parameters) or "none that can be varied"
+                hint = f"did you mean {near[0]!r}?" if near else f"it has {known}"
+                raise KeyError(f"{self.name} has no parameter {name!r}; {hint}")
+        if self.equations is None:
+            return self
         parameters = {**self.parameters, **changes}
-        return replace(self, parameters=parameters, rhs=self.equations(**parameters))
+        varied = replace(self, parameters=parameters, rhs=self.equations(**parameters))
+        if not np.isfinite(np.array(varied.function()(self.x_e, self.u_e))).all():
+            given = ", ".join(f"{name} = {value:g}" for name, value in changes.items())
+            raise PlantError(f"{self.name} with {given}: dx/dt is not finite at (x_e, u_e)")
+        return varied
 
     @property
     def d(self) -> int:
@@ -132,6 +142,15 @@ class Plant:
         """f as a CasADi function (x, u) -> dx/dt."""
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
         return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
+
+    def function_of_parameters(self) -> ca.Function:
+        """f as a CasADi function (x, u, p) -> dx/dt; p are the `parameters` in their order, (0,) where it has none."""
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        p = ca.SX.sym("p", len(self.parameters))
+        rhs = self.rhs
+        if self.equations is not None:
+            rhs = self.equations(**{name: p[i] for i, name in enumerate(self.parameters)})
+        return ca.Function("f", [x, u, p], [ca.vertcat(*rhs(x, u))], ["x", "u", "p"], ["dx"])
 
     def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
@@ -250,7 +269,7 @@ class Stepped(NamedTuple):
     slopes: list[ca.SX]
 
 
-def dop853(f: ca.Function, x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
+def dop853(f: Callable[[ca.SX, ca.SX], ca.SX], x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
     """A single step of DOP853 along dx/dt = f(x, u), as one expression."""
     method, slopes = _method(), [f(x, u)]
     for weights in method.A[1 : method.n_stages]:

@@ -34,8 +34,9 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     """(x, v, theta, xr, ur) -> (cost, vs, zs, A, B, K, L) for a horizon of n.
 
     Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
-    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m, n) and its *nominal* states zbar_1..n, zs
-    (d, n); the Jacobians along the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs
+    (m, n) and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along the learned trajectory A (d, D n),
+    B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
     With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
     d, m, behind = model.d, model.m, remembered(oracle)

@@ -51,6 +51,8 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
@@ -155,11 +157,24 @@ class TrialConfig(Section, frozen=True):
     """The same for a set that was adopted: what K has not learned yet is no reason to roll back."""
 
 
+class KalmanConfig(Section, frozen=True):
+    """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
+
+    prior_variance: Positive = 0.02
+    """Of each entry of K, before the first sample."""
+    label_variance: Positive = 0.01
+    """Of each entry of a label: measuring noise, and what the features cannot explain."""
+    memory: Seconds = 10.0
+    """Seconds in which what is known fades towards the prior, by a factor of e."""
+
+
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
+    law: literals.LawName = "gradient"
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
     gamma: Unit = 0.8
-    """Learning rate of the last layer, 0 < gamma < 1."""
+    """Learning rate of the gradient law, 0 < gamma < 1."""
     column_bound: Positive = 2.0
     """Bound on the norm of each column of K, as h, in half-widths of its state per second of period."""
     initial_scale: NonNegative = 1.2e-2
@@ -168,8 +183,14 @@ class AdaptationConfig(Section, frozen=True):
     """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
     at_adoption: literals.AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
+    kalman: KalmanConfig = KalmanConfig()
     refit: RefitConfig = RefitConfig()
     trial: TrialConfig = TrialConfig()
+
+
+class ConstantConfig(Section, frozen=True):
+    gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5
+    """Share of a new label in the filtered one; 1: the last label alone."""
 
 
 class L2nwConfig(Section, frozen=True):
@@ -260,6 +281,7 @@ class Config(Section, frozen=True):
     controller: ControllerConfig = ControllerConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
+    constant: ConstantConfig = ConstantConfig()
     l2nw: L2nwConfig = L2nwConfig()
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lbmpc.plants import Plant
-from run_log.reporting.summary import TOLERANCE
+from run_log.reporting.performance import TOLERANCE
 from run_log.reporting.traces import Traces
 
 BLACK, BLUE, SKY, VERMILION, GREEN = "#000000", "#0072B2", "#56B4E9", "#D55E00", "#009E73"
@@ -106,7 +106,10 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float)
 def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
     x = motion.x[:, i]
-    ax.plot(motion.t, x, color=BLUE, linewidth=1.6, label="true state")
+    # A plant that starts again jumps, which is no motion.
+    starts = np.flatnonzero(np.diff(motion.episode)) + 1
+    t, unbroken = np.insert(motion.t, starts, np.nan), np.insert(x, starts, np.nan)
+    ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
     ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
     _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
     ax.set_ylabel(_label(plant, plant.states[i]))

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import msgspec
 
 from lbmpc.plants import Plant
-from node_runtime.config.sections import Config, from_tree
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
-from tandem.experiments.study.declaration import Declaration, resolve
+from tandem.experiments.study.declaration import STEPS, Declaration, config_of, resolve
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, time_all, wanted
 
@@ -82,7 +82,7 @@ def run(
     timings = time_all(
         cases,
         lambda case: repeats if case.group in shown and not quick else 1,
-        declared.steps * base.period,
+        (declared.steps or STEPS) * base.period,
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )
@@ -99,7 +99,7 @@ def run(
 
 def settings(declared: Declaration, where: str) -> Config:
     """The configuration that no case has changed. Raises `ConfigError`."""
-    return from_tree(dict(declared.base), where)
+    return config_of([declared], {}, where)
 
 
 def overview(declared: Declaration) -> dict[str, Any]:

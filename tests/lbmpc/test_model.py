@@ -11,7 +11,7 @@ import pytest
 from lbmpc.model import Model, ModelError, build_model, discretise, linearise
 from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.science import compressor
 
 

@@ -117,7 +117,7 @@ def test_a_mistake_in_the_arguments(arguments: list[str], capsys: pytest.Capture
     [
         (
             ["config", "show", "--set", "controller.oracle=dn"],
-            "is not one of dnn, l2nw, linear, perfect; did you mean 'dnn'?",
+            "is not one of constant, dnn, l2nw, linear, perfect; did you mean 'dnn'?",
         ),
         (["config", "show", "--set", "plant.model=compresor"], "did you mean 'moore_greitzer'?"),
         (["config", "show", "--config", "none.toml"], "none.toml: cannot be read"),

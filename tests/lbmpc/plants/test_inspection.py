@@ -14,13 +14,16 @@ from lbmpc.plants import PLANTS, Plant, PlantDefinitionError, get_plant
 from lbmpc.plants.base import Domain
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
-from tests.helpers.integrator import INTEGRATOR
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.integrator import INTEGRATOR
+from tests.helpers.plants.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import equations as pendulum_of
 
 INF, NAN = float("inf"), float("nan")
 
 
 def changed(**fields: object) -> Plant:
+    if "rhs" in fields:
+        fields = {"parameters": {}, "equations": None, **fields}
     return replace(PENDULUM, **fields)
 
 
@@ -119,6 +122,23 @@ FAULTY: dict[str, tuple[Plant, str]] = {
     "a scale of 0": (
         replace(INTEGRATOR, scale={"speed": 0.0}),
         "scale of speed is 0.0: .* a positive number",
+    ),
+    "parameters that nothing takes": (
+        changed(equations=None),
+        "parameters has stiffness, gain and equations is None: give the function",
+    ),
+    "a parameter in words": (changed(parameters={"gain": "high"}), "parameters is .*: give numbers by name"),
+    "parameters that the equations do not have": (
+        changed(parameters={"gain": 1.0}),
+        "equations fails with symbols for gain: TypeError",
+    ),
+    "a condition on a parameter": (
+        changed(equations=lambda stiffness, gain: pendulum_of(stiffness if stiffness > 0 else 0.0, gain)),
+        "equations fails with symbols for stiffness, gain",
+    ),
+    "other parameters than in rhs": (
+        changed(parameters={"stiffness": 5.0, "gain": 1.0}),
+        r"rhs is not what equations makes of parameters: write rhs=equations\(\*\*parameters\)",
     ),
 }
 

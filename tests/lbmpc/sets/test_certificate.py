@@ -27,7 +27,7 @@ from lbmpc.sets.invariance.approach import one_period
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
-from tests.helpers.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
