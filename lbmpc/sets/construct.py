@@ -67,7 +67,7 @@ def construct(
 
 
 def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
-    X = body_of(state_set(model), "X")
+    X = body_of(state_set(model), "X", model.plant.x_scale)
     G, g = predecessor(X, UncertainSystem(model.A, model.B, bound, input_set(model)))
     once = body(np.vstack([X.G, G]), np.concatenate([X.g, g]), "X with its predecessor", X.scale).reduced()
     pieces = [_piece("X with Pre(X)", once, bound, 0)]
@@ -116,7 +116,7 @@ def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report:
 def _invariant(
     model: Model, bound: DisturbanceBound, slack: float, patience: int, saved: Saved, report: Report
 ) -> Stage:
-    X = body_of(state_set(model), "X")
+    X = body_of(state_set(model), "X", model.plant.x_scale)
     plant = UncertainSystem(model.A, model.B, bound, input_set(model))
     stage = _thaw(saved["stage"], X) if "stage" in saved else None
     first = None
