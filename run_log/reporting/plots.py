@@ -109,8 +109,8 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
     x = motion.x[:, i]
     # A plant that starts again jumps, which is no motion.
-    starts = np.flatnonzero(np.diff(motion.episode)) + 1
-    t, unbroken = np.insert(motion.t, starts, np.nan), np.insert(x, starts, np.nan)
+    later = list(motion.starts[1:])
+    t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
     ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
     _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i], plant.x_scale[i])
