@@ -69,8 +69,12 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
         by_plant.setdefault(s.run_id, []).append(s)
     moved = [found for one in by_plant.values() if (found := _after_the_hold(one))]
     # Of a plant that never moved its last sample is all there is.
-    moved = moved or [states[-1:]]
-    states = [s for one in moved for s in one]
+    return motion(moved or [states[-1:]], plant, run.config.period)
+
+
+def motion(episodes: list[list[PlantState]], plant: Plant, period: float) -> Trajectory:
+    """The trajectory of these samples, each with the plant's number of states; none of the lists is empty."""
+    states = [s for one in episodes for s in one]
     nothing = [np.nan] * plant.m
     applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
     # A plant that was started again counts its samples from zero again; on another machine its seconds too.
@@ -80,17 +84,16 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
     for before, s in zip([states[0], *states], states, strict=False):
         if s.run_id != before.run_id:
             offset = step[-1] + 1 - s.seq
-            t_offset = t_offset if s.t >= before.t else t[-1] + run.config.period - s.t
+            t_offset = t_offset if s.t >= before.t else t[-1] + period - s.t
         step.append(s.seq + offset)
         t.append(s.t + t_offset)
     known = [
-        _pieces(s, plant.m, run.config.period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
+        _pieces(s, plant.m, period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
         for before, s in pairwise(states)
     ]
-    starts = (0, *accumulate(len(one) for one in moved[:-1]))
-    return Trajectory(
-        np.array(step), np.array(t), np.array([s.x for s in states]), np.array(applied), ((), *known), starts
-    )
+    starts = (0, *accumulate(len(one) for one in episodes[:-1]))
+    x = np.array([s.x for s in states])
+    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known), starts)
 
 
 def _after_the_hold(states: list[PlantState]) -> list[PlantState]:

@@ -371,7 +371,10 @@ def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
     assert np.isinf(lost.worst("J"))
     table = _table([settled, restless, lost], PLANT)
     column = {name: i for i, name in enumerate(table.head)}
-    shown = [[row[column[name]] for name in ("J", "settled (s)", "excess between (%)")] for row in table.body]
+    shown = [
+        [row[column[name]] for name in ("J", "settled (s)", "excess, also between samples (%)")]
+        for row in table.body
+    ]
     assert shown == [["20.5", "5", "0.0"], ["20", "not settled", "–"], ["lost", "lost", "lost"]]
     assert "z within 0.02 and y within 0.02 of the equilibrium (4% of the half-width)" in table.note
 
