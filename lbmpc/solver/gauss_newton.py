@@ -25,8 +25,6 @@ from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
-# Above the QP's own tolerance; what a hard row may be off by, as a share of its scale, before a solution is refused.
-HARD_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
 # Steps that shrink this fast need no watching: the next one will be this much smaller again.
 FAST = 0.1
@@ -288,7 +286,7 @@ class Solver:
     ) -> Solution:
         found = self._rollout(x, v)
         slack, slack_row = self._rows.slack(found["outside"][:, 0])
-        hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > HARD_TOLERANCE
+        hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > 0.0
         if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
             status = Status.NUMERICAL
         cost = merit * self.problem.model.cost_scale
