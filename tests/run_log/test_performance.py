@@ -41,7 +41,7 @@ def motion(x: Any, applied: Any = 0.0, period: float = 1.0, pieces: Any = None) 
     inputs = np.vstack([[np.nan], np.broadcast_to(np.reshape(applied, (-1, 1)), (len(x) - 1, 1))])
     known = pieces or tuple(((period, (u,)),) for u in inputs[1:, 0])
     step = np.arange(len(x))
-    return Trajectory(np.zeros(len(x), dtype=int), step, period * step, x, inputs, ((), *known))
+    return Trajectory(step, period * step, x, inputs, ((), *known))
 
 
 def figures(
