@@ -20,7 +20,9 @@ from tandem.experiments.study.runner import file_name, run_all, time_all, wanted
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
-REPEATS = 5
+REPEATS = 3
+SHORT = 0.2
+"""Share of a timed run that --quick makes."""
 
 Progress = Callable[[str, int, int], None]
 """Told the stage, what is done and of how many."""
@@ -82,7 +84,7 @@ def run(
     timings = time_all(
         cases,
         lambda case: repeats if case.group in shown and not quick else 1,
-        (declared.steps or STEPS) * base.period,
+        (declared.steps or STEPS) * base.period * (SHORT if quick else 1.0),
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )

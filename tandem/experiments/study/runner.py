@@ -154,7 +154,9 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
     plant = PlantConfig(model=config.plant.model)
-    config = msgspec.structs.replace(config, seed=seed, plant=plant, controller=controller)
+    config = msgspec.structs.replace(
+        config, seed=seed, plant=plant, controller=controller, constant=Config().constant
+    )
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)

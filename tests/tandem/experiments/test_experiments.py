@@ -142,6 +142,61 @@ def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
     assert len({plan.floor.key for plan in plans if plan.floor is not None}) == 3
 
 
+LEVELS = """
+name = "levels"
+title = "Who says it"
+config = "compressor-cheap"
+steps = 10
+episodes = 4
+set.adaptation = { gamma = 0.3, start = "zero" }
+[quick]
+episodes = 3
+[[group]]
+name = "a"
+title = "a"
+seeds = 3
+steps = 20
+set.adaptation.gamma = 0.4
+[[case]]
+name = "own"
+group = "a"
+config = "published"
+steps = 30
+episodes = 1
+vary."controller.oracle" = ["linear", "dnn"]
+[[case]]
+name = "others"
+group = "a"
+vary."controller.horizon" = [7]
+[[case]]
+name = "seconds"
+group = "a"
+config = "compressor"
+vary."plant.truth" = [{ slope = 1.4 }]
+vary."controller.horizon_seconds" = [2.0]
+"""
+
+
+def test_the_nearest_level_that_says_something_counts(tmp_path: Path) -> None:
+    path = tmp_path / "levels.toml"
+    path.write_text(LEVELS)
+    linear, network, others, seconds = cases(path)
+    assert (network.steps, network.episodes, network.seeds) == (30, 1, [0, 1, 2])
+    assert (network.config.rate, network.config.controller.terminal) == (100.0, "published")
+    assert (network.config.adaptation.gamma, network.config.adaptation.start) == (0.4, "zero")
+    assert (linear.seeds, linear.label, linear.family) == ([0], "linear MPC", "own")
+    assert (others.steps, others.episodes) == (20, 4)
+    # The configuration that it starts from has a horizon too, in seconds and in steps.
+    assert (others.config.controller.horizon, others.config.controller.R) == (7, [0.1])
+    assert seconds.config.controller.horizon == 40
+    assert seconds.config.plant.truth == {"slope": 1.4}
+    assert seconds.label == "slope = 1.4, horizon_seconds = 2.0"
+    assert [case.episodes for case in cases(path, quick=True)] == [1, 1, 3, 3]
+    path.write_text(LEVELS.replace('"published"', '"publisht"'))
+    with pytest.raises(ConfigError, match=r"case 'own': config: .*did you mean 'published'"):
+        cases(path)
+
+
 def test_a_key_changes_with_the_settings_and_with_nothing_else(small: Path) -> None:
     job: Job = next(iter(rows(cases(small)))).job
     assert job.key == msgspec.json.decode(msgspec.json.encode(job), type=Job).key
@@ -357,6 +412,53 @@ def test_regret_is_signed_and_a_page_says_where_the_true_h_is_beaten() -> None:
     assert findings.below_perfect([worse]) == []
 
 
+def test_figures_of_several_episodes_are_those_with_a_memory() -> None:
+    first, second, third = (a_record(J).performance for J in (30.0, 21.0, 23.0))
+    job = msgspec.structs.replace(a_record(20.0).job, episodes=3)
+    floor = [a_record(20.0).performance] * 3
+    (row,) = collected(job, [first, second, third], floor).rows
+    assert row.J_by_episode == [30.0, 21.0, 23.0]
+    assert row.regret_by_episode == pytest.approx([0.5, 0.05, 0.15])
+    assert (row.J, row.regret, row.deviation) == pytest.approx((22.0, 0.1, 0.8 * 22.0))
+    # Lost in the second episode: only the first one is known.
+    (row,) = collected(job, [first], floor, lost="at step 3 of 200 in episode 2 of 3").rows
+    assert row.J_by_episode == [30.0, None, None]
+    assert (row.J, row.regret, row.J_first) == (None, None, 30.0)
+
+
+def collected(
+    job: Job, episodes: list[Performance], floor: list[Performance], lost: str | None = None
+) -> results.CaseResult:
+    (plan,) = rows([msgspec.structs.replace(NETWORK, episodes=job.episodes, seeds=[0])])
+    records = {
+        plan.floor.key: a_record(20.0, job=job, episodes=floor),
+        plan.job.key: a_record(20.0, job=job, episodes=episodes, lost=lost),
+    }
+    return results.collect([plan], records, {}, PLANT)[0]
+
+
+def test_the_picture_of_episodes_has_a_line_for_each_oracle_and_a_panel_for_all_else() -> None:
+    job = msgspec.structs.replace(a_record(20.0).job, episodes=3)
+    learns = collected(
+        job, [a_record(J).performance for J in (30.0, 21.0, 19.9)], [a_record(20.0).performance] * 3
+    )
+    wrong = [
+        learns._replace(case=msgspec.structs.replace(learns.case, words={"plant.truth": f"slope = {slope}"}))
+        for slope in (1.4, 1.6)
+    ]
+    (picture,) = pictures.draw("episodes", wrong, PLANT, None)
+    assert [ax.get_title() for ax in picture.figure.axes if ax.get_visible()] == [
+        "slope = 1.4",
+        "slope = 1.6",
+    ]
+    line = picture.figure.axes[0].lines[0]
+    assert list(line.get_xdata()) == [1, 2, 3]
+    assert list(line.get_ydata()) == pytest.approx([50.0, 5.0, -0.5])
+    low, high = picture.figure.axes[0].get_ylim()
+    assert low < -0.5
+    assert high > 50.0
+
+
 def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
     settled = a_result("fine", [20.0, 21.0], overshoot=0.1)
     assert settled.median("overshoot") == pytest.approx(0.1)
@@ -380,7 +482,7 @@ def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
 
 
 @pytest.mark.parametrize("states", [1, 2])
-@pytest.mark.parametrize("kind", ["trajectories", "states", "survival", "recovery", "rows"])
+@pytest.mark.parametrize("kind", ["trajectories", "states", "survival", "recovery", "rows", "episodes"])
 def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, states: int) -> None:
     plant = dataclasses.replace(
         PENDULUM,
