@@ -153,6 +153,14 @@ def test_summary_of_applied_input_and_settled_states(config: Config, messages: l
     assert summarise(gather(config, late)).settled_by_state_s == {"z": 0.0, "y": 0.9}
 
 
+def test_a_true_plant_that_cannot_be_is_named_and_no_traceback(
+    config: Config, messages: list[Logged]
+) -> None:
+    run = gather(override(config, ["plant.truth.slop=1.4"]), messages)
+    with pytest.raises(LogError, match=r"plant\.truth: .* no parameter 'slop'; did you mean 'slope'"):
+        summarise(run)
+
+
 def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged]) -> None:
     slow = [
         (topic, msgspec.structs.replace(message, tick_ms=51.0) if message.seq == 12 else message, t)

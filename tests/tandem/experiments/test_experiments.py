@@ -27,6 +27,7 @@ from tandem.experiments import experiment
 from tandem.experiments.experiment import Finished
 from tandem.experiments.reporting import findings, pictures
 from tandem.experiments.reporting.page import _table
+from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Picture, Resolved, load, resolve
 from tandem.experiments.study.plan import Job, code_version, rows
@@ -139,7 +140,15 @@ def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
     plans = list(rows(list(found.values())))
     # linear draws nothing: one seed stands for both; so does the floor of every controller from one state.
     assert len(plans) == 2 + 2 + 2 * 2 + 2
-    assert len({plan.floor.key for plan in plans if plan.floor is not None}) == 3
+    assert len({plan.floor.key for plan in plans}) == 3
+
+
+def test_the_floor_of_a_plant_that_drifts_drifts_as_well(small: Path) -> None:
+    drift = Drift(to={"slope": 1.45}, at=1.0)
+    case = msgspec.structs.replace(cases(small)[0], faults=Faults(drift=drift))
+    (plan, *_) = rows([case])
+    assert plan.floor.config.controller.oracle == "perfect"
+    assert plan.floor.faults.drift == drift
 
 
 LEVELS = """
@@ -365,7 +374,7 @@ def a_result(
     case = msgspec.structs.replace(NETWORK, name=name, label=name, seeds=list(range(len(costs))))
     plans = list(rows([case]))
     floor = a_record(20.0)
-    records: dict[str, Record] = {plan.floor.key: floor for plan in plans if plan.floor is not None}
+    records: dict[str, Record] = {plan.floor.key: floor for plan in plans}
     records |= {
         plan.job.key: a_record(cost, overshoot, violations, **changes)
         for plan, cost in zip(plans, costs, strict=True)
@@ -496,7 +505,7 @@ def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, sta
         a_record(1.0).performance, overshoot={"angle": 0.1}, settled_by_state_s={"angle": 5.0}
     )
     record = a_record(1.0, performance=performance, traces=traces)
-    records = {job.key: record for plan in plans for job in (plan.job, plan.floor) if job is not None}
+    records = {job.key: record for plan in plans for job in (plan.job, plan.floor)}
     found = results.collect(plans, records, {}, plant)
     drawn = pictures.draw(kind, found, plant, None)
     assert drawn
