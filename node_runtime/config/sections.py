@@ -162,9 +162,9 @@ class KalmanConfig(Section, frozen=True):
 
     prior_variance: Positive = 0.02
     """Of each entry of K, before the first sample."""
-    label_variance: Positive = 0.01
+    label_variance: Positive = 1e-3
     """Of each entry of a label: measuring noise, and what the features cannot explain."""
-    memory: Seconds = 10.0
+    memory: Seconds = 2.0
     """Seconds in which what is known fades towards the prior, by a factor of e."""
 
 

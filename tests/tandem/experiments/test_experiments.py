@@ -298,7 +298,9 @@ def a_record(cost: float, overshoot: float = 0.0, violations: int = 0, **changes
         lemma=None,
     )
     changed = msgspec.structs.replace(record, **changes)
-    return changed if "episodes" in changes else msgspec.structs.replace(changed, episodes=[changed.performance])
+    return (
+        changed if "episodes" in changes else msgspec.structs.replace(changed, episodes=[changed.performance])
+    )
 
 
 def a_result(
@@ -386,9 +388,7 @@ def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, sta
         names={"angle": "angle of the arm"},
     )
     traces = Traces(x=[[0.5], [0.2], [0.0]], u=[[1.0], [0.0]], error=[None, 0.1])
-    case = msgspec.structs.replace(
-        NETWORK, x0s=[[0.5, 0.0][:states]], seeds=[0]
-    )
+    case = msgspec.structs.replace(NETWORK, x0s=[[0.5, 0.0][:states]], seeds=[0])
     plans = list(rows([case]))
     performance = msgspec.structs.replace(
         a_record(1.0).performance, overshoot={"angle": 0.1}, settled_by_state_s={"angle": 5.0}
