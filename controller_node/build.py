@@ -13,11 +13,12 @@ from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
 from lbmpc.model import Model, ModelError
 from lbmpc.model import build_model as nominal_model
-from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
+from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
+from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Plant, get_plant
+from lbmpc.plants import Plant, PlantError, get_plant
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -26,24 +27,26 @@ from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture
-from node_runtime.config.plant import plant_of
+from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol.topics import WEIGHTS_LIMIT
 
 WEIGHTS = WEIGHTS_LIMIT // 4
 """Hidden weights at most, float32 each."""
+FILTERED = 512
+"""Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
 
 def build_plant(config: Config) -> Plant:
-    """The plant named by the configuration, whose lengths fit it. Raises `ConfigError`."""
+    """The plant named by the configuration, as the model knows it; its lengths fit. Raises `ConfigError`."""
     return plant_of(config, get_plant)
 
 
 def describe_network(config: Config, plant: Plant) -> NetworkDescription:
-    """The network of the configuration for this plant; inputs are scaled by its half-widths.
+    """The network of the configuration for this plant; its inputs and h are scaled by the half-widths.
 
     Raises:
         ValueError: the sizes or the options do not fit the architecture, there is none of that name, or the network
@@ -57,7 +60,7 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
         hidden=network.hidden,
         activations=[network.activation] * len(network.hidden),
         input_scale=[*plant.x_scale.tolist(), *plant.u_scale.tolist()],
-        output_scale=[network.output_scale * config.period] * plant.d,
+        output_scale=(network.output_scale * config.period * plant.x_scale).tolist(),
         max_layer_norm=network.max_layer_norm,
         architecture=network.architecture,
         window=architecture.window if network.window is None else network.window,
@@ -74,8 +77,13 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     plant = model.plant
     if config.controller.oracle == "linear":
         return LinearOracle(plant.d, plant.m)
+    if config.controller.oracle == "constant":
+        return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
-        return PerfectOracle(model)
+        try:
+            return PerfectOracle(model, true_plant_of(config, get_plant))
+        except PlantError as error:
+            raise ConfigError(f"controller.oracle = 'perfect': {error}") from error
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
         chosen = config.l2nw.variables if config.l2nw.variables is not None else list(plant.kernel)
@@ -83,9 +91,8 @@ def build_oracle(config: Config, model: Model) -> Oracle:
             raise ConfigError(f"l2nw.variables: empty; choose from {', '.join(names)}")
         indices = tuple(names.index(name) for name in chosen)
         settings = config.l2nw
-        return L2nwOracle(
-            plant.d, plant.m, indices, settings.window, settings.bandwidth, settings.regularisation
-        )
+        bandwidth = settings.bandwidth * np.concatenate([plant.x_scale, plant.u_scale])[list(indices)]
+        return L2nwOracle(plant.d, plant.m, indices, settings.window, bandwidth, settings.regularisation)
     return build_network_oracle(config, plant)
 
 
@@ -95,17 +102,37 @@ def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
         description = describe_network(config, plant)
     except ValueError as error:
         raise ConfigError(f"network: {error}") from error
-    adaptation, period = config.adaptation, config.period
+    adaptation, per_period = config.adaptation, config.period * plant.x_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
     return DnnOracle(
         description,
         adaptation.gamma if adaptation.enabled else 0.0,
-        adaptation.column_bound * period,
-        adaptation.initial_scale * period,
+        adaptation.column_bound * per_period,
+        adaptation.initial_scale * per_period,
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config),
+        describe_filter(config, description.features),
     )
+
+
+def describe_filter(config: Config, features: int) -> Kalman | None:
+    """The filter of the last layer with so many features, at the configured rate; None where there is none.
+
+    Raises:
+        ConfigError: its covariance would be too large.
+    """
+    adaptation = config.adaptation
+    if adaptation.law != "kalman" or not adaptation.enabled:
+        return None
+    if features > FILTERED:
+        raise ConfigError(
+            f'adaptation.law = "kalman" keeps a covariance of {features} x {features} numbers; the last of '
+            f"network.hidden can have {FILTERED - 1} neurons at most with it"
+        )
+    settings = adaptation.kalman
+    kept = math.exp(-config.period / settings.memory)
+    return Kalman(settings.prior_variance, settings.label_variance, kept)
 
 
 def describe_trial(config: Config) -> Trial | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
+import logging
 import os
 import zipfile
 import zlib
@@ -28,7 +29,10 @@ from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
+from node_runtime.private_folder import make_private, why_not_ours, why_not_private
 from node_runtime.whole_file import read_regular, write_whole
+
+log = logging.getLogger(__name__)
 
 CONSTRUCTION = 2
 """Counts up when the construction finds other sets for the same arguments."""
@@ -126,11 +130,11 @@ def read_sets(path: Path) -> CertifiedSets:
         raise CertificateError(f"{path}: {error}") from error
 
 
-def write_sets(sets: CertifiedSets, path: Path) -> None:
+def write_sets(sets: CertifiedSets, path: Path, mode: int = 0o644) -> None:
     """Whole or not at all. Raises `OSError`."""
     data = sets.to_bytes()
     # Without a time of writing in it, so that the same sets are the same file.
-    write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+    write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data, mode)
 
 
 # -- the cache ----------------------------------------------------------------------------------
@@ -167,19 +171,55 @@ class Work:
         whole = _key(base | {"kind": kind, "start": start.tolist()})
         return cls(whole, cache / f"{whole}.json", cache / _key(base))
 
+    def save(self, sets: CertifiedSets) -> None:
+        """Into the cache, for this user alone. Raises `OSError`."""
+        make_private(self.sets.parent)
+        write_sets(sets, self.sets, 0o600)
+
+
+def why_not_believed(work: Work) -> str | None:
+    """Why somebody else may have written what the cache has of a construction, and what to do; None: nobody can have.
+
+    What is not there is nobody's.
+    """
+    cache = work.sets.parent
+    for path, reason_of in (
+        (cache, why_not_private),
+        (work.sets, _why_not_ours),
+        (work.folder, _why_not_ours),
+    ):
+        try:
+            reason = reason_of(path)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            reason = f"{path}: {error.strerror}"
+        if reason is not None:
+            return (
+                f"the cache of certified sets is not believed: {reason}. If you trust all that is in it, "
+                f"chmod -R go-w {cache}; else remove it"
+            )
+    return None
+
+
+def _why_not_ours(path: Path) -> str | None:
+    return why_not_ours(path, path.lstat())
+
 
 def _key(parts: object) -> str:
     return hashlib.sha256(msgspec.json.encode(parts, order="sorted")).hexdigest()[:24]
 
 
 class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
-    """Named sets of arrays in a folder, one .npz each. What cannot be read counts as not there."""
+    """Named sets of arrays in a folder, one .npz each. What cannot be read, or is not ours, counts as not there."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def __getitem__(self, name: str) -> dict[str, np.ndarray]:
         try:
+            if _why_not_ours(self._path(name)) is not None:
+                raise KeyError(name)
             with np.load(io.BytesIO(read_regular(self._path(name))), allow_pickle=False) as saved:
                 return {key: saved[key] for key in saved.files}
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -188,7 +228,8 @@ class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
     def __setitem__(self, name: str, arrays: dict[str, np.ndarray]) -> None:
         content = io.BytesIO()
         np.savez(content, **arrays)  # type: ignore[arg-type]
-        write_whole(self._path(name), content.getvalue())
+        make_private(self.folder)
+        write_whole(self._path(name), content.getvalue(), 0o600)
 
     def __delitem__(self, name: str) -> None:
         try:
@@ -225,16 +266,23 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
         return sets
     cache = default_cache() if cache is None else cache
     start = start_of(config, model)
+    doubts: list[str] = []
     for kind in PREFERRED:
-        candidates = [Work.of(model, kind, start, None, SLACK, cache).sets]
+        work = Work.of(model, kind, start, None, SLACK, cache)
+        doubt = why_not_believed(work) if work.sets.exists() else None
+        candidates = [work.sets] if doubt is None else []
+        doubts += [doubt] if doubt is not None else []
         candidates += sorted(SHIPPED.glob(f"{model.plant.name}-*-{kind}.json*"))
         for path in candidates:
             usable = _usable(path, model)
             if usable is not None:
+                for text in dict.fromkeys(doubts):
+                    log.warning("%s", text)
                 return usable
     raise ConfigError(
         "controller.tightening = 'invariant' needs certified sets, and none are there for this plant, rate and bounds: "
         "`tandem sets compute` with this configuration makes them, or controller.sets = 'FILE' names them"
+        + "".join(f"; {text}" for text in dict.fromkeys(doubts))
     )
 
 

@@ -54,7 +54,7 @@ class Translation:
             layers = [array.numpy().astype(float) for array in tick.weights.layers]
             hidden = HiddenSet(tick.weights.seq, layers, tick.weights.sha256, tick.weights.network_sha256)
         if state is None:
-            return Observation(None, None, 0, -1, hidden)
+            return Observation(None, None, 0, -1, hidden, truth=tick.truth)
         applied = None if state.applied is None else np.array(state.applied) - self.plant.u_e
         pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
         total = sum(seconds for seconds, _u in pieces)
@@ -62,7 +62,7 @@ class Translation:
             # Not the whole period: what acted in the rest of it is not known, but what acts now is.
             applied = None
         x = np.array(state.x) - self.plant.x_e
-        return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces)
+        return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces, tick.truth)
 
     def outputs(
         self, tick: m.Tick, result: StepResult, network: LearnedNetwork | None, hidden_sha256: str

@@ -70,6 +70,15 @@ class Model:
         """A + BK, Schur stable."""
         return self.A + self.B @ self.K
 
+    @cached_property
+    def cost_scale(self) -> float:
+        """What the cost is counted in: x'|P|x + u'Ru with every state and input at its half-width.
+
+        That is a bound on the cost to go from anywhere in X, and one input at the end of its range.
+        """
+        x, u = self.plant.x_scale, self.plant.u_scale
+        return float(x @ np.abs(self.P) @ x + u @ self.R @ u)
+
     def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray, pieces: Pieces = ()) -> np.ndarray:
         """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), with the input that really was applied.
 
@@ -99,7 +108,7 @@ class Model:
         Up to two periods by a series: `discretise` to rounding, in a tenth of the time.
         """
         if not 0.0 <= seconds <= 2.0 * self.period:
-            phi, gamma = discretise(self.a, self.b, seconds)
+            phi, gamma = discretise(self.a, self.b, seconds, balanced(self.plant))
             return phi @ x + gamma @ u
         held = self._held
         inputs = held.inputs
@@ -111,11 +120,12 @@ class Model:
     def _held(self) -> Bound:
         """(x, u, share) -> the state after this share of a period.
 
-        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings) is a polynomial in the share; squaring does the rest.
+        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings), in balanced units, is a polynomial in the share;
+        squaring does the rest.
         """
         d, m = self.b.shape
-        block = np.zeros((d + m, d + m))
-        block[:d, :d], block[:d, d:] = self.a * self.period, self.b * self.period
+        units = balanced(self.plant)
+        block = _block(self.a, self.b) * self.period * units / units[:, None]
         squarings = max(0, math.ceil(math.log2(max(np.abs(block).sum(axis=0).max(), 1e-300) / SERIES_NORM)))
         block /= 2.0**squarings
         terms = [np.eye(d + m)]
@@ -130,7 +140,7 @@ class Model:
         power = held(part)
         for _ in range(squarings):
             power = power @ power
-        after = power[:d, :d] @ x + power[:d, d:] @ u
+        after = (power[:d, :d] @ (x / units[:d]) + power[:d, d:] @ (u / units[d:])) * units[:d]
         return Bound(ca.Function("held", [x, u, part], [after], ["x", "u", "share"], ["after"]))
 
 
@@ -140,13 +150,27 @@ def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     return a, b
 
 
-def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact zero-order hold: exp([[a, b], [0, 0]] T)."""
+def balanced(plant: Plant) -> np.ndarray:
+    """Units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
+
+    A state in pascals beside one in metres would otherwise cost digits. Powers of two: going there and back is exact.
+    """
+    return np.exp2(np.rint(np.log2(np.concatenate([plant.x_scale, plant.u_scale]))))
+
+
+def discretise(
+    a: np.ndarray, b: np.ndarray, period: float, units: np.ndarray | float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exact zero-order hold: exp([[a, b], [0, 0]] T), computed in these units of (x, u), (d + m,)."""
     d, m = b.shape
-    block = np.zeros((d + m, d + m))
-    block[:d, :d], block[:d, d:] = a, b
-    exponential = expm(block * period)
+    units = np.broadcast_to(units, d + m)
+    exponential = expm(_block(a, b) * period * units / units[:, None]) * units[:, None] / units
     return exponential[:d, :d], exponential[:d, d:]
+
+
+def _block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[[a, b], [0, 0]]."""
+    return np.vstack([np.hstack([a, b]), np.zeros((b.shape[1], sum(b.shape)))])
 
 
 def build_model(
@@ -176,9 +200,28 @@ def build_model(
     except PlantDefinitionError as error:
         raise ModelError(str(error)) from error
     a_c, b_c = linearise(plant)
-    a, b = discretise(a_c, b_c, period)
-    q = np.diag(period * _weights("Q", Q, plant.d))
-    r = np.diag(period * _weights("R", R, plant.m))
+    units = balanced(plant)
+    A, B = discretise(a_c, b_c, period, units)
+    q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)
+    x, u = units[: plant.d], units[plant.d :]
+    a, b = A * x / x[:, None], B * u / x[:, None]
+    k, p = _gain_and_terminal_weight(plant, period, terminal, a, b, np.diag(q * x**2), np.diag(r * u**2), x)
+    return Model(
+        plant, period, a_c, b_c, A, B, np.diag(q), np.diag(r), k * u[:, None] / x, p / np.outer(x, x)
+    )
+
+
+def _gain_and_terminal_weight(
+    plant: Plant,
+    period: float,
+    terminal: TerminalCost,
+    a: np.ndarray,
+    b: np.ndarray,
+    q: np.ndarray,
+    r: np.ndarray,
+    x: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """K and P of the model in the units x, (d,). Raises `ModelError`."""
     try:
         if plant.poles is not None:
             k = place(a, b, [_real(np.exp(p * period)) for p in plant.poles])
@@ -193,8 +236,7 @@ def build_model(
         raise ModelError(
             f"{plant.name}: A + BK is not Schur stable at a period of {period} s (radius {radius:.4f})"
         )
-    p = _terminal_weight(plant, period, terminal, a, b, q, r, k)
-    return Model(plant, period, a_c, b_c, a, b, q, r, k, p)
+    return k, _terminal_weight(plant, period, terminal, a, b, q, r, k, plant.x_scale / x)
 
 
 def _terminal_weight(
@@ -206,6 +248,7 @@ def _terminal_weight(
     q: np.ndarray,
     r: np.ndarray,
     k: np.ndarray,
+    scale: np.ndarray,
 ) -> np.ndarray:
     """P of that name, of which it is certain that it bounds what comes after the horizon. Raises `ModelError`."""
     where = f"{plant.name}: the terminal cost {kind!r} at a period of {period:g} s"
@@ -214,7 +257,7 @@ def _terminal_weight(
     )
     try:
         p, k_f = terminal_cost(kind, a, b, q, r, k, period)
-        missing = shortfall(p, k_f, a, b, q, r, plant.x_scale)
+        missing = shortfall(p, k_f, a, b, q, r, scale)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ModelError(f"{where} has no solution: {error}; {remedy}") from error
     if not missing <= TOLERANCE:

@@ -33,7 +33,7 @@ class Problem:
     """(e:LBMPC) for one model, oracle and horizon.
 
     `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty
-    `penalty` per unit of violation relative to `scale` of its row, unless a set guarantees that they can be kept.
+    `penalty` times the model's `cost_scale` per half-width of violation, unless a set guarantees that they can be kept.
     """
 
     model: Model
@@ -54,7 +54,7 @@ def build_problem(
     horizon: int,
     tightening: Tightening = "first_step",
     W: np.ndarray | None = None,
-    penalty: float = 1e4,
+    penalty: float = 100.0,
     certificate: Certificate | None = None,
 ) -> Problem:
     """Lay out the constraints of the named tightening; W (d,) as h of one period.
@@ -110,7 +110,7 @@ def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytop
         np.concatenate([last.upper, omega.upper]),
         last.names + omega.names,
     )
-    if both.interior_point() is None:
+    if both.interior_point(model.plant.x_scale) is None:
         raise EmptySetError(
             f"the tightened set is empty at step {n}: the terminal set Omega - R_{n} holds nothing. "
             f"A smaller W, another K or a shorter horizon would help."

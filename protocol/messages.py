@@ -157,6 +157,8 @@ class Tick(Message, frozen=True):
     state: PlantState | None
     weights: HiddenWeights | None
     """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
 
 
 class TickResult(Message, frozen=True):
@@ -168,7 +170,7 @@ class TickResult(Message, frozen=True):
     status: str
     iterations: Count
     slack: float
-    """Largest state-constraint violation of the nominal plan, in units of that constraint's row."""
+    """Largest state-constraint violation of the nominal plan, as a share of that state's half-width."""
     slack_row: str
     """Which row that is, as "y at step 3"; empty when none."""
     h: list[float] | None

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from run_log.reporting.summary import Summary
 
-FOR_A_PERSON = ("skipped_slots", "final_deviation")
+FOR_A_PERSON = ("skipped_slots",)
 """Shown in the table alone; programs may count on everything else, in `run` and `simulate` alike."""
 
 MEANING = {
@@ -21,13 +21,17 @@ MEANING = {
     "weights_adopted": "sets of hidden weights",
     "weights_refused": "sets of hidden weights",
     "weights_rolled_back": "adopted, then worse than the set before",
-    "fallback_ticks": "input not from the solver",
+    "iteration_limit_ticks": "the solver stopped before it had converged",
     "soft_ticks": "a soft state constraint gave way",
-    "constraint_violations": "true state at a sample or applied input outside X or U",
-    "cost": "sum of squared deviations",
-    "overshoot": "of the first performance state",
-    "settling_step": "last one off by more than 0.02",
-    "final_deviation": "largest, of the performance states",
+    "fallback_ticks": "input not from the solver",
+    "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
+    "J": "sum of the stage costs, Q and R per second",
+    "deviation": "integral of the performance states' squared deviations",
+    "overshoot": "share of the state's own initial deviation",
+    "settled_s": "all performance states within 4 % of their half-widths",
+    "settled_by_state_s": "each of them",
+    "constraint_violations": "at samples: true state or applied input outside X or U",
+    "excess_between_samples": "largest distance of the true motion from X, of a half-width",
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
     "prediction_error": "first / last second",
@@ -35,6 +39,10 @@ MEANING = {
     "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",
 }
+ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
+"""What null means, where it is more than that there is no such figure."""
+OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s"}
+"""Which figure of each performance state these are."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -42,8 +50,11 @@ SHOULD_BE_ZERO = (
     "lost_ticks",
     "weights_refused",
     "weights_rolled_back",
+    "iteration_limit_ticks",
+    "soft_ticks",
     "fallback_ticks",
     "constraint_violations",
+    "excess_between_samples",
     "outside_ticks",
 )
 
@@ -57,15 +68,23 @@ def table(summary: Summary) -> Table:
     """The same for a person, with what else there is to know."""
     columns = Column(style="bold"), Column(justify="right"), Column(style="dim")
     shown = Table(*columns, show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name, value in msgspec.to_builtins(summary).items():
+    figures = msgspec.to_builtins(summary)
+    episodes = figures.pop("episodes")
+    if len(episodes) > 1:
+        figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
+    for name, value in figures.items():
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
-        shown.add_row(name, Text(_text(value), style), MEANING.get(name, ""))
+        shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
     return shown
 
 
-def _text(value: Any) -> str:
+def _text(name: str, value: Any) -> str:
     if value is None:
-        return "-"
+        return ABSENT.get(name, "-")
+    if name in OF_EACH_STATE:
+        return ", ".join(f"{state} {_text(OF_EACH_STATE[name], one)}" for state, one in value.items())
     if isinstance(value, dict):
-        return " / ".join(_text(part) for part in value.values())
+        return " / ".join(_text("", part) for part in value.values())
+    if name == "share":
+        return f"{value:.1%}"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

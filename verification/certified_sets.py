@@ -140,7 +140,7 @@ def states(
 
 
 def closed_loop(
-    file: Path, seeds: int = 100, steps: int = 100, oracle: OracleName = "perfect"
+    file: Path, seeds: int = 100, steps: int = 60, oracle: OracleName = "linear"
 ) -> dict[str, float | int | str]:
     """The control step with a solver that lies, errors of measurement and late commands: ticks outside, by case."""
     certificate = read_sets(file).certificate

@@ -24,7 +24,7 @@ from node_runtime.realtime.scheduling import GarbageCollection, punctual
 
 Progress = Callable[[str, int, int], None]
 """Told what is going on, and how many steps of how many are done."""
-ORACLES: tuple[OracleName, ...] = ("linear", "l2nw", "dnn")
+ORACLES: tuple[OracleName, ...] = ("linear", "constant", "l2nw", "dnn")
 CENTRE, WIDTH = 60, 32
 """The horizon and the width at which everything is compared."""
 
@@ -204,7 +204,7 @@ def _candidates(
 
 def _rivals(case: Case) -> Iterator[tuple[str, Rival]]:
     problem = case.problem
-    if case.oracle != "l2nw":
+    if case.oracle in ("linear", "dnn"):
         yield "ipopt", ipopt(problem, soft=True, gauss_newton=False)
         yield "ipopt-hard", ipopt(problem, soft=False, gauss_newton=False)
     if case.oracle == "dnn":

@@ -205,7 +205,8 @@ def _softened(problem: Problem, written: _Written, nominal: ca.MX) -> _Written:
     count = rows.count_inputs
     scale, lower, upper = rows.penalty.scale[count:], rows.lower[count:], rows.upper[count:]
     e = ca.MX.sym("e", len(scale))
-    price = problem.penalty * ca.sum1(e + 0.5 * e**2)
+    weight = problem.penalty * problem.model.cost_scale
+    price = weight * ca.sum1(e + 0.5 * e**2)
     program = {
         **written.program,
         "x": ca.vertcat(written.program["x"], e),
@@ -215,7 +216,7 @@ def _softened(problem: Problem, written: _Written, nominal: ca.MX) -> _Written:
     unbounded = np.full(len(scale), np.inf)
     return _Written(
         program,
-        ca.diagcat(written.hessian, problem.penalty * ca.DM.eye(len(scale))),
+        ca.diagcat(written.hessian, weight * ca.DM.eye(len(scale))),
         np.concatenate([written.lbx, np.zeros(len(scale))]),
         np.concatenate([written.ubx, unbounded]),
         np.concatenate([written.lbg, -unbounded, lower]),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -30,6 +31,8 @@ class Observation:
     pieces: Pieces = ()
     """The inputs of that period where there were several, deviations. Without `applied` only the last counts: it acts
     now."""
+    truth: Mapping[str, float] = field(default_factory=dict)
+    """Parameters of the true plant that are others from now on, by name; for the oracle that knows the truth."""
 
 
 @dataclass(frozen=True, eq=False)

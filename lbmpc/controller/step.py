@@ -20,6 +20,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.problem import Problem
 from lbmpc.sets.guard import FirstInputs
+from lbmpc.sets.motion import Motion
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
 
@@ -45,8 +46,8 @@ class Solves(Protocol):
 
 
 ABSURD = 1e6
-"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Finite
-alone is not enough: what is learned from 1e307 is not."""
+"""Half-widths from the equilibrium: a number that is no measurement, and no input that acts, whatever a gateway means
+by it. Finite alone is not enough: what is learned from 1e307 is not, nor where it leads within a delay."""
 
 
 class Controller:
@@ -64,8 +65,9 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self._first_delay = self._acceptable(input_delay)
+        self._motion = None if problem.guard is None else Motion(self.model)
         self.oracle = problem.oracle
-        self._absurd = ABSURD * self.model.plant.x_scale
+        self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -93,8 +95,7 @@ class Controller:
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        if seen.x is not None and not (np.abs(seen.x) <= self._absurd).all():
-            seen = replace(seen, x=None)
+        seen = self._without_absurd(seen)
         label, oracle = self._learn(state, seen)
         rolled_back = ""
         if label is not None:
@@ -102,6 +103,8 @@ class Controller:
         verdict = Verdict("none")
         if seen.hidden is not None:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
+        if seen.truth:
+            oracle = self.oracle.told(oracle, seen.truth)
         delay = self._delay(state.delay, seen)
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
@@ -115,6 +118,15 @@ class Controller:
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
         after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
         return after, StepResult(plan.v, mode, solution, label, verdict, rolled_back, delay, first)
+
+    def _without_absurd(self, seen: Observation) -> Observation:
+        most_x, most_u = self._absurd
+        if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
+            seen = replace(seen, x=None)
+        inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
+        if any(not (np.abs(u) <= most_u).all() for u in inputs):
+            seen = replace(seen, applied=None, pieces=())
+        return seen
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
@@ -146,11 +158,14 @@ class Controller:
         """The state, (d,), at which the command that is being computed will begin to act.
 
         Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance.
+        between sample and command would be a disturbance. With certified sets the plant's own equations say where:
+        an error of the oracle's would be one of the state that the sets are asked about, and they hold for any oracle.
         """
         acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:
             return seen.x
+        if self._motion is not None and (there := self._motion.after(seen.x, acting, delay)) is not None:
+            return there
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
         return self.model.ahead(seen.x, acting, delay) + drift
 

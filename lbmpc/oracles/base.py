@@ -18,7 +18,7 @@ a shift register, so that the prediction is Markov again. Without a look back s 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -120,6 +120,13 @@ class Oracle(ABC):
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
         """The state after one labelled sample, (x, u) now in its past; the state given is left as it was."""
+        return state
+
+    def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:
+        """The state once an experiment has said what the true plant's parameters are from now on, by name.
+
+        Only `perfect` listens: whoever learns is told nothing.
+        """
         return state
 
     # -- hidden layers of a trainer ------------------------------------------------------------------------------

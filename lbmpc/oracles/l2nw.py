@@ -21,17 +21,24 @@ class L2nwOracle(Oracle):
         d, m: states and inputs.
         variables: indices into (x, u) that the kernel sees.
         window: samples kept.
-        bandwidth: b, in the units of those variables.
+        bandwidth: b of each of those variables, (n,), in its units; a number counts for every one.
         regularisation: lambda.
     """
 
     name = "l2nw"
 
     def __init__(
-        self, d: int, m: int, variables: tuple[int, ...], window: int, bandwidth: float, regularisation: float
+        self,
+        d: int,
+        m: int,
+        variables: tuple[int, ...],
+        window: int,
+        bandwidth: np.ndarray | float,
+        regularisation: float,
     ):
         self.d, self.m, self.variables = d, m, variables
-        self.window, self.bandwidth, self.regularisation = window, bandwidth, regularisation
+        self.window, self.regularisation = window, regularisation
+        self.bandwidth = np.broadcast_to(bandwidth, len(variables))
         # theta, column-major: kernel inputs (n, window), labels (d, window), validity (1, window).
         self.rows = len(variables) + d + 1
         self.parameters = self.rows * window
@@ -58,14 +65,15 @@ class L2nwOracle(Oracle):
         for row, k in enumerate(self.variables):
             # (window, points): every sample against every point.
             offset = ca.repmat(xu[k, :], self.window, 1) - ca.repmat(points[:, row], 1, xu.shape[1])
+            offset /= self.bandwidth[row]
             offsets.append(offset)
             squared += offset**2
-        weights = ca.repmat(valid, 1, xu.shape[1]) * ca.exp(-squared / (2 * self.bandwidth**2))
+        weights = ca.repmat(valid, 1, xu.shape[1]) * ca.exp(-squared / 2)
         total = ca.repmat(self.regularisation + ca.sum1(weights), self.d, 1)
         h = (labels @ weights) / total
         slopes = []
-        for offset in offsets:
-            weight_slope = -weights * offset / self.bandwidth**2
+        for row, offset in enumerate(offsets):
+            weight_slope = -weights * offset / self.bandwidth[row]
             slopes.append((labels @ weight_slope - h * ca.repmat(ca.sum1(weight_slope), self.d, 1)) / total)
         return h, slopes
 
@@ -78,8 +86,8 @@ class L2nwOracle(Oracle):
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         n = len(self.variables)
         table = state["window"]
-        distance = table[:, :n] - np.concatenate([x, u])[list(self.variables)]
-        weights = table[:, -1] * np.exp(-(distance**2).sum(axis=1) / (2 * self.bandwidth**2))
+        distance = (table[:, :n] - np.concatenate([x, u])[list(self.variables)]) / self.bandwidth
+        weights = table[:, -1] * np.exp(-(distance**2).sum(axis=1) / 2)
         return weights @ table[:, n : n + self.d] / (self.regularisation + weights.sum())
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:

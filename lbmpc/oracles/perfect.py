@@ -2,62 +2,101 @@
 
     h(x, u) = Phi_T(x_e + x, u_e + u) - x_e - A x - B u
 
-Phi_T is the plant's own motion over one period under a constant input, by so many steps of the order-8 method that
-integrates the truth.
+Phi_T is the true plant's motion over one period under a constant input, by so many steps of the order-8 method that
+integrates the truth; A and B are the nominal model's, however wrong that is. The true plant's parameters are theta, so
+that a plant that changes is followed without building anything again.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, OracleState
-from lbmpc.plants.base import dop853
+from lbmpc.plants.base import Plant, PlantError, dop853
 
 STEP_NORM = 0.4
 """At most so much of |a| dt, a the linearisation, in one integration step: h is then right to 1e-9."""
-LEAST = 1e-3
-"""States that must stay positive are not let below this in the expression, or a wild plan would make it NaN."""
+MOST_STEPS = 400
+"""Of integration in a period. More are a plant far too fast for its period, and would fill the memory."""
+LEAST = 2e-3
+"""Of their half-width: states that must stay positive are not let below this in the expression, or a wild plan would
+make it NaN."""
 
 
 class PerfectOracle(Oracle):
-    """h_hat = h, with nothing to learn."""
+    """h_hat = h, with nothing to learn.
+
+    Args:
+        model: the nominal model, whose A and B h is the rest of.
+        truth: the true plant; None: the model's own.
+
+    Raises:
+        PlantError: the true plant is too fast to be followed over a period.
+    """
 
     name = "perfect"
-    parameters = 0
 
-    def __init__(self, model: Model):
+    def __init__(self, model: Model, truth: Plant | None = None):
         self.d, self.m = model.d, model.m
-        self._value, self._slopes = _functions(model)
+        self._truth = model.plant if truth is None else truth
+        self._names = list(self._truth.parameters)
+        self.parameters = len(self._names)
+        self._value, self._slopes = _functions(model, self._truth)
 
     def split(self, theta: ca.MX) -> list[ca.MX]:
-        return []
+        return [theta]
 
     def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        return self._value.map(su.shape[1])(su)
+        return self._value.map(su.shape[1])(su, ca.repmat(parts[0], 1, su.shape[1]))
 
     def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        return ca.horzsplit(self._slopes.map(su.shape[1])(su), self.d + self.m)
+        slopes = self._slopes.map(su.shape[1])(su, ca.repmat(parts[0], 1, su.shape[1]))
+        return ca.horzsplit(slopes, self.d + self.m)
+
+    def initial_state(self, rng: np.random.Generator) -> OracleState:
+        return {"parameters": np.array(list(self._truth.parameters.values()), dtype=float)}
+
+    def theta(self, state: OracleState) -> np.ndarray:
+        return state["parameters"]
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.array(self._value(np.concatenate([x, u])))[:, 0]
+        return np.array(self._value(np.concatenate([x, u]), state["parameters"]))[:, 0]
+
+    def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:
+        before = zip(self._names, state["parameters"].tolist(), strict=True)
+        return {"parameters": np.array([truth.get(name, value) for name, value in before])}
 
 
-def _functions(model: Model) -> tuple[ca.Function, ca.Function]:
-    """(x, u), (d + m,), deviations -> h (d,) and its Jacobian (d, d + m)."""
+def _functions(model: Model, truth: Plant) -> tuple[ca.Function, ca.Function]:
+    """(x, u), (d + m,), deviations, and the parameters -> h (d,) and its Jacobian (d, d + m)."""
     plant, d = model.plant, model.d
-    f = plant.function()
-    xu = ca.SX.sym("xu", d + model.m)
+    xu, parameters = ca.SX.sym("xu", d + model.m), ca.SX.sym("parameters", len(truth.parameters))
     low = np.full(d, -np.inf)
-    low[[domain.state for domain in plant.positive]] = LEAST
+    positive = [domain.state for domain in plant.positive]
+    low[positive] = LEAST * plant.x_scale[positive]
     start = ca.fmax(xu[:d] + plant.x_e, low)
     u = xu[d:] + plant.u_e
-    steps = max(1, math.ceil(float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period / STEP_NORM))
+    steps = _steps(truth, model.period)
+    f = truth.function_of_parameters()
     after = start
     for _ in range(steps):
-        after = dop853(f, after, u, model.period / steps).after
+        after = dop853(lambda x, u: f(x, u, parameters), after, u, model.period / steps).after
     h = after - plant.x_e - model.A @ xu[:d] - model.B @ xu[d:]
-    return ca.Function("h", [xu], [h]), ca.Function("dh", [xu], [ca.jacobian(h, xu)])
+    inputs = [xu, parameters]
+    return ca.Function("h", inputs, [h]), ca.Function("dh", inputs, [ca.jacobian(h, xu)])
+
+
+def _steps(truth: Plant, period: float) -> int:
+    """Of integration in a period."""
+    slopes = truth.linearised()[1]
+    turns = float(np.abs(np.linalg.eigvals(slopes)).max()) * period if np.isfinite(slopes).all() else math.inf
+    if not turns <= MOST_STEPS * STEP_NORM:
+        raise PlantError(
+            f"{truth.name}: its true motion is too fast, or too wild, to be predicted over a period of {period:g} s"
+        )
+    return max(1, math.ceil(turns / STEP_NORM))

@@ -5,6 +5,7 @@ Bring your own plant as one file beside this one: give `rhs` in CasADi operation
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -81,7 +82,7 @@ class Plant:
     parameters: Mapping[str, float] = field(default_factory=dict)
     """What the equations are built with, by name; empty where they cannot be varied."""
     equations: Callable[..., Rhs] | None = None
-    """`rhs` from `parameters`, given by name."""
+    """`rhs` from `parameters`, given by name: numbers, or CasADi symbols."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
@@ -94,14 +95,23 @@ class Plant:
         """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
 
         Raises:
-            KeyError: there is no such parameter; names those there are.
+            KeyError: there is no such parameter; names the nearest, or those there are.
+            PlantError: with these parameters dx/dt is not finite at (x_e, u_e).
         """
-        unknown = [name for name in changes if name not in self.parameters]
-        if unknown or self.equations is None:
-            known = ", ".join(self.parameters) or "none that can be varied"
-            raise KeyError(f"{self.name} has no parameter {', '.join(unknown)}; it has {known}")
+        for name in changes:
+            if self.equations is None or name not in self.parameters:
+                near = difflib.get_close_matches(name, self.parameters, n=1)
+                known = ", ".join(self.parameters) or "none that can be varied"
+                hint = f"did you mean {near[0]!r}?" if near else f"it has {known}"
+                raise KeyError(f"{self.name} has no parameter {name!r}; {hint}")
+        if self.equations is None:
+            return self
         parameters = {**self.parameters, **changes}
-        return replace(self, parameters=parameters, rhs=self.equations(**parameters))
+        varied = replace(self, parameters=parameters, rhs=self.equations(**parameters))
+        if not np.isfinite(np.array(varied.function()(self.x_e, self.u_e))).all():
+            given = ", ".join(f"{name} = {value:g}" for name, value in changes.items())
+            raise PlantError(f"{self.name} with {given}: dx/dt is not finite at (x_e, u_e)")
+        return varied
 
     @property
     def d(self) -> int:
@@ -133,6 +143,15 @@ class Plant:
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
         return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
 
+    def function_of_parameters(self) -> ca.Function:
+        """f as a CasADi function (x, u, p) -> dx/dt; p are the `parameters` in their order, (0,) where it has none."""
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        p = ca.SX.sym("p", len(self.parameters))
+        rhs = self.rhs
+        if self.equations is not None:
+            rhs = self.equations(**{name: p[i] for i, name in enumerate(self.parameters)})
+        return ca.Function("f", [x, u, p], [ca.vertcat(*rhs(x, u))], ["x", "u", "p"], ["dx"])
+
     def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
         f = self.function()
@@ -152,9 +171,10 @@ def _array(value: Any) -> Any:
 
 
 class Truth:
-    """The plant's true motion, integrated to a local error below 1e-9 over a sampling period.
+    """The plant's true motion, integrated to a local error below 1e-9 half-widths over a sampling period.
 
-    DOP853 (order 8, scipy) at rtol = atol = 1e-12. Deterministic: the same numbers in, the same numbers out.
+    DOP853 (order 8, scipy) at rtol = 1e-12 and atol = 1e-12 half-widths. Deterministic: the same numbers in, the same
+    numbers out.
     """
 
     def __init__(self, plant: Plant):
@@ -196,7 +216,7 @@ class Truth:
             np.asarray(x, dtype=float),
             dt,
             rtol=INTEGRATION_TOLERANCE,
-            atol=INTEGRATION_TOLERANCE,
+            atol=INTEGRATION_TOLERANCE * self.plant.x_scale,
         )
         while solver.status == "running":
             trouble = solver.step()
@@ -211,7 +231,9 @@ class Truth:
         inside[:] = x
         for domain in self.plant.positive:
             # A trial stage may leave the domain where the true motion does not; what is accepted is checked.
-            inside[domain.state] = max(inside[domain.state], 1e-12)
+            inside[domain.state] = max(
+                inside[domain.state], INTEGRATION_TOLERANCE * self.plant.x_scale[domain.state]
+            )
         self._f()
         dx = self._f.outputs["dx"][:, 0]
         if not np.isfinite(dx).all():
@@ -247,7 +269,7 @@ class Stepped(NamedTuple):
     slopes: list[ca.SX]
 
 
-def dop853(f: ca.Function, x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
+def dop853(f: Callable[[ca.SX, ca.SX], ca.SX], x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
     """A single step of DOP853 along dx/dt = f(x, u), as one expression."""
     method, slopes = _method(), [f(x, u)]
     for weights in method.A[1 : method.n_stages]:
@@ -264,7 +286,7 @@ def _whole_step(plant: Plant) -> ca.Function:
     x, u, dt = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m), ca.SX.sym("dt")
     after, slopes = dop853(f, x, u, dt)
     slopes = [*slopes, f(after, u)]
-    scale = INTEGRATION_TOLERANCE * (1 + ca.fmax(ca.fabs(x), ca.fabs(after)))
+    scale = INTEGRATION_TOLERANCE * (plant.x_scale + ca.fmax(ca.fabs(x), ca.fabs(after)))
     fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (method.E5, method.E3))
     bound = plant.d * (fifth + 0.01 * third)
     # Both estimates are exactly zero where nothing moves.

@@ -57,7 +57,7 @@ def _faults_of_model(plant: Plant) -> tuple[str, ...]:
     """Remembered: a plant never changes, it is looked at wherever it is looked up, and derivatives take a while."""
     numbers = list(_numbers(plant))
     found = [*(numbers or [*_bounds(plant), *_domains(plant), *_poles(plant)]), *_equations(plant)]
-    return tuple(found or _rest(plant))
+    return tuple(found or list(_rest(plant)) or _parameters(plant))
 
 
 def _names(plant: Plant) -> tuple[str, ...]:
@@ -247,6 +247,29 @@ def _rest(plant: Plant) -> Iterator[str]:
             f"(x_e, u_e) is not an equilibrium: {', '.join(moving)}. Give x_e and u_e at which the plant rests, with "
             "more digits if need be"
         )
+
+
+def _parameters(plant: Plant) -> Iterator[str]:
+    """Whether the equations can be varied as the plant says; `rhs` itself is sound."""
+    parameters: Any = plant.parameters
+    if not isinstance(parameters, Mapping) or not all(
+        isinstance(v, int | float) for v in parameters.values()
+    ):
+        yield f"parameters is {parameters!r}: give numbers by name, as in {{'mass': 1.0}}"
+        return
+    if plant.equations is None:
+        if parameters:
+            yield f"parameters has {', '.join(parameters)} and equations is None: give the function that takes them"
+        return
+    try:
+        f, varied = plant.function(), plant.function_of_parameters()
+    except Exception as error:  # noqa: BLE001 - the equations are somebody else's code
+        failed = f"{type(error).__name__}: {_said(error)}"
+        yield f"equations fails with symbols for {', '.join(parameters)}: {failed}. {WRITE_IT}"
+        return
+    given = np.array(f(plant.x0, plant.u_e)), np.array(varied(plant.x0, plant.u_e, list(parameters.values())))
+    if not np.allclose(*given, rtol=1e-9, atol=1e-12):
+        yield "rhs is not what equations makes of parameters: write rhs=equations(**parameters)"
 
 
 def _at(plant: Plant, error: Exception) -> str:

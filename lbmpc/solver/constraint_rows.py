@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lbmpc.problem import Problem
-from lbmpc.solver.least_distance import NO_ROWS, Nearest, Penalty, Shown, least_distance, violation
+from lbmpc.sets.geometry.polytope import row_ranges
+from lbmpc.solver.least_distance import (
+    NO_ROWS,
+    Nearest,
+    Penalty,
+    Shown,
+    least_distance,
+    violation,
+)
 
+KEPT = 1e-7
+"""A row that is off by less of its scale counts as kept: that much a QP's own tolerance may leave."""
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds, (m,) each."""
 
@@ -36,15 +48,20 @@ class Rows:
             b[: self.count_inputs].reshape(n, m) for b in (self.lower, self.upper)
         )
         self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
-        half, plant = 0.5 * (self.upper - self.lower), problem.model.plant
-        terminal = np.maximum(np.abs(self.upper[len(half) - len(self.terminal_rows) :]), 1e-3)
-        unbounded = np.concatenate([np.tile(plant.u_scale, n), np.tile(plant.x_scale, n), terminal])
-        scale = np.where(np.isfinite(half), half, unbounded)
-        # The scale of a row is that of its plain set: tightening must not make a violation weigh more.
-        plain = np.tile(scale[self.count_inputs + common :][:common] if n > 1 else scale[-common:], n)
-        scale[self.count_inputs : self.count_inputs + common * n] = plain
+        plant = problem.model.plant
+        # Of the plain sets' half-widths: tightening must not make a violation weigh more.
+        of_inputs, of_states, of_terminal = (
+            row_ranges(F, half)
+            for F, half in (
+                (self.input_rows, plant.u_scale),
+                (self.state_rows, plant.x_scale),
+                (self.terminal_rows, plant.x_scale),
+            )
+        )
+        scale = np.concatenate([np.tile(of_inputs, n), np.tile(of_states, n), of_terminal])
         soft = np.arange(len(self.lower)) >= self.count_inputs
         self.penalty = Penalty(soft, scale, problem.penalty)
+        self._hard = replace(self.penalty, soft=np.zeros_like(soft))
         self.names = [
             f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
         ]
@@ -92,15 +109,15 @@ class Rows:
         Softly where state rows are soft or contradict each other; None where the numbers are unusable. Arguments as for
         `least_distance`.
         """
-        first = self.penalty if self.soft else None
+        first = self.penalty if self.soft else self._hard
         nearest = least_distance(values, slopes, self.lower, self.upper, first, hint, ready)
         if nearest is not None or self.soft:
             return nearest, True
         return least_distance(values, slopes, self.lower, self.upper, self.penalty, hint), False
 
     def slack(self, outside: np.ndarray) -> tuple[float, str]:
-        """The largest violation of a state row and the row's name, from all rows' violations, (rows,)."""
-        states = outside[self.count_inputs :]
+        """The largest violation of a state row, in shares, and the row's name, from all rows' violations, (rows,)."""
+        states = (outside / self.penalty.scale)[self.count_inputs :]
         worst = int(states.argmax())
         slack = float(states[worst])
-        return (slack, self.names[worst]) if slack > 1e-9 else (0.0, "")
+        return (slack, self.names[worst]) if slack > KEPT else (0.0, "")

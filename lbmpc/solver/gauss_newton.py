@@ -25,8 +25,6 @@ from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
-# Above the QP's own tolerance; what a hard row may be off by before a solution is refused.
-HARD_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
 # Steps that shrink this fast need no watching: the next one will be this much smaller again.
 FAST = 0.1
@@ -62,7 +60,7 @@ class Solver:
     Args:
         problem: what to solve; nothing in it is rebuilt later.
         max_iterations: Gauss-Newton steps in one solve, at least 1.
-        tolerance: converged when no input of the plan moves by more (input units).
+        tolerance: converged when no input of the plan moves by more, as a share of its half-width.
         realise: what turns a CasADi function into the one that is called, a compiler for instance.
     """
 
@@ -77,6 +75,7 @@ class Solver:
         self.max_iterations, self.tolerance = max_iterations, tolerance
         self._realise = realise
         self._rows = Rows(problem)
+        self._per_input = 1.0 / problem.model.plant.u_scale
         self._behind = remembered(problem.oracle)
         self._move = Bound(realise(build_rows(problem.model, problem.horizon, self._behind)))
         self._learned = self._subproblem(problem.oracle)
@@ -220,7 +219,7 @@ class Solver:
             if not target.feasible:
                 status = arrived
             step = target.v - v
-            size, before = float(np.abs(step).max()), size
+            size, before = self._size(step), size
             rate = size / before if before > 0 else np.inf
             if np.isfinite(merit) and (
                 size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
@@ -238,7 +237,7 @@ class Solver:
                 v, merit, status = trial, trial_merit, arrived
                 break
             halvings = 0
-            while trial_merit > merit and halvings < MAX_HALVINGS and np.abs(step).max() >= self.tolerance:
+            while trial_merit > merit and halvings < MAX_HALVINGS and self._size(step) >= self.tolerance:
                 # The rows are linear in v, so half a step has half the change.
                 step, halvings = 0.5 * step, halvings + 1
                 trial, trial_values = v + step, 0.5 * (values + trial_values)
@@ -248,13 +247,20 @@ class Solver:
                 status = arrived
                 break
             v, values, merit = trial, trial_values, trial_merit
-            if np.abs(step).max() < self.tolerance:
+            if self._size(step) < self.tolerance:
                 status = arrived
                 break
         return self._finish(status, x, v, merit, iterations)
 
+    def _size(self, step: np.ndarray) -> float:
+        """The largest entry of a step in the inputs, (N, m), as a share of that input's half-width."""
+        return float((np.abs(step) * self._per_input).max())
+
     def _merit(self, subproblem: Subproblem, v: np.ndarray, values: np.ndarray) -> float:
-        """Linearise at v, (N, m), with row values (rows,); its true cost, soft constraints included, or inf."""
+        """Linearise at v, (N, m), with row values (rows,); its true cost, soft constraints included, or inf.
+
+        As a share of the model's `cost_scale`, as everything in here.
+        """
         total = subproblem.linearise(v) + self._rows.price(values)
         return total if np.isfinite(total) else np.inf
 
@@ -280,10 +286,11 @@ class Solver:
     ) -> Solution:
         found = self._rollout(x, v)
         slack, slack_row = self._rows.slack(found["outside"][:, 0])
-        hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > HARD_TOLERANCE
+        hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > 0.0
         if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
             status = Status.NUMERICAL
-        return Solution(status, v, found["zbar"].T.copy(), merit, iterations, slack, slack_row)
+        cost = merit * self.problem.model.cost_scale
+        return Solution(status, v, found["zbar"].T.copy(), cost, iterations, slack, slack_row)
 
 
 def _numbers(v: np.ndarray) -> np.ndarray:

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 import daqp
 import numpy as np
 
-# DAQP's own default, 1e-6, moves the first input by 5e-6.
+# Of w, and of each row's scale. DAQP's own default, 1e-6, moves the first input by 5e-6.
 PRIMAL_TOLERANCE = 1e-9
+UNMOVED = 1e-12
+"""Of a row's scale: a row that w = 1 moves by less is not moved at all."""
 SOFT = 8
 
 
@@ -22,7 +24,7 @@ class Penalty:
     soft: np.ndarray
     """Which rows are soft, (rows,) of bool."""
     scale: np.ndarray
-    """Violation that counts as 1, (rows,)."""
+    """What counts as 1, (rows,), of hard rows too: the unit of their tolerance."""
     weight: float
 
     def cost(self, violation: np.ndarray) -> float:
@@ -50,12 +52,12 @@ class Shown:
     """
 
     def __init__(
-        self, M: np.ndarray, lower: np.ndarray, upper: np.ndarray, penalty: Penalty | None, seen: np.ndarray
+        self, M: np.ndarray, lower: np.ndarray, upper: np.ndarray, penalty: Penalty, seen: np.ndarray
     ):
         self.seen, self._free = seen, M.shape[1]
         rows = M[seen]
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
-        self._usable = bool((norms > 1e-12).all())
+        self._usable = bool((norms > UNMOVED * penalty.scale[seen]).all())
         if not self._usable:
             return
         # Rows of length 1, so that DAQP's tolerances and weights mean distances.
@@ -63,11 +65,9 @@ class Shown:
         self._rows = rows * self._inverse[:, None]
         self._lower, self._upper = lower[seen] * self._inverse, upper[seen] * self._inverse
         self._sense = np.zeros(len(seen), dtype=np.intc)
-        self._weights: tuple[np.ndarray, np.ndarray] | None = None
-        if penalty is not None:
-            self._sense[penalty.soft[seen]] = SOFT
-            unit = norms / penalty.scale[seen]
-            self._weights = 1.0 / (penalty.weight * unit * unit), penalty.weight * unit
+        self._sense[penalty.soft[seen]] = SOFT
+        unit = norms / penalty.scale[seen]
+        self._weights = 1.0 / (penalty.weight * unit * unit), penalty.weight * unit
         self._model: daqp.Model | None = None
 
     def solve(self, y: np.ndarray) -> np.ndarray | None:
@@ -94,7 +94,7 @@ class Shown:
         flag, _time = self._model.setup(
             np.eye(n), np.zeros(n), self._rows, self._upper - offset, self._lower - offset, self._sense
         )
-        if flag >= 0 and self._weights is not None:
+        if flag >= 0 and self._sense.any():
             quadratic, linear = self._weights
             self._model.soft_weights(quadratic, quadratic, linear, linear)
         return int(flag)
@@ -114,7 +114,7 @@ def least_distance(
     M: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
-    penalty: Penalty | None,
+    penalty: Penalty,
     hint: np.ndarray = NO_ROWS,
     ready: Shown | None = None,
 ) -> Nearest | None:
@@ -124,11 +124,11 @@ def least_distance(
         y: row values at w = 0, (rows,).
         M: how they move with w, (rows, n).
         lower, upper: bounds, (rows,).
-        penalty: None when every row is hard.
+        penalty: which rows are soft, and the rows' scales.
         hint: indices of rows to show from the start; they change the time, not the result.
         ready: a QP over rows of this very M, to begin with.
     """
-    low, high = lower - PRIMAL_TOLERANCE, upper + PRIMAL_TOLERANCE
+    low, high = lower - PRIMAL_TOLERANCE * penalty.scale, upper + PRIMAL_TOLERANCE * penalty.scale
     seen = ready.seen if ready is not None else hint
     unseen = np.ones(len(y), dtype=bool)
     unseen[seen] = False

@@ -34,12 +34,15 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     """(x, v, theta, xr, ur) -> (cost, vs, zs, A, B, K, L) for a horizon of n.
 
     Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
-    Outputs: half of psi at v; the subproblem's unconstrained minimiser vs (m, n) and its *nominal* states zbar_1..n, zs
-    (d, n); the Jacobians along the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs
+    (m, n) and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along the learned trajectory A (d, D n),
+    B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
     With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
     d, m, behind = model.d, model.m, remembered(oracle)
-    a, b, q, r = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R))
+    # The cost's own scale is the unit: w, the penalty and the QP's tolerances then mean the same for any Q and R.
+    q, r, p = (ca.DM(weight / model.cost_scale) for weight in (model.Q, model.R, model.P))
+    a, b = ca.DM(model.A), ca.DM(model.B)
     x, v, theta = ca.MX.sym("x", d + behind), ca.MX.sym("v", m, n), ca.MX.sym("theta", oracle.parameters)
     xr, ur = ca.MX.sym("xr", d, n + 1), ca.MX.sym("ur", m, n)
     inputs = ca.horzsplit(v)
@@ -53,7 +56,7 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     z = s[:d, :] if behind else s
     dz, dv = z - xr, v - ur
     gradient_z, gradient_v = q @ dz[:, :n], r @ dv
-    gradient_end = ca.DM(model.P) @ dz[:, n]
+    gradient_end = p @ dz[:, n]
     cost = 0.5 * (ca.dot(gradient_z, dz[:, :n]) + ca.dot(gradient_v, dv) + ca.dot(gradient_end, dz[:, n]))
 
     stages = oracle.jacobians(ca.vertcat(s[:, :n], v), parts)
@@ -62,7 +65,7 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     b_i = [b + jacobian[:, d + behind :] for jacobian in stages]
 
     riccati = _riccati_stage_behind(d, m, behind, q, r) if behind else _riccati_stage(d, m, q, r)
-    p_matrix, p_vector = _padded(ca.DM(model.P), behind), ca.vertcat(gradient_end, ca.DM(behind, 1))
+    p_matrix, p_vector = _padded(p, behind), ca.vertcat(gradient_end, ca.DM(behind, 1))
     gains: list[ca.MX] = [ca.MX()] * n
     offsets: list[ca.MX] = [ca.MX()] * n
     inverses: list[ca.MX] = [ca.MX()] * n

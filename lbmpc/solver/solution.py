@@ -27,8 +27,8 @@ class Status(StrEnum):
 class Solution:
     """Outcome of one solve, in deviation coordinates.
 
-    v is (N, m), zbar (N, d) the nominal states zbar_1..zbar_N. `slack` is the largest state-row violation of zbar in
-    that row's units, 0 when all are kept, and `slack_row` names it ("y at step 3").
+    v is (N, m), zbar (N, d) the nominal states zbar_1..zbar_N. `slack` is the largest state-row violation of zbar, as a
+    share of that row's half-width, 0 when all are kept, and `slack_row` names it ("y at step 3").
     """
 
     status: Status

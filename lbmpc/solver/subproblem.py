@@ -51,7 +51,7 @@ class Subproblem:
         inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
 
     def linearise(self, v: np.ndarray) -> float:
-        """Linearise at v, (N, m), and return its true cost, soft constraints left out."""
+        """Linearise at v, (N, m); its true cost, soft constraints left out, as a share of the model's `cost_scale`."""
         self.sweep.inputs["v"][:] = v.T
         self.sweep()
         return float(self.sweep.outputs["cost"][0, 0])

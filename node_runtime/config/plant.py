@@ -6,7 +6,7 @@ Whoever asks hands over the function that finds a plant by name; nothing of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -25,21 +25,31 @@ class Plant(Protocol):
     def inputs(self) -> Sequence[str]: ...
     @property
     def x0(self) -> np.ndarray: ...
+    def varied(self, **changes: float) -> Self: ...
 
 
 P = TypeVar("P", bound=Plant)
 
 
 def plant_of(config: Config, find: Callable[[str], P]) -> P:
-    """The plant that `config` names, with every length in `config` checked against it.
+    """The plant that `config` names, as its model knows it, with every length and name in `config` checked against it.
 
     Args:
         find: `lbmpc.plants.get_plant`; raises LookupError with a text for a plant that is unknown or cannot be used.
 
     Raises:
-        ConfigError: a plant that is unknown or cannot be used, an unknown variable, or a vector of the wrong length;
-            names the key and the rule.
+        ConfigError: a plant that is unknown or cannot be used, an unknown variable or parameter, or a vector of the
+            wrong length; names the key and the rule.
     """
+    return _model_and_truth(config, find)[0]
+
+
+def true_plant_of(config: Config, find: Callable[[str], P]) -> P:
+    """The plant as it really moves: `plant_of` with the parameters of `plant.truth`. Raises as `plant_of` does."""
+    return _model_and_truth(config, find)[1]
+
+
+def _model_and_truth(config: Config, find: Callable[[str], P]) -> tuple[P, P]:
     try:
         plant = find(config.plant.model)
     except LookupError as error:
@@ -59,7 +69,10 @@ def plant_of(config: Config, find: Callable[[str], P]) -> P:
             raise ConfigError(f"l2nw.variables: {name!r} is not one of {plant.name}'s {', '.join(known)}")
     if config.l2nw.variables is not None and not config.l2nw.variables:
         raise ConfigError(f"l2nw.variables is empty; the kernel needs at least one of {', '.join(known)}")
-    return plant
+    try:
+        return plant, plant.varied(**config.plant.truth) if config.plant.truth else plant
+    except (LookupError, ArithmeticError) as error:
+        raise ConfigError(f"plant.truth: {error.args[0]}") from error
 
 
 def initial_state(config: Config, plant: Plant) -> np.ndarray:

@@ -51,6 +51,8 @@ class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
+    truth: dict[str, float] = msgspec.field(default_factory=dict)
+    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 
@@ -62,9 +64,10 @@ class SolverConfig(Section, frozen=True):
     """"auto" compiles the solver's functions where there is a C compiler, once; "never" does not."""
     max_iterations: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
     tolerance: Positive = 1e-6
-    """Converged when no input of the plan moves by more than this (input units)."""
-    penalty: Positive = 1e4
-    """Exact-penalty weight on soft state constraints, per unit of violation relative to the row's range."""
+    """Converged when no input of the plan moves by more than this share of its half-width."""
+    penalty: Positive = 100.0
+    """Exact-penalty weight on soft state constraints: what a violation of one half-width costs, in units of the cost to
+    go x'Px with every state at its half-width."""
 
 
 class BackupConfig(Section, frozen=True):
@@ -121,8 +124,9 @@ class NetworkConfig(Section, frozen=True):
     )
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
-    output_scale: Positive = 0.2
-    """h per second of period that counts as 1 for the network: h of a sampled plant grows with the period."""
+    output_scale: Positive = 0.4
+    """h that counts as 1 for the network, in half-widths of each state per second of period: h of a sampled plant grows
+    with the period."""
     max_layer_norm: Positive = 100.0
 
 
@@ -153,26 +157,46 @@ class TrialConfig(Section, frozen=True):
     """The same for a set that was adopted: what K has not learned yet is no reason to roll back."""
 
 
+class KalmanConfig(Section, frozen=True):
+    """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
+
+    prior_variance: Positive = 0.02
+    """Of each entry of K, before the first sample."""
+    label_variance: Positive = 1e-3
+    """Of each entry of a label: measuring noise, and what the features cannot explain."""
+    memory: Seconds = 2.0
+    """Seconds in which what is known fades towards the prior, by a factor of e."""
+
+
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
+    law: literals.LawName = "gradient"
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
     gamma: Unit = 0.8
-    """Learning rate of the last layer, 0 < gamma < 1."""
-    column_bound: Positive = 1.0
-    """Bound on the norm of each column of K, as h per second of period."""
-    initial_scale: NonNegative = 6e-3
-    """Standard deviation of the entries of K_0, as h per second of period."""
+    """Learning rate of the gradient law, 0 < gamma < 1."""
+    column_bound: Positive = 2.0
+    """Bound on the norm of each column of K, as h, in half-widths of its state per second of period."""
+    initial_scale: NonNegative = 1.2e-2
+    """Standard deviation of the entries of K_0, likewise."""
     start: literals.StartName = "random"
     """K_0: "random"; "zero"; "pretrained": random, then fitted to h = 0, the middle of W, all over X x U."""
     at_adoption: literals.AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as the paper does, or fitted to the newest samples."""
+    kalman: KalmanConfig = KalmanConfig()
     refit: RefitConfig = RefitConfig()
     trial: TrialConfig = TrialConfig()
 
 
+class ConstantConfig(Section, frozen=True):
+    gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5
+    """Share of a new label in the filtered one; 1: the last label alone."""
+
+
 class L2nwConfig(Section, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
-    bandwidth: Positive = 0.5
+    bandwidth: Positive = 1.0
+    """Of the Gaussian kernel, in half-widths of each of its variables."""
     regularisation: Positive = 1e-3
     variables: list[str] | None = None
     """Names of the states and inputs the kernel sees; None: the plant's own choice."""
@@ -257,6 +281,7 @@ class Config(Section, frozen=True):
     controller: ControllerConfig = ControllerConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
+    constant: ConstantConfig = ConstantConfig()
     l2nw: L2nwConfig = L2nwConfig()
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()

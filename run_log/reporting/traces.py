@@ -9,7 +9,7 @@ import numpy as np
 from lbmpc.plants import Plant
 from protocol import topics
 from run_log.errors import LogError
-from run_log.reporting.summary import Trajectory, trajectory
+from run_log.reporting.motion import Trajectory, trajectory
 from run_log.run import Run, plant_of
 
 

@@ -35,7 +35,7 @@ class Run(Configured):
     seconds: Annotated[float, arg(metavar="S")] = 20.0
     """How long, counted from the first command."""
     oracle: Annotated[
-        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+        OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
     ] = None
     """What the controller learns with."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None

@@ -28,11 +28,13 @@ class Simulate(Configured):
     )
 
     oracle: Annotated[
-        OracleName | None, arg(metavar="linear|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
+        OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
     ] = None
     """What the controller learns with."""
     steps: Annotated[int, arg(metavar="INT")] = 200
-    """How many ticks."""
+    """How many ticks; of each episode."""
+    episodes: Annotated[int, arg(metavar="INT")] = 1
+    """How often the plant starts again from x0; controller and trainer keep all they have learned."""
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
     """Of everything random; the same seed gives the same run, bit for bit."""
     tightening: Annotated[
@@ -52,6 +54,7 @@ class Simulate(Configured):
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
         terminal.limited("--steps", self.steps, 1, MOST_STEPS)
+        terminal.limited("--episodes", self.episodes, 1, MOST_STEPS // self.steps)
         if self.log is not None and self.log.exists():
             raise Refused(
                 f"{self.log}: exists already, and a log never overwrites anything; choose another name"
@@ -70,9 +73,14 @@ class Simulate(Configured):
             config = override(config, ["trainer.enabled=false"])
         self.say(guarantee(config, build_model(config)))
         with terminal.progress_bar(self.console) as bar:
-            task = bar.add_task(f"simulating, {config.controller.oracle}", total=self.steps)
+            task = bar.add_task(f"simulating, {config.controller.oracle}", total=self.steps * self.episodes)
             try:
-                ran = simulate(config, self.steps, progress=lambda step: bar.update(task, completed=step))
+                ran = simulate(
+                    config,
+                    self.steps,
+                    progress=lambda step: bar.update(task, completed=step),
+                    episodes=self.episodes,
+                )
             except PlantError as error:
                 terminal.complain(f"the plant was lost: {error}", self.json)
                 return 1

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import msgspec
 
 from lbmpc.plants import Plant
-from node_runtime.config.sections import Config, from_tree
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
-from tandem.experiments.study.declaration import Declaration, resolve
+from tandem.experiments.study.declaration import STEPS, Declaration, config_of, resolve
 from tandem.experiments.study.plan import code_version, rows
-from tandem.experiments.study.runner import run_all, time_all, wanted
+from tandem.experiments.study.runner import file_name, run_all, time_all, wanted
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
@@ -82,24 +82,28 @@ def run(
     timings = time_all(
         cases,
         lambda case: repeats if case.group in shown and not quick else 1,
-        declared.steps * base.period,
+        (declared.steps or STEPS) * base.period,
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )
     found = results.collect(plans, records, timings, plant)
     code = code_version()
-    html = page(declared, found, plant, base, command, code, quick)
+    made = page(declared, found, plant, base, command, code, quick)
     every = [row for result in found for row in result.rows]
     told = results.summary(declared, every, plant, command, code, processes, quick)
     report, summary = out / "report.html", out / "summary.json"
-    write_whole(report, html.encode())
+    write_whole(report, made.html.encode())
+    drawn = out / "pictures"
+    drawn.mkdir(exist_ok=True)
+    for name, png in made.pictures.items():
+        write_whole(drawn / f"{file_name(name)}.png", png)
     write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
     return Finished(report, summary, sum(len(want.logs) for want in wants.values()), every)
 
 
 def settings(declared: Declaration, where: str) -> Config:
     """The configuration that no case has changed. Raises `ConfigError`."""
-    return from_tree(dict(declared.base), where)
+    return config_of([declared], {}, where)
 
 
 def overview(declared: Declaration) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def test_rows_have_the_promised_keys(report: Report) -> None:
 
 
 def test_everything_is_there(report: Report) -> None:
-    for oracle in ("linear", "l2nw", "dnn"):
+    for oracle in ("linear", "constant", "l2nw", "dnn"):
         for mode in ("converged", "preparation", "feedback", "tick", "real_time_tick"):
             assert report.find("tandem", mode, oracle, 10, 32 if oracle == "dnn" else None, False), (
                 oracle,

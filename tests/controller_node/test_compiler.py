@@ -58,7 +58,7 @@ def test_products_and_tanh_agree_with_the_virtual_machine(tmp_path: Path) -> Non
     np.testing.assert_array_equal(wide[1], 1.0)
 
 
-@pytest.mark.parametrize("name", ["linear", "l2nw", "dnn"])
+@pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
 def test_the_solver_gives_the_same_optimum_compiled(name: str, tmp_path: Path) -> None:
     oracle = oracle_named(name, MODEL)
     problem = build_problem(MODEL, oracle, 8)

@@ -44,7 +44,7 @@ class ReferenceSolver:
         slack = (
             ca.DM(rows.penalty.scale[count:]) * e if problem.soft else ca.DM.zeros(values.shape[0] - count)
         )
-        cost += problem.penalty * ca.sum1(e + 0.5 * e**2)
+        cost += problem.penalty * model.cost_scale * ca.sum1(e + 0.5 * e**2)
         g = ca.vertcat(values[:count], values[count:] - slack, values[count:] + slack)
         self._lower = np.concatenate(
             [rows.lower[:count], np.full(len(rows.lower) - count, -np.inf), rows.lower[count:]]

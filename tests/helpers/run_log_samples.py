@@ -92,7 +92,7 @@ def synthetic(config: Config | None = None, steps: int = 100, seed: int = 0) -> 
             x=x.tolist(),
             u=u.tolist(),
             mode=command.mode,
-            status="converged",
+            status="iteration limit" if k == 6 else "converged",
             iterations=3,
             slack=1e-3 if k == 5 else 0.0,
             slack_row="y at step 3" if k == 5 else "",

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.model import Model, build_model
-from lbmpc.oracles import DnnOracle, L2nwOracle, LinearOracle, Oracle, OracleState
+from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, OracleState
 from lbmpc.oracles.base import remembered
 from lbmpc.oracles.dnn.adaptation_law import project_columns
 from lbmpc.plants import get_plant
@@ -44,6 +44,8 @@ def describe(
 def oracle_named(name: str, model: Model, hidden: list[int] | None = None) -> Oracle:
     if name == "linear":
         return LinearOracle(model.d, model.m)
+    if name == "constant":
+        return ConstantOracle(model.d, model.m, 0.5)
     if name == "l2nw":
         return L2nwOracle(model.d, model.m, (0, 1, 4), 30, 0.5, 1e-3)
     return DnnOracle(describe(model, hidden or [8, 8]))

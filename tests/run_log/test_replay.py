@@ -99,7 +99,7 @@ def test_from_the_middle(run: Run, from_tick: int, first: int) -> None:
     assert (found.first_tick, found.ticks) == (first, STEPS - first)
 
 
-@pytest.mark.parametrize("oracle", ["linear", "l2nw"])
+@pytest.mark.parametrize("oracle", ["linear", "constant", "l2nw"])
 def test_other_oracles(config: Config, oracle: str) -> None:
     run = simulate(override(config, [f"controller.oracle={oracle}"]), 40)
     assert replay(run).equal

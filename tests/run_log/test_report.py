@@ -62,11 +62,14 @@ def test_summary_of_a_known_run(config: Config, messages: list[Logged]) -> None:
     assert summary.weights_refused == 1
     assert summary.fallback_ticks == 1
     assert summary.soft_ticks == 1
-    assert summary.cost == pytest.approx(sum(z * z + y * y))
-    assert summary.overshoot == max(z)
-    assert summary.settling_step == STEPS - 1
-    assert summary.final_deviation == max(abs(z[-1]), abs(y[-1]))
-    assert summary.constraint_violations == sum(y < -0.5 - 1e-6)
+    assert summary.iteration_limit_ticks == 1
+    dx, u = x - PLANT.x_e, np.array([r.u for r in run.results])[:-1, 0] - PLANT.u_e
+    assert summary.J == pytest.approx(0.05 * (np.sum(dx[:-1] ** 2) + np.sum(u**2)))
+    assert summary.deviation == pytest.approx(0.05 * sum(z[:-1] ** 2 + y[:-1] ** 2))
+    assert summary.overshoot == {"z": max(0.0, max(z / 0.35)), "y": max(0.0, max(y / 0.4))}
+    assert summary.settled_s is None
+    assert summary.settled_by_state_s == {"z": None, "y": None}
+    assert summary.constraint_violations == sum(y < -0.5 - 0.5e-6)
     assert summary.constraint_violations > 5
     errors = [r.prediction_error for r in run.results]
     assert errors[0] is None
@@ -106,11 +109,15 @@ def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, mes
 def test_summary_of_applied_input_and_settled_states(config: Config, messages: list[Logged]) -> None:
     at_rest = moved(messages, x=lambda s: PLANT.x_e.tolist(), applied=lambda s: [2.1547 + 5e-7])
     summary = summarise(gather(config, at_rest))
-    assert (summary.settling_step, summary.constraint_violations, summary.cost) == (0, 0, 0.0)
+    assert (summary.settled_s, summary.constraint_violations, summary.deviation) == (0.0, 0, 0.0)
+    # Who begins settled has no deviation of which an overshoot could be a share.
+    assert summary.overshoot == {"z": None, "y": None}
+    # The equilibrium is none under that input.
+    assert summary.excess_between_samples is None
     outside = moved(at_rest, applied=lambda s: [2.1547 + 2e-6] if s.seq == 9 else None)
     assert summarise(gather(config, outside)).constraint_violations == 1
     late = moved(at_rest, x=lambda s: np.add(PLANT.x_e, [0, 0.021 * (s.seq == 17), 0, 0]).tolist())
-    assert summarise(gather(config, late)).settling_step == 17
+    assert summarise(gather(config, late)).settled_by_state_s == {"z": 0.0, "y": 0.9}
 
 
 def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged]) -> None:

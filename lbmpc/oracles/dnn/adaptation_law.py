@@ -1,14 +1,53 @@
-"""The fast timescale: the projected, normalised gradient law for the last layer, (e:weight_update_law).
-
-    Kbar_{t+1} = K_t - gamma phi / |phi|^2 xtilde_{t+1}',     K_{t+1}^(i) = Kbar^(i) min(1, Wbar_i / |Kbar^(i)|)
-
-with phi = phi_j(x_t, u_t) and xtilde_{t+1} = h_hat_t(x_t, u_t) - h(x_t, u_t). Lemma 1 of the paper holds for it
-whenever |phi| >= 1, which the leading 1 of phi guarantees.
-"""
+"""What a law of the fast timescale is: how one sample moves the last layer. And two operations on its columns."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+import casadi as ca
 import numpy as np
+
+from lbmpc.oracles.base import OracleState
+
+
+class AdaptationLaw(ABC):
+    """One sample's effect on K, (f, d), and on what the law remembers beside it.
+
+    Its arithmetic is an expression, so that it can be compiled together with the features.
+    """
+
+    remembers: tuple[str, ...] = ()
+    """Names of the arrays, (f, f) and symmetric, that an oracle's state holds beside K and that go with it."""
+
+    def begin(self, features: int) -> OracleState:
+        """What is remembered before the first sample, for so many features f."""
+        return {}
+
+    @abstractmethod
+    def settings(self) -> dict[str, np.ndarray]:
+        """The law's numbers, (n,) each: inputs of its expression, so that other ones are the same compiled code."""
+
+    @abstractmethod
+    def expression(
+        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+    ) -> dict[str, ca.MX]:
+        """K and what is remembered after one sample.
+
+        Args:
+            phi: features phi_j(x_t, u_t), (f,), phi[0] = 1.
+            K: K_t transposed, (d, f).
+            error: xtilde_{t+1} = h_hat_t(x_t, u_t) - h(x_t, u_t), (d,), in the units of K' phi.
+            settings: of `settings`.
+            memory: of `remembers`.
+
+        Returns:
+            "K", (d, f), and every name of `remembers`.
+        """
+
+    def bounded(self, learned: OracleState) -> OracleState:
+        """What the expression gave, with each column of "K", (f, d), within its bound."""
+        return learned
 
 
 def project_columns(K: np.ndarray, bounds: np.ndarray) -> np.ndarray:

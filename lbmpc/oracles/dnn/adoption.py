@@ -75,21 +75,21 @@ class Adoption:
         """After a sample was learned: whether the set that was adopted last holds what its trial promised.
 
         Returns:
-            The state and "", or the state with the hidden layers and K from before, and a text that says why.
+            The state and "", or the state with the network from before, and a text that says why.
         """
         if self.trial is None or not rollback.due(self.trial, state):
             return state, ""
         samples = newest(self.trial, state, rollback.since(state))
-        before = rollback.before(state, len(self.net.shapes) - 1)
-        found = self._compare(samples, (self.net.hidden(state), rollback.K_adopted(state)), before)
+        hidden, last = rollback.before(state, len(self.net.shapes) - 1)
+        in_use = (self.net.hidden(state), rollback.K_adopted(state))
+        found = self._compare(samples, in_use, (hidden, last["K"]))
         if self.trial.regrets(found):
-            hidden, K = before
             version = np.array([rollback.version(state), state["version"][NEWEST]], dtype=np.int64)
             text = f"version {int(state['version'][IN_USE])} back to version {int(version[IN_USE])}: {found}"
             return {
                 **state,
                 **self.net.named(hidden),
-                "K": K,
+                **last,
                 "version": version,
                 **rollback.over(state),
             }, text

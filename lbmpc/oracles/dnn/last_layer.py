@@ -12,25 +12,26 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.oracles.base import Realise
+from lbmpc.oracles.base import OracleState, Realise
+from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw
 from lbmpc.oracles.dnn.expressions import NetworkExpressions
 
 
 class LastLayer:
-    """h_hat = s * K' phi and the law of `lbmpc.oracles.dnn.adaptation_law`, on arrays that stay in place.
+    """h_hat = s * K' phi and a law of adaptation, on arrays that stay in place.
 
     Args:
         net: the network.
-        gamma: learning rate.
-        bounds: Wbar_i, (d,), scaled.
+        law: how K learns.
         realise: may compile the functions.
     """
 
-    def __init__(self, net: NetworkExpressions, gamma: float, bounds: np.ndarray, realise: Realise):
-        estimate, learn = build_last_layer(net)
+    def __init__(self, net: NetworkExpressions, law: AdaptationLaw, realise: Realise):
+        estimate, learn = build_last_layer(net, law)
+        self._law = law
         self._estimate, self._learn = Bound(realise(estimate)), Bound(realise(learn))
-        self._learn.inputs["gamma"][0, 0] = gamma
-        self._learn.inputs["bounds"][:, 0] = bounds
+        for name, numbers in law.settings().items():
+            self._learn.inputs[name][:, 0] = numbers
         self._hidden: Sequence[np.ndarray] = ()
 
     def estimate(
@@ -44,17 +45,27 @@ class LastLayer:
     def learn(
         self,
         hidden: Sequence[np.ndarray],
-        K: np.ndarray,
+        state: OracleState,
         x: np.ndarray,
         past: np.ndarray,
         u: np.ndarray,
         h: np.ndarray,
-    ) -> np.ndarray:
-        """K_{t+1}, (1 + n_L, d), after the label h (d,) of the same."""
-        self._load(self._learn, hidden, K, x, past, u)
+    ) -> OracleState:
+        """K, (1 + n_L, d), and what the law remembers beside it, after the label h (d,) of the same.
+
+        state: has both from before.
+        """
+        self._load(self._learn, hidden, state["K"], x, past, u)
         self._learn.inputs["h"][:, 0] = h
+        for name in self._law.remembers:
+            self._learn.inputs[name][:] = state[name]
         self._learn()
-        return self._learn.outputs["K_next"].T.copy()
+        after = self._learn.outputs
+        learned: OracleState = {"K": after["K_next"].T.copy()}
+        for name in self._law.remembers:
+            # Symmetric, so that rows may stand for columns: a keyframe holds arrays row by row.
+            learned[name] = after[f"{name}_next"].T.copy()
+        return self._law.bounded(learned)
 
     def _load(
         self,
@@ -78,23 +89,29 @@ class LastLayer:
             point[d:-m] = past
 
 
-def build_last_layer(net: NetworkExpressions) -> tuple[ca.Function, ca.Function]:
-    """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, gamma, bounds) -> K_next, K (d, 1 + n_L)."""
+def build_last_layer(net: NetworkExpressions, law: AdaptationLaw) -> tuple[ca.Function, ca.Function]:
+    """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, the law's) -> K_next and the law's.
+
+    K is (d, 1 + n_L) there.
+    """
     features, d = net.description.features, net.d
     su = ca.MX.sym("su", d + (net.pairs - 1) * (d + net.m) + net.m)
     hidden, K = ca.MX.sym("hidden", net.parameters - features * d), ca.MX.sym("K", d, features)
-    h, gamma, bounds = ca.MX.sym("h", d), ca.MX.sym("gamma"), ca.MX.sym("bounds", d)
+    h = ca.MX.sym("h", d)
+    settings = {name: ca.MX.sym(name, len(numbers)) for name, numbers in law.settings().items()}
+    memory = {name: ca.MX.sym(name, features, features) for name in law.remembers}
     parts = net.split(ca.vertcat(hidden, ca.vec(K)))
     phi = ca.vertcat(1, net.activation(su, parts))
     unit = K @ phi
-    error = unit - h / net.output_scale
-    moved = K - (gamma / ca.dot(phi, phi)) * (error @ phi.T)
-    norms = ca.sqrt(ca.sum2(moved * moved))
-    # bounds / bounds is 1 exactly, so what keeps its bound is not touched.
-    kept = moved * ca.repmat(bounds / ca.fmax(norms, bounds), 1, features)
+    after = law.expression(phi, K, unit - h / net.output_scale, settings, memory)
     estimate = ca.Function(
         "estimate", [su, hidden, K], [unit * net.output_scale], ["su", "hidden", "K"], ["h_hat"]
     )
-    names = ["su", "hidden", "K", "h", "gamma", "bounds"]
-    learn = ca.Function("learn", [su, hidden, K, h, gamma, bounds], [ca.densify(kept)], names, ["K_next"])
+    learn = ca.Function(
+        "learn",
+        [su, hidden, K, h, *settings.values(), *memory.values()],
+        [ca.densify(value) for value in after.values()],
+        ["su", "hidden", "K", "h", *settings, *memory],
+        [f"{name}_next" for name in after],
+    )
     return estimate, learn

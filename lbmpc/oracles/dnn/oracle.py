@@ -8,9 +8,11 @@ import numpy as np
 
 from lbmpc.oracles.base import HiddenSet, LearnedNetwork, OracleState, Realise, Verdict
 from lbmpc.oracles.dnn import rollback
-from lbmpc.oracles.dnn.adaptation_law import project_columns, refit
+from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw, project_columns, refit
 from lbmpc.oracles.dnn.adoption import IN_USE, NEWEST, Adoption, Refit
 from lbmpc.oracles.dnn.expressions import NetworkExpressions
+from lbmpc.oracles.dnn.gradient_law import GradientLaw
+from lbmpc.oracles.dnn.kalman_law import Kalman, KalmanLaw
 from lbmpc.oracles.dnn.last_layer import LastLayer
 from lbmpc.oracles.dnn.trial import Trial, empty, only, remember
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
@@ -26,12 +28,13 @@ class DnnOracle(NetworkExpressions):
 
     Args:
         description: sizes, activations and scaling.
-        gamma: learning rate of the last layer; 0: it stays as it is.
-        column_bound: Wbar_i, in units of h.
-        initial_scale: standard deviation of the entries of K_0, in units of h.
+        gamma: learning rate of the last layer under the gradient law; 0: it stays as it is.
+        column_bound: Wbar_i, (d,), in units of h; a number counts for every column.
+        initial_scale: standard deviation of the entries of each column of K_0, likewise.
         start: how K_0 comes about.
         refit: what happens to K when hidden layers are adopted; None: it is kept.
         trial: what hidden layers must show before and after they are adopted; None: nothing.
+        kalman: the last layer learns by this filter; None: by the gradient law.
     """
 
     name = "dnn"
@@ -40,16 +43,20 @@ class DnnOracle(NetworkExpressions):
         self,
         description: NetworkDescription,
         gamma: float = 0.5,
-        column_bound: float = 0.05,
-        initial_scale: float = 1e-3,
+        column_bound: np.ndarray | float = 0.05,
+        initial_scale: np.ndarray | float = 1e-3,
         start: Start = "random",
         refit: Refit | None = None,
         trial: Trial | None = None,
+        kalman: Kalman | None = None,
     ):
         super().__init__(description)
         self.gamma = gamma
         self.bounds = column_bound / self.output_scale
         self.initial_scale, self.start, self.refit, self.trial = initial_scale, start, refit, trial
+        self.law: AdaptationLaw = (
+            GradientLaw(gamma, self.bounds) if kalman is None else KalmanLaw(kalman, self.bounds)
+        )
         self._adoption = Adoption(self, self.bounds, refit, trial)
         self._last_layer: LastLayer | None = None
 
@@ -57,6 +64,7 @@ class DnnOracle(NetworkExpressions):
         hidden = initial_hidden(self.description, rng)
         state = self.named(hidden)
         state["K"] = self._first_K(hidden, rng)
+        state |= self.law.begin(self.description.features)
         state["version"] = np.zeros(2, dtype=np.int64)
         if self.pairs > 1:
             state["past"] = np.zeros((self.pairs - 1, self.d + self.m))
@@ -65,7 +73,8 @@ class DnnOracle(NetworkExpressions):
             state["sampled"] = np.zeros(1, dtype=np.int64)
         if self.trial is not None:
             state |= empty(self.trial, self.pairs * (self.d + self.m) + self.d)
-            state |= rollback.nothing(self.hidden(state), state["K"]) | only(hash_layers(hidden))
+            state |= rollback.nothing(hidden, {name: state[name] for name in ("K", *self.law.remembers)})
+            state |= only(hash_layers(hidden))
         return state
 
     def _first_K(self, hidden: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -92,15 +101,14 @@ class DnnOracle(NetworkExpressions):
 
     def compile(self, realise: Realise) -> None:
         """Let `realise` turn what every tick calls into something faster; the virtual machine runs it otherwise."""
-        self._last_layer = LastLayer(self, self.gamma, self.bounds, realise)
+        self._last_layer = LastLayer(self, self.law, realise)
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return self._every_tick().estimate(self.hidden(state), state["K"], x, self._before(state), u)
 
     def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
         before = self._before(state)
-        K = self._every_tick().learn(self.hidden(state), state["K"], x, before, u, h)
-        learned = {**state, "K": K}
+        learned = {**state, **self._every_tick().learn(self.hidden(state), state, x, before, u, h)}
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
         if self.refit is not None or self.trial is not None:
@@ -126,7 +134,7 @@ class DnnOracle(NetworkExpressions):
 
     def _every_tick(self) -> LastLayer:
         if self._last_layer is None:
-            self._last_layer = LastLayer(self, self.gamma, self.bounds, lambda function: function)
+            self._last_layer = LastLayer(self, self.law, lambda function: function)
         return self._last_layer
 
     def _before(self, state: OracleState) -> np.ndarray:

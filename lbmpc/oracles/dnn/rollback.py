@@ -19,10 +19,11 @@ that time, whoever sends more is measured against what was there before them."""
 ON, SINCE, ADOPTED, UNTIL, VERSION = range(5)
 
 
-def nothing(hidden: list[np.ndarray], K: np.ndarray) -> State:
-    """Nothing to be confirmed."""
+def nothing(hidden: list[np.ndarray], last: State) -> State:
+    """Nothing to be confirmed; last: K and what its law remembers beside it."""
     entries: State = {f"before.W{i + 1}": np.zeros(layer.shape, np.float32) for i, layer in enumerate(hidden)}
-    entries["before.K"], entries["adopted.K"] = np.zeros(K.shape), np.zeros(K.shape)
+    entries |= {f"before.{name}": np.zeros(array.shape) for name, array in last.items()}
+    entries["adopted.K"] = np.zeros(last["K"].shape)
     entries["watch"] = np.zeros(5, dtype=np.int64)
     return entries
 
@@ -36,7 +37,7 @@ def adopted(trial: Trial, state: State, hidden: list[np.ndarray], K: np.ndarray)
     if not on or settled:
         # Hidden layers are float32 values.
         changed |= {f"before.W{i + 1}": layer.astype(np.float32) for i, layer in enumerate(hidden)}
-        changed["before.K"] = state["K"]
+        changed |= {f"before.{name}": state[name] for name in _last(state)}
         left, version = now, int(state["version"][0])
     changed["watch"] = np.array([1, left, now, now + trial.window, version], dtype=np.int64)
     return changed
@@ -59,7 +60,7 @@ def ends(state: State) -> bool:
 def over(state: State) -> State:
     """What the end of a watch changes."""
     layers = [array for name, array in state.items() if name.startswith("before.W")]
-    return nothing(layers, state["K"])
+    return nothing(layers, _last(state))
 
 
 def since(state: State) -> int:
@@ -72,11 +73,18 @@ def version(state: State) -> int:
     return int(state["watch"][VERSION])
 
 
-def before(state: State, layers: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """The reference: hidden layers and K as they were."""
-    return [state[f"before.W{i + 1}"].astype(float) for i in range(layers)], state["before.K"]
+def before(state: State, layers: int) -> tuple[list[np.ndarray], State]:
+    """The reference: hidden layers, and the last one with what its law remembered, as they were."""
+    hidden = [state[f"before.W{i + 1}"].astype(float) for i in range(layers)]
+    return hidden, {name: state[f"before.{name}"] for name in _last(state)}
 
 
 def K_adopted(state: State) -> np.ndarray:
     """K with which the set in use began."""
     return state["adopted.K"]
+
+
+def _last(state: State) -> State:
+    """K and what its law remembers beside it: what a reference holds besides hidden layers."""
+    names = [name.removeprefix("before.") for name in state if name.startswith("before.")]
+    return {name: state[name] for name in names if not name.startswith("W")}

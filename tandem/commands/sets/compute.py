@@ -97,17 +97,20 @@ class SetsCompute(Configured):
             Work,
             default_cache,
             read_sets,
-            write_sets,
+            why_not_believed,
         )
         from lbmpc.sets.certificate import CertificateError
         from lbmpc.sets.check import check
-        from lbmpc.sets.construct import construct, volume_fraction
+        from lbmpc.sets.construct import Saved, construct, volume_fraction
         from lbmpc.sets.geometry.polytope import SetError
         from lbmpc.sets.guard import Guard
 
         work = Work.of(model, kind, start, W, self.slack, default_cache())
-        saved = SavedArrays(work.folder)
-        if self.fresh:
+        doubt = why_not_believed(work)
+        saved: Saved = SavedArrays(work.folder) if doubt is None else {}
+        if doubt is not None:
+            self.say(f"{doubt}; computed without it", style="yellow")
+        elif self.fresh:
             saved.clear()
         elif work.sets.exists():
             try:
@@ -128,9 +131,8 @@ class SetsCompute(Configured):
             try:
                 certificate = construct(model, kind, start, W, self.slack, saved=saved, report=report)
             except KeyboardInterrupt:
-                self.say(
-                    f"interrupted; what was done is kept in {work.folder}: the same command goes on from there"
-                )
+                kept = f"is kept in {work.folder}: the same command goes on from there"
+                self.say(f"interrupted; what was done {kept if doubt is None else 'is lost'}")
                 raise
             seconds = time.monotonic() - began
             proving = bar.add_task(f"{kind}: proving the claim", total=1.0)
@@ -140,7 +142,8 @@ class SetsCompute(Configured):
         contains = Guard(certificate).first_inputs(start).piece >= 0
         found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
         sets = CertifiedSets.of(certificate, found)
-        write_sets(sets, work.sets)
+        if doubt is None:
+            work.save(sets)
         return sets, False
 
 

@@ -39,7 +39,7 @@ class SetsPlot(Command):
         from lbmpc.sets.certificate import CertificateError, require_match
         from run_log.reading.reader import read_run
         from run_log.reporting.canvas import drawing, save
-        from run_log.reporting.summary import trajectory
+        from run_log.reporting.motion import trajectory
         from run_log.run import plant_of
 
         require("matplotlib")

@@ -9,21 +9,27 @@ from matplotlib.ticker import NullLocator
 
 from lbmpc.plants import Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
+from tandem.experiments.reporting.pictures_by_episode import episodes
 from tandem.experiments.reporting.pictures_over_time import lemma, recovery, trajectories
-from tandem.experiments.reporting.style import Picture, figure, full_name, legend_above, looks
+from tandem.experiments.reporting.style import Picture, figure, legend_above, looks, named
 from tandem.experiments.study.declaration import Picture as Kind
 from tandem.experiments.study.results import CaseResult
+
+WIDE = 50.0
+"""Percent of regret from which on the axis is logarithmic, but for its first percent on either side of 0."""
 
 
 def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | None) -> list[Picture]:
     """The pictures of one group."""
     match kind:
+        case "episodes":
+            return episodes(results)
         case "trajectories":
             return trajectories(results, plant)
         case "states":
             return states(results, plant)
         case "survival":
-            return survival(results)
+            return survival(results, plant)
         case "recovery":
             return recovery(results, plant)
         case "lemma":
@@ -33,18 +39,22 @@ def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | N
 
 
 def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
-    """Regret of each case: median, and from the best to the worst run. Cost where a case has no regret."""
-    what = "regret" if any(row.regret is not None for result in results for row in result.rows) else "cost"
+    """Regret of each case: median, and from the best to the worst run. J where no case has a regret."""
+    regret = any(row.regret is not None for result in results for row in result.rows)
     made, (ax,) = figure(height=0.45 + 0.27 * len(results))
-    everything = np.concatenate([result.values(what) for result in results])
-    finite = everything[np.isfinite(everything)]
+    every = [100 * result.values("regret") if regret else result.values("J") for result in results]
+    finite = np.concatenate(every)
+    finite = finite[np.isfinite(finite)]
     if not finite.size:
         return []
-    right = float(finite.max()) * 1.4
-    for i, result in enumerate(results):
-        values, own = result.values(what), result.case.name == reference
+    low, high = min(0.0, float(finite.min())), float(finite.max())
+    right = high + 0.4 * max(high - low, 1e-9)
+    for i, (result, all_values) in enumerate(zip(results, every, strict=True)):
+        values, own = all_values[~np.isnan(all_values)], result.case.name == reference
+        if not values.size:
+            continue
         shown = np.minimum(values, right)
-        middle = min(result.median(what), right)
+        middle = min(float(np.median(values)), right)
         colour = BLUE if own else "black"
         reach = [shown.min(), shown.max()]
         ax.plot(reach, [i, i], color=colour, linewidth=3.5, alpha=0.25, solid_capstyle="butt")
@@ -53,7 +63,7 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
         lost = int((~np.isfinite(values)).sum())
         broken = sum(not record.kept for record in result.records)
         if lost or broken:
-            said, beside = f"{broken} of {len(values)} leave the bounds", (shown.max(), i)
+            said, beside = f"{broken} of {len(result.records)} leave the bounds", (shown.max(), i)
             place: Any = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
             ax.annotate(said, beside, **place, fontsize=8, color=VERMILION)
         if own:
@@ -65,11 +75,18 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
             ax.xaxis.set_minor_formatter(lambda at, _position: f"{at:g}" if f"{at:e}"[0] in "25" else "")
         else:
             ax.xaxis.set_minor_locator(NullLocator())
+    elif regret:
+        # What is left of it is better than the true h.
+        ax.axvline(0.0, color=GREY, linewidth=0.9, zorder=0)
+        if high > WIDE:
+            ax.set_xscale("symlog", linthresh=1.0)
+            ax.xaxis.set_major_formatter("{x:g}")
     ax.set_yticks(range(len(results)), [_wrapped(result.label) for result in results])
     ax.set_ylim(len(results) - 0.5, -0.5)
-    ax.set_xlabel(f"{what}: sum of Δz² + Δy²{', above the true h' if what == 'regret' else ''}")
+    what = "regret" if regret else "J"
+    ax.set_xlabel("regret: J above that of the true h (%)" if regret else "J: sum of the stage costs")
     marked = "; diamond and dashed line: what the others are compared with" if reference else ""
-    caption = f"{what.capitalize()} of every run (strokes) and its median (dot){marked}."
+    caption = f"{what[0].upper()}{what[1:]} of every run (strokes) and its median (dot){marked}."
     return [Picture(made, caption, f"{what} by case")]
 
 
@@ -82,7 +99,8 @@ def _wrapped(label: str) -> str:
 
 def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
     """Each initial state where it lies: kept, kept for some seeds, or not."""
-    first, second = plant.performance[:2]
+    first, *more = [*plant.performance, *(i for i in range(plant.d) if i not in plant.performance)]
+    second = more[0] if more else None
     columns = 2
     made, axes = figure(rows=-(-len(results) // columns), columns=columns, height=2.3)
     for ax in axes[len(results) :]:
@@ -90,25 +108,31 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
     for ax, result in zip(axes, results, strict=False):
         kept_from: dict[tuple[float, float], list[bool]] = {}
         for row, record in zip(result.rows, result.records, strict=True):
-            kept_from.setdefault((row.x0[first], row.x0[second]), []).append(record.kept)
-        for (z, y), kept in kept_from.items():
+            kept_from.setdefault((row.x0[first], 0.0 if second is None else row.x0[second]), []).append(
+                record.kept
+            )
+        for (across, up), kept in kept_from.items():
             if all(kept):
-                ax.plot(z, y, "o", color=BLUE, markersize=8)
+                ax.plot(across, up, "o", color=BLUE, markersize=8)
             elif not any(kept):
-                ax.plot(z, y, "x", color=VERMILION, markersize=8, markeredgewidth=2)
+                ax.plot(across, up, "x", color=VERMILION, markersize=8, markeredgewidth=2)
             else:
-                ax.plot(z, y, "o", markerfacecolor="white", markeredgecolor=VERMILION, markersize=11)
-                ax.text(z, y, f"{sum(kept)}", ha="center", va="center", fontsize=7.5)
-        ax.plot(plant.x_e[first], plant.x_e[second], "+", color=GREY, markersize=14, zorder=0)
+                ax.plot(across, up, "o", markerfacecolor="white", markeredgecolor=VERMILION, markersize=11)
+                ax.text(across, up, f"{sum(kept)}", ha="center", va="center", fontsize=7.5)
+        rest = 0.0 if second is None else plant.x_e[second]
+        ax.plot(plant.x_e[first], rest, "+", color=GREY, markersize=14, zorder=0)
         ax.set_xlim(*_frame(plant, first))
-        ax.set_ylim(*_frame(plant, second))
+        if second is None:
+            ax.set_yticks([])
+        else:
+            ax.set_ylim(*_frame(plant, second))
         ax.set_title(f"{result.label}: {result.kept:.0%} keep all", fontsize=9)
     for ax in axes[-columns:]:
-        ax.set_xlabel(full_name(plant, first))
+        ax.set_xlabel(named(plant, first))
     for ax in axes[::columns]:
-        ax.set_ylabel(full_name(plant, second))
+        ax.set_ylabel("" if second is None else named(plant, second))
     caption = (
-        "Dot: every run from there keeps all true constraints; cross: none does; number: so many seeds do. "
+        "Dot: every run from there keeps all true constraints at samples; cross: none does; number: so many seeds do. "
         "The frame is the bounds, the plus in the middle the equilibrium."
     )
     return [Picture(made, caption, "initial states that are kept, by controller")]
@@ -120,7 +144,7 @@ def _frame(plant: Plant, i: int) -> tuple[float | None, float | None]:
     return low, high
 
 
-def survival(results: list[CaseResult]) -> list[Picture]:
+def survival(results: list[CaseResult], plant: Plant) -> list[Picture]:
     """Share of the runs that keep all true constraints, against what the cases vary."""
     made, (ax,) = figure(height=3.3)
     families = by_family(results)
@@ -136,30 +160,41 @@ def survival(results: list[CaseResult]) -> list[Picture]:
     # Even steps: the margins crowd at the small end.
     ax.set_xticks(range(len(places)), [f"{place:g}" for place in places])
     ax.set_ylim(-4, 104)
-    ax.set_ylabel("runs that keep all constraints (%)")
-    ax.set_xlabel("margin for w_y per second (half-width of W; steps are not even)")
+    ax.set_ylabel("runs that keep all constraints at samples (%)")
+    ax.set_xlabel(f"{_what_varies(next(iter(families.values())), plant)} (steps are not even)")
     legend_above(ax)
-    caption = "Share of runs that keep all true constraints, by margin."
+    caption = "Share of runs that keep all true constraints at samples, by margin."
     return [Picture(made, caption, "survival by margin and oracle")]
 
 
 def by_family(results: list[CaseResult]) -> dict[str, list[CaseResult]]:
-    """Cases that one declaration's `vary` made, together."""
+    """Cases that differ in the last of what varies alone, together."""
     families: dict[str, list[CaseResult]] = {}
     for result in results:
-        families.setdefault(result.case.name.partition(": ")[0], []).append(result)
+        families.setdefault(result.case.family, []).append(result)
     return families
 
 
 def family_label(member: CaseResult) -> str:
-    return member.label.partition(": ")[0]
+    return member.case.family
 
 
 def margins(members: list[CaseResult]) -> list[float]:
     """What varies from member to member: a number, or the one entry of a list that does."""
-    values: list[Any] = [next(iter(member.case.varied.values()), 0.0) for member in members]
+    values: list[Any] = [[0.0, *member.case.varied.values()][-1] for member in members]
     if not isinstance(values[0], list):
         return [float(value) for value in values]
-    table = np.array(values, dtype=float)
-    column = int(np.argmax(np.ptp(table, axis=0)))
-    return table[:, column].tolist()
+    return [value[_varying(values)] for value in values]
+
+
+def _what_varies(members: list[CaseResult], plant: Plant) -> str:
+    key, value = [("", 0.0), *members[0].case.varied.items()][-1]
+    name = key.rpartition(".")[2]
+    if not isinstance(value, list):
+        return name
+    at = _varying([member.case.varied[key] for member in members])
+    return f"{name} of {plant.states[at]}" if len(value) == plant.d else f"{name}, entry {at}"
+
+
+def _varying(values: list[list[float]]) -> int:
+    return int(np.argmax(np.ptp(np.array(values, dtype=float), axis=0)))

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from lbmpc.plants import Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
-from tandem.experiments.reporting.style import Look, Picture, figure, full_name, legend_above, looks
+from tandem.experiments.reporting.style import Look, Picture, figure, full_name, legend_above, looks, named
 from tandem.experiments.study.results import CaseResult
 from tandem.experiments.study.work import Traces
 
@@ -29,7 +29,7 @@ def _state(results: list[CaseResult], plant: Plant, i: int) -> Picture:
     ax.axhline(plant.x_e[index], color=GREY, linewidth=0.7, zorder=0)
     _bounds(ax, plant, index)
     ax.set_xlabel("time (s)")
-    ax.set_ylabel(f"{full} ({_unit(plant, index)})")
+    ax.set_ylabel(named(plant, index))
     legend_above(ax)
     return Picture(
         made,
@@ -112,13 +112,14 @@ def recovery(results: list[CaseResult], plant: Plant) -> list[Picture]:
         drift = same[0].case.faults.drift
         said = "no change"
         if drift is not None:
-            values = ", ".join(f"{n} = {plant.parameters[n]:g} to {v:g}" for n, v in drift.to.items())
+            before = {**plant.parameters, **same[0].case.config.plant.truth}
+            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" for n, v in drift.to.items())
             when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
             said = f"{values} {when}"
             for ax in (above, below):
                 ax.axvspan(drift.at, drift.at + max(drift.over, 0.02), color=GREY, alpha=0.3, linewidth=0)
         above.axhline(plant.x_e[index], color=GREY, linewidth=0.7, zorder=0)
-        above.set_ylabel(f"{full_name(plant, index)} ({_unit(plant, index)})")
+        above.set_ylabel(named(plant, index))
         below.set_yscale("log")
         below.set_ylabel("|ĥ − h|")
         below.set_xlabel("time (s)")
@@ -162,8 +163,3 @@ def lemma(results: list[CaseResult], plant: Plant) -> list[Picture]:
     legend_above(axes[0], height=1.08, columns=1, space=0.0)
     alt = "accumulated squared prediction error beside its bounds, logarithmic"
     return [Picture(made, " ".join(lines), alt)]
-
-
-def _unit(plant: Plant, index: int) -> str:
-    unit = plant.units.get(plant.states[index], "")
-    return "dimensionless" if unit in ("", "1") else unit

@@ -16,6 +16,8 @@ from tandem.experiments.study.results import CaseResult
 
 WIDTH = 5.4
 """Inches: narrow, so that letters can still be read on a phone."""
+DOTS = 150
+"""Per inch."""
 FONT: Any = {"font.size": 9, "axes.titlesize": 9.5, "svg.hashsalt": "tandem", "svg.fonttype": "path"}
 
 
@@ -23,6 +25,7 @@ Look = dict[str, Any]
 """Colour, line and marker, as `Axes.plot` takes them."""
 LOOKS: dict[str, Look] = {
     "linear": {"color": GREY, "linestyle": (0, (5, 1.5)), "marker": "s"},
+    "constant": {"color": SKY, "linestyle": (0, (3, 1)), "marker": "d"},
     "l2nw": {"color": VERMILION, "linestyle": (0, (5, 1.5, 1, 1.5)), "marker": "^"},
     "dnn": {"color": BLUE, "linestyle": "-", "marker": "o"},
     "perfect": {"color": BLACK, "linestyle": (0, (1, 1.2)), "marker": "D"},
@@ -31,7 +34,7 @@ MORE: tuple[Look, ...] = (
     {"color": "#E69F00", "linestyle": (0, (3, 1, 1, 1, 1, 1)), "marker": "v"},
     {"color": GREEN, "linestyle": (0, (8, 2)), "marker": "P"},
     {"color": "#CC79A7", "linestyle": (0, (2, 2)), "marker": "X"},
-    {"color": SKY, "linestyle": "-", "marker": "*"},
+    {"color": "#882255", "linestyle": "-", "marker": "*"},
 )
 
 
@@ -75,6 +78,20 @@ def legend_above(ax: Axes, height: float = 1.0, columns: int = 2, space: float =
 def full_name(plant: Plant, index: int) -> str:
     """Of a state, in words where the plant has them."""
     return plant.names.get(plant.states[index], plant.states[index])
+
+
+def named(plant: Plant, index: int) -> str:
+    """A state for an axis: its full name, and its unit where it has one."""
+    unit = plant.units.get(plant.states[index], "")
+    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else unit})"
+
+
+def png(made: Figure) -> bytes:
+    """The figure for a document that takes no SVG."""
+    buffer = io.BytesIO()
+    with rc_context(FONT):
+        made.savefig(buffer, format="png", dpi=DOTS, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def data_uri(made: Figure) -> str:

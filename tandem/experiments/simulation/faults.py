@@ -24,12 +24,12 @@ class Drift(Section, frozen=True):
         """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
         pieces = RAMP_PIECES if self.over > 0 else 1
         made = []
-        for share in np.arange(1, pieces + 1) / pieces:
+        for share in (np.arange(1, pieces + 1) / pieces).tolist():
             values = {
                 name: (1 - share) * plant.parameters.get(name, 0.0) + share * value
                 for name, value in self.to.items()
             }
-            made.append((self.at + float(share) * self.over, plant.varied(**values)))
+            made.append((self.at + share * self.over, plant.varied(**values)))
         return made
 
 

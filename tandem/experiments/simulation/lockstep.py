@@ -2,13 +2,15 @@
 
 Deterministic for a seed: a tick's state is the plant's sample at exactly that time, its command acts from that time
 on and a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
+
+Each episode is a plant that was started again at x0; controller and trainer go on with all they have learned.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,8 +18,8 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError
-from node_runtime.config.plant import initial_state
+from lbmpc.plants import Plant, PlantError, get_plant
+from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -44,45 +46,52 @@ class Outcome:
     """What a recorder would have seen; times are virtual and start at 0."""
     lost: str | None
     """Why the true motion could not be followed to the end; None when it could."""
+    episodes: int
+    """How many of them were followed to their end."""
 
 
-def simulate(config: Config, steps: int, progress: Progress | None = None) -> Run:
+def simulate(config: Config, steps: int, progress: Progress | None = None, episodes: int = 1) -> Run:
     """`follow`, without faults, of a plant that is not lost.
 
     Raises:
         ConfigError: the configuration admits no controller.
         PlantError: the true plant left every state from which its equations can be followed.
     """
-    outcome = follow(config, steps, progress=progress)
+    outcome = follow(config, steps, progress=progress, episodes=episodes)
     if outcome.lost is not None:
         raise PlantError(outcome.lost)
     return outcome.run
 
 
 def follow(
-    config: Config, steps: int, faults: Faults = NO_FAULTS, progress: Progress | None = None
+    config: Config,
+    steps: int,
+    faults: Faults = NO_FAULTS,
+    progress: Progress | None = None,
+    episodes: int = 1,
 ) -> Outcome:
-    """Run `steps` periods from x0.
+    """Run `steps` periods from x0, `episodes` times.
 
     Args:
         config: the resolved configuration.
-        steps: ticks.
-        faults: what goes wrong.
-        progress: told the number of finished steps.
+        steps: ticks of each episode.
+        faults: what goes wrong; its times count from the first episode on.
+        progress: told the number of finished steps, of all episodes.
+        episodes: how often the plant is started.
 
     Raises:
         ConfigError: the configuration admits no controller, or the faults do not fit the plant.
     """
     with one_blas_thread():
-        return _LockStep(config, faults).run(steps, progress)
+        return _LockStep(config, faults).run(steps, progress, episodes)
 
 
 class _LockStep:
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        x0 = initial_state(config, self.core.plant)
-        self.plant = PlantSim(self.core.plant, config.period, x0, config.plant.plan_patience, PLANT)
+        self.true = true_plant_of(config, get_plant)
+        self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
         if faults.command_seconds >= config.period:
@@ -94,12 +103,16 @@ class _LockStep:
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
         self.log: list[tuple[Topic, m.Message, int]] = []
 
+    def _started_plant(self, run_id: str) -> PlantSim:
+        x0 = initial_state(self.config, self.true)
+        return PlantSim(self.true, self.config.period, x0, self.config.plant.plan_patience, run_id)
+
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
             return []
         try:
-            return self.faults.drift.plants(self.core.plant)
-        except KeyError as error:
+            return self.faults.drift.plants(self.true)
+        except (KeyError, PlantError) as error:
             raise ConfigError(f"faults.drift: {error.args[0]}") from error
 
     def _noise(self) -> np.ndarray | None:
@@ -121,30 +134,43 @@ class _LockStep:
             self.core.controller.oracle.description, self.config.trainer, self.config.seed, TRAINER, hidden
         )
 
-    def run(self, steps: int, progress: Progress | None) -> Outcome:
+    def run(self, steps: int, progress: Progress | None, episodes: int = 1) -> Outcome:
         self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
         if (sets := self.core.certified_sets()) is not None:
             self._note(topics.SETS, sets, 0)
         self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
-        lost, seq = None, -1
+        lost, seq, ended = None, -1, 0
         try:
-            for seq in range(steps):
+            for seq in range(steps * episodes):
+                if seq and seq % steps == 0:
+                    self._end_episode(seq)
+                    ended += 1
+                    self.plant = self._started_plant(f"{PLANT}-{seq // steps + 1}")
                 self._step(seq)
                 if progress is not None:
                     progress(seq + 1)
-            self._note(topics.PLANT_STATE, self.plant.sample(steps * self.config.period), steps)
+            self._end_episode(steps * episodes)
+            ended += 1
         except PlantError as error:
-            lost = f"at step {seq} of {steps}: {error}"
+            episode = f" in episode {seq // steps + 1} of {episodes}" if episodes > 1 else ""
+            lost = f"at step {seq % steps} of {steps}{episode}: {error}"
         if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
             self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
-        return Outcome(gather(self.config, self.log), lost)
+        return Outcome(gather(self.config, self.log), lost, ended)
+
+    def _end_episode(self, seq: int) -> None:
+        """Where the last command of the plant has led it."""
+        self._note(topics.PLANT_STATE, self.plant.sample(seq * self.config.period), seq)
 
     def _step(self, seq: int) -> None:
         started = time.perf_counter()
         t = seq * self.config.period
         true = self.plant.sample(t)
+        truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
-            self.plant.change(self.changes.pop(0)[1])
+            self.true = self.changes.pop(0)[1]
+            self.plant.change(self.true)
+            truth = self.true.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = self._arriving(seq)
@@ -159,6 +185,7 @@ class _LockStep:
             state_verdict="fresh",
             state=state,
             weights=weights,
+            truth=dict(truth),
         )
         stepped = time.perf_counter()
         outputs = self.core.step(tick)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,10 +11,21 @@ import msgspec
 
 from lbmpc.plants import Plant
 from node_runtime.config.sections import Config, Count, Section, from_tree
-from node_runtime.config.strict import ConfigError, apply_override, did_you_mean, load_tree, strict
+from node_runtime.config.shipped import config_file
+from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults
 
-Picture = Literal["trajectories", "states", "survival", "lemma", "recovery", "rows"]
+Picture = Literal["episodes", "trajectories", "states", "survival", "lemma", "recovery", "rows"]
+ORACLE = "controller.oracle"
+ORACLES = {
+    "linear": "linear MPC",
+    "constant": "constant ĥ",
+    "l2nw": "L2NW",
+    "dnn": "network",
+    "perfect": "true h",
+}
+"""As the report calls them."""
+STEPS = 200
 Name = Annotated[str, msgspec.Meta(pattern=r"^[^/\\]{1,60}$")]
 
 
@@ -27,7 +38,23 @@ class Starts(Section, frozen=True):
     """Values by state name, every combination; the states that are not named are the plant's x0's."""
 
 
-class Group(Section, frozen=True):
+class Runs(Section, frozen=True, kw_only=True):
+    """What a case runs. Its group and the experiment may say it for all of theirs: the nearest that says it counts."""
+
+    config: str | None = None
+    """What to start from: a shipped configuration by its name, or a file."""
+    set: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Changes of the configuration, as a table like it: a case's over its group's, a group's over the experiment's."""
+    seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count | None = None
+    """Which, or how many from 0 on; 1 where nothing is said. A case that draws nothing has the first alone."""
+    steps: Count | None = None
+    """Ticks of an episode; 200 where nothing is said."""
+    episodes: Count | None = None
+    """How often the plant starts, with all that was learned kept; 1 where nothing is said."""
+    faults: Faults | None = None
+
+
+class Group(Runs, frozen=True, kw_only=True):
     """Cases that one table shows together."""
 
     name: Name
@@ -37,23 +64,19 @@ class Group(Section, frozen=True):
     picture: Picture = "rows"
     reference: str | None = None
     """The case that the others are compared with, in words below the table."""
+    x0s: Name = "default"
+    """A name of [x0s]; "default" is the configuration's own x0."""
 
 
-class Case(Section, frozen=True):
+class Case(Runs, frozen=True, kw_only=True):
     name: Name
     group: Name
     label: str = ""
     """What the report calls it; the name where there is none."""
-    set: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Changes of the configuration, as a table like it."""
     vary: dict[str, list[Any]] = msgspec.field(default_factory=dict)
     """Makes a case of each combination: "section.key" -> values."""
-    seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count = 1
-    """Which, or how many from 0 on."""
-    x0s: Name = "default"
-    """A name of [x0s]; "default" is the configuration's own x0."""
-    steps: Count | None = None
-    faults: Faults = Faults()
+    x0s: Name | None = None
+    """Others than its group's."""
     log: bool = False
     """Keep the MCAP log of every run from the default x0."""
     quick: bool = True
@@ -66,18 +89,16 @@ class Quick(Section, frozen=True):
     seeds: Count = 2
     x0s: Count = 3
     values: Count = 3
-    """Of each `vary`, first, last and some between."""
+    """Of each `vary`, first, last and some between; of the oracles all."""
+    episodes: Count = 2
 
 
-class Declaration(Section, frozen=True, kw_only=True):
+class Declaration(Runs, frozen=True, kw_only=True):
     """The file."""
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
     title: str
     about: str = ""
-    steps: Count = 200
-    base: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Changes of the configuration for all cases."""
     x0s: dict[str, Starts] = msgspec.field(default_factory=dict)
     quick: Quick = Quick()
     group: list[Group]
@@ -90,14 +111,24 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     group: str
     label: str
+    family: str
+    """The label without the last value that is varied: what it has in common with the cases beside it."""
     config: Config
     varied: dict[str, Any]
     """What this case has of its declaration's `vary`."""
+    words: dict[str, str]
+    """The same as the report says it."""
     seeds: list[int]
     x0s: list[list[float] | None]
     steps: int
+    episodes: int
     faults: Faults
     log: bool
+
+    @property
+    def draws(self) -> bool:
+        """Whether two seeds are two different runs."""
+        return _draws(self.config, self.faults)
 
     def config_of(self, seed: int, x0: list[float] | None) -> Config:
         plant = self.config.plant if x0 is None else msgspec.structs.replace(self.config.plant, x0=x0)
@@ -114,7 +145,9 @@ def load(path: Path) -> Declaration:
     groups = [group.name for group in declared.group]
     for i, case in enumerate(declared.case):
         _known(path, f"case[{i}].group", case.group, groups)
-        _known(path, f"case[{i}].x0s", case.x0s, ["default", *declared.x0s])
+        _known(path, f"case[{i}].x0s", case.x0s or "default", ["default", *declared.x0s])
+    for i, group in enumerate(declared.group):
+        _known(path, f"group[{i}].x0s", group.x0s, ["default", *declared.x0s])
     for names, what in ((groups, "group"), ([case.name for case in declared.case], "case")):
         twice = [name for name in names if names.count(name) > 1]
         if twice:
@@ -139,43 +172,77 @@ def resolve(declared: Declaration, plant: Plant, where: str, quick: bool = False
     return resolved
 
 
+def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str) -> Config:
+    """The configuration of an experiment, of a group or of a case, with what varies on top.
+
+    Raises:
+        ConfigError: there is no such configuration to start from, or the changes do not fit it.
+    """
+    name = _said(levels, "config", None)
+    changes: dict[str, Any] = {}
+    for change in (*(level.set for level in levels), *(_below(key, value) for key, value in varied.items())):
+        changes = _merged(changes, change)
+    try:
+        tree = {} if name is None else load_tree(config_file(name))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: config: {error}") from error
+    return from_tree(_merged(tree, changes), where, dict.fromkeys(_keys(changes), where))
+
+
 def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick: bool) -> list[Resolved]:
-    seeds = case.seeds if isinstance(case.seeds, list) else list(range(case.seeds))
-    x0s = _x0s(declared, case, plant, where)
+    group = next(group for group in declared.group if group.name == case.group)
+    levels = (declared, group, case)
+    named = _said(levels, "seeds", 1)
+    seeds = named if isinstance(named, list) else list(range(named))
+    x0s = _x0s(declared, case.x0s or group.x0s, plant, where)
+    episodes = _said(levels, "episodes", 1)
+    faults = _said(levels, "faults", Faults())
     vary = case.vary
     if quick:
         few = declared.quick
         seeds, x0s = seeds[: few.seeds], x0s[: few.x0s]
-        vary = {key: _spread(values, few.values) for key, values in vary.items()}
+        episodes = min(episodes, few.episodes)
+        vary = {key: values if key == ORACLE else _spread(values, few.values) for key, values in vary.items()}
     made = []
     for values in itertools.product(*vary.values()):
         varied = dict(zip(vary, values, strict=True))
-        tree = _merged(_merged({}, declared.base), case.set)
-        for key, value in varied.items():
-            apply_override(tree, f"{key}={msgspec.json.encode(value).decode()}")
-        suffix = ", ".join(f"{key.rpartition('.')[2]} = {_shown(value)}" for key, value in varied.items())
-        label = case.label or ("" if suffix else case.name)
+        config = config_of(levels, varied, f"{where}: case {case.name!r}")
+        names = ", ".join(f"{key.rpartition('.')[2]} = {_shown(value)}" for key, value in varied.items())
+        words = {key: _words(key, value) for key, value in varied.items()}
         made.append(
             Resolved(
-                name=f"{case.name}: {suffix}" if suffix else case.name,
+                name=f"{case.name}: {names}" if names else case.name,
                 group=case.group,
-                label=": ".join(text for text in (label, suffix) if text),
-                config=from_tree(tree, f"{where}: case {case.name!r}"),
+                label=_label(case, list(words.values())),
+                family=_label(case, list(words.values())[:-1]),
+                config=config,
                 varied=varied,
-                seeds=seeds,
+                words=words,
+                seeds=seeds if _draws(config, faults) else seeds[:1],
                 x0s=x0s,
-                steps=case.steps or declared.steps,
-                faults=case.faults,
+                steps=_said(levels, "steps", STEPS),
+                episodes=episodes,
+                faults=faults,
                 log=case.log,
             )
         )
     return made
 
 
-def _x0s(declared: Declaration, case: Case, plant: Plant, where: str) -> list[list[float] | None]:
-    if case.x0s == "default":
+def _draws(config: Config, faults: Faults) -> bool:
+    return config.controller.oracle == "dnn" or faults.noise is not None
+
+
+def _said(levels: Sequence[Runs], key: str, otherwise: Any) -> Any:
+    """What the nearest level says of one of the keys of `Runs`."""
+    said = [getattr(level, key) for level in levels]
+    return next((value for value in reversed(said) if value is not None), otherwise)
+
+
+def _x0s(declared: Declaration, name: str, plant: Plant, where: str) -> list[list[float] | None]:
+    if name == "default":
         return [None]
-    starts, key = declared.x0s[case.x0s], f"x0s.{case.x0s}"
+    starts, key = declared.x0s[name], f"x0s.{name}"
     if (starts.points is None) == (starts.grid is None):
         raise ConfigError(f"{where}: {key}: give either points or grid")
     if starts.points is not None:
@@ -216,6 +283,34 @@ def _spread(values: list[Any], count: int) -> list[Any]:
     if len(values) <= count:
         return values
     return [values[round(i * (len(values) - 1) / max(1, count - 1))] for i in range(count)]
+
+
+def _below(key: str, value: Any) -> Any:
+    """A plain tree that has nothing but the value at "section.key"."""
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return value
+
+
+def _keys(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """Every "section.key" of a plain tree, the sections too."""
+    for name, value in tree.items():
+        yield above + name
+        if isinstance(value, dict):
+            yield from _keys(value, f"{above}{name}.")
+
+
+def _label(case: Case, words: list[str]) -> str:
+    return ": ".join(filter(None, (case.label, ", ".join(words)))) or case.name
+
+
+def _words(key: str, value: Any) -> str:
+    """A value as the report has it; an oracle and a table of values need no key."""
+    if key == ORACLE:
+        return ORACLES.get(value, value)
+    if isinstance(value, dict):
+        return ", ".join(f"{name} = {_shown(below)}" for name, below in value.items())
+    return f"{key.rpartition('.')[2]} = {_shown(value)}"
 
 
 def _shown(value: Any) -> str:

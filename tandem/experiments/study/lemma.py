@@ -14,6 +14,7 @@ import numpy as np
 
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.dnn.adaptation_law import refit
+from lbmpc.oracles.dnn.gradient_law import GradientLaw
 from run_log.run import Run
 
 RIDGE = 1e-8
@@ -54,10 +55,10 @@ class Lemma(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measure(run: Run, oracle: DnnOracle) -> Lemma | None:
-    """From the log alone. None where the lemma says nothing: no sample, or a last layer that does not adapt."""
+    """From the log alone. None where the lemma says nothing: no sample, or a last layer under another law."""
     samples = {sample.seq: sample for sample in run.samples}
     weights = [w for w in run.output_weights if w.seq in samples]
-    if not weights or oracle.gamma == 0.0:
+    if not weights or not isinstance(oracle.law, GradientLaw) or oracle.gamma == 0.0:
         return None
     hidden = _hidden_by_hash(run, oracle)
     phis, Ks, labels = [], [], []

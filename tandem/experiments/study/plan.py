@@ -22,6 +22,9 @@ CODE = (
     "controller_node",
     "trainer_node",
     "plant_sim",
+    "run_log/reporting/motion.py",
+    "run_log/reporting/between_samples.py",
+    "run_log/reporting/performance.py",
     "tandem/experiments/simulation/lockstep.py",
 )
 
@@ -31,6 +34,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     config: Config
     steps: int
+    episodes: int
     faults: Faults
 
     @property
@@ -46,7 +50,7 @@ class RowPlan(NamedTuple):
     seed: int
     x0: list[float] | None
     job: Job
-    floor: Job | None
+    floor: Job
 
 
 def rows(cases: list[Resolved]) -> Iterator[RowPlan]:
@@ -62,13 +66,11 @@ def _job(config: Config, case: Resolved) -> Job:
     faults = case.faults
     if config.controller.oracle != "dnn":
         faults = msgspec.structs.replace(faults, training_seconds=0.0, trainer_dies_at=None)
-    return Job(config=_what_counts(config, faults), steps=case.steps, faults=faults)
+    return Job(config=_what_counts(config, faults), steps=case.steps, episodes=case.episodes, faults=faults)
 
 
-def _floor(config: Config, case: Resolved) -> Job | None:
-    """The same run with the true h; None where the plant drifts, whose h no oracle here knows."""
-    if case.faults.drift is not None:
-        return None
+def _floor(config: Config, case: Resolved) -> Job:
+    """The same run with the true h, of the present plant where it drifts."""
     controller = msgspec.structs.replace(config.controller, oracle="perfect")
     return _job(msgspec.structs.replace(config, controller=controller), case)
 
@@ -76,6 +78,8 @@ def _floor(config: Config, case: Resolved) -> Job | None:
 def _what_counts(config: Config, faults: Faults) -> Config:
     """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
     unread, oracle = ["name", "bus", "log", "realtime"], config.controller.oracle
+    if oracle != "constant":
+        unread.append("constant")
     if oracle != "l2nw":
         unread.append("l2nw")
     if oracle != "dnn":

@@ -11,6 +11,7 @@ import numpy as np
 
 from lbmpc.plants import Plant
 from node_runtime import provenance
+from run_log.reporting.performance import of_episodes
 from run_log.reporting.summary import Spread
 from tandem.experiments.study.declaration import Declaration, Resolved
 from tandem.experiments.study.plan import RowPlan
@@ -19,27 +20,53 @@ from tandem.experiments.study.work import Record
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, as `summary.json` has it."""
+    """One run, as `summary.json` has it.
+
+    Of several episodes, J, regret, deviation, overshoot and settling are those from the second one on: what the run
+    came to with a memory. J and the deviation are their mean, overshoot and settling the worst.
+    """
 
     case: str
     group: str
     oracle: str
     seed: int
     x0: list[float]
-    cost: float | None
-    """Sum of the squared deviations of the performance states; null where the plant was lost."""
+    J: float | None
+    """Sum of the stage costs, Q and R as densities; null where the plant was lost, as for the five after it."""
     regret: float | None
-    """Cost above that of the true h from the same start; null where either was lost, or the plant drifts."""
-    overshoot: float | None
-    settling_step: int | None
+    """J above that of the true h from the same start, as a share of it, negative where below; null where either was
+    lost."""
+    deviation: float | None
+    """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
+    J_by_episode: list[float | None]
+    regret_by_episode: list[float | None]
+    """Of each episode; null where the plant was lost before its end."""
+    overshoot: dict[str, float | None] | None
+    """Per performance state, as a share of its initial deviation; null for one that began settled."""
+    settled_s: float | None
+    """Seconds; null where not settled at the end."""
+    settled_by_state_s: dict[str, float | None] | None
     violations: int
-    infeasible_ticks: int
+    """Samples outside X or U by more than 1e-6 of a half-width."""
+    excess_between_samples: float | None
+    """Largest distance from X, as a share of a half-width; null where the truth between the samples is not known."""
+    iteration_limit_ticks: int
+    soft_ticks: int
+    fallback_ticks: int
     solve_ms: Spread | None
     """Of runs made alone, of the same oracle, horizon, network and rate."""
     lost: str | None
     weights_adopted: int
     error_first_second: float | None
     error_last_second: float | None
+
+    @property
+    def J_first(self) -> float | None:
+        return self.J_by_episode[0]
+
+    @property
+    def regret_first(self) -> float | None:
+        return self.regret_by_episode[0]
 
 
 class CaseResult(NamedTuple):
@@ -51,19 +78,27 @@ class CaseResult(NamedTuple):
     timing: Timing | None
 
     def values(self, name: str) -> np.ndarray:
-        """(rows,) one figure of each; what is lost is infinitely bad."""
-        given = [getattr(row, name) for row in self.rows]
-        return np.array([math.inf if value is None else value for value in given], dtype=float)
+        """(rows,) one figure of each, of the first performance state where each has its own.
+
+        What is lost, or not settled, is infinitely bad; NaN where there is no such figure, as for the overshoot of a
+        state that began settled.
+        """
+        return np.array([_value(row, name) for row in self.rows])
 
     def median(self, name: str) -> float:
-        return float(np.median(self.values(name)))
+        """Of the rows that have this figure; NaN where none has."""
+        values = self.values(name)
+        values = values[~np.isnan(values)]
+        return float(np.median(values)) if values.size else math.nan
 
     def worst(self, name: str) -> float:
-        return float(self.values(name).max())
+        values = self.values(name)
+        values = values[~np.isnan(values)]
+        return float(values.max()) if values.size else math.nan
 
     @property
     def kept(self) -> float:
-        """Share of the runs that keep all constraints on the true plant."""
+        """Share of the runs that keep all constraints on the true plant, at samples."""
         return float(np.mean([record.kept for record in self.records]))
 
     @property
@@ -75,6 +110,15 @@ class CaseResult(NamedTuple):
         return self.case.label
 
 
+def _value(row: Row, name: str) -> float:
+    value = getattr(row, name)
+    if isinstance(value, dict):
+        value = next(iter(value.values()))
+    if value is not None:
+        return float(value)
+    return math.inf if row.lost is not None or name == "settled_s" else math.nan
+
+
 def collect(
     plans: list[RowPlan], records: dict[str, Record], timings: dict[str, Timing], plant: Plant
 ) -> list[CaseResult]:
@@ -82,36 +126,58 @@ def collect(
     cases: dict[str, CaseResult] = {}
     for plan in plans:
         case, record = plan.case, records[plan.job.key]
-        floor = records[plan.floor.key] if plan.floor is not None else None
-        timing = timings.get(case.name)
+        floor, timing = records[plan.floor.key], timings.get(case.name)
         result = cases.setdefault(case.name, CaseResult(case, [], [], timing))
         result.rows.append(_row(plan, record, floor, timing, plant))
         result.records.append(record)
     return list(cases.values())
 
 
-def _row(plan: RowPlan, record: Record, floor: Record | None, timing: Timing | None, plant: Plant) -> Row:
+def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Plant) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
-    known = record.cost is not None and floor is not None and floor.cost is not None
+    found, floors = _figures(record), _figures(floor)
+    J, least = _J_by_episode(record), _J_by_episode(floor)
     return Row(
         case=plan.case.name,
         group=plan.case.group,
         oracle=config.controller.oracle,
         seed=plan.seed,
         x0=list(x0),
-        cost=record.cost,
-        regret=record.cost - floor.cost if known else None,  # type: ignore[operator, union-attr]
-        overshoot=record.overshoot,
-        settling_step=record.settling_step,
-        violations=record.violations,
-        infeasible_ticks=record.infeasible_ticks,
+        J=found.get("J"),
+        regret=_regret(found.get("J"), floors.get("J")),
+        deviation=found.get("deviation"),
+        J_by_episode=J,
+        regret_by_episode=[_regret(own, its) for own, its in zip(J, least, strict=True)],
+        overshoot=found.get("overshoot"),
+        settled_s=found.get("settled_s"),
+        settled_by_state_s=found.get("settled_by_state_s"),
+        violations=record.performance.constraint_violations,
+        excess_between_samples=record.performance.excess_between_samples if found else None,
+        iteration_limit_ticks=record.iteration_limit_ticks,
+        soft_ticks=record.soft_ticks,
+        fallback_ticks=record.fallback_ticks,
         solve_ms=spread(timing) if timing else None,
         lost=record.lost,
         weights_adopted=record.weights_adopted,
         error_first_second=record.error_first,
         error_last_second=record.error_last,
     )
+
+
+def _figures(record: Record) -> dict[str, Any]:
+    """Of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
+    if record.lost is not None:
+        return {}
+    return msgspec.structs.asdict(of_episodes(record.episodes[1:] or record.episodes))
+
+
+def _J_by_episode(record: Record) -> list[float | None]:
+    return [*(one.J for one in record.episodes), *[None] * (record.job.episodes - len(record.episodes))]
+
+
+def _regret(J: float | None, floor: float | None) -> float | None:
+    return None if J is None or not floor else J / floor - 1.0
 
 
 def spread(timing: Timing) -> Spread:

@@ -57,10 +57,9 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
 
     for plan in plans:
         case = plan.case
-        name = f"{_file_name(case.name)}-seed{plan.job.config.seed}.mcap"
+        name = f"{file_name(case.name)}-seed{plan.job.config.seed}.mcap"
         want(plan.job, case.group in detailed, *([logs / name] if case.log and plan.x0 is None else []))
-        if plan.floor is not None:
-            want(plan.floor, False)
+        want(plan.floor, False)
     return wants
 
 
@@ -132,10 +131,10 @@ def _leave_ctrl_c_to_the_parent() -> None:
 
 def _effort(job: Job) -> float:
     learning = 5.0 if job.config.controller.oracle == "dnn" else 1.0
-    return job.steps * job.config.controller.horizon * learning
+    return job.steps * job.episodes * job.config.controller.horizon * learning
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
     """Two names are two files, also where what a file's name had better not have is replaced."""
     clean = "".join(c if c.isascii() and (c.isalnum() or c in "-_=.") else "-" for c in name)[:LONGEST_NAME]
     return clean if clean == name else f"{clean}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
@@ -159,7 +158,7 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
-    return Job(config=config, steps=round(seconds * config.rate), faults=Faults())
+    return Job(config=config, steps=round(seconds * config.rate), episodes=1, faults=Faults())
 
 
 def time_all(

@@ -10,7 +10,9 @@ import msgspec
 from controller_node.build import build_network_oracle, build_plant
 from node_runtime.config.sections import Config
 from node_runtime.whole_file import read_regular, require_regular, write_whole
-from run_log.reporting.summary import SOFT, summarise, trajectory
+from run_log.reporting.motion import trajectory
+from run_log.reporting.performance import Performance
+from run_log.reporting.summary import summarise
 from run_log.run import Run, plant_of
 from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import Outcome, follow
@@ -35,14 +37,13 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     job: Job
     lost: str | None
     """Why the true motion could not be followed to the end."""
-    cost: float | None
-    """Sum of the squared deviations of the performance states; None where the plant was lost, as for the next two."""
-    overshoot: float | None
-    settling_step: int | None
-    violations: int
-    """Samples outside X or U by more than 1e-6."""
-    infeasible_ticks: int
-    """Ticks whose problem has no solution that keeps all constraints: slack was needed, or the solver failed."""
+    episodes: list[Performance]
+    """Those that could be followed to their end."""
+    performance: Performance
+    """Of all that could be followed."""
+    iteration_limit_ticks: int
+    soft_ticks: int
+    fallback_ticks: int
     weights_adopted: int
     error_first: float | None
     error_last: float | None
@@ -52,8 +53,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def kept(self) -> bool:
-        """All constraints, all the time, on the true plant."""
-        return self.lost is None and self.violations == 0
+        """All constraints, at all samples, on the true plant."""
+        return self.lost is None and self.performance.constraint_violations == 0
 
 
 def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -> None:
@@ -63,7 +64,7 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
         ConfigError: the job's configuration admits no controller.
         OSError: something else than a file has the name of a log.
     """
-    outcome = follow(job.config, job.steps, job.faults)
+    outcome = follow(job.config, job.steps, job.faults, episodes=job.episodes)
     for log in logs:
         require_regular(log)
         partial = log.with_suffix(".partial")
@@ -74,18 +75,16 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
 
 
 def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
-    run, lost = outcome.run, outcome.lost
+    run = outcome.run
     summary = summarise(run)
     return Record(
         job=job,
-        lost=lost,
-        cost=None if lost else summary.cost,
-        overshoot=None if lost else summary.overshoot,
-        settling_step=None if lost else summary.settling_step,
-        violations=summary.constraint_violations,
-        infeasible_ticks=sum(
-            r.slack > SOFT or r.mode != "solver" or r.status == "infeasible" for r in run.results
-        ),
+        lost=outcome.lost,
+        episodes=summary.episodes[: outcome.episodes],
+        performance=Performance(**{name: getattr(summary, name) for name in Performance.__struct_fields__}),
+        iteration_limit_ticks=summary.iteration_limit_ticks,
+        soft_ticks=summary.soft_ticks,
+        fallback_ticks=summary.fallback_ticks,
         weights_adopted=summary.weights_adopted,
         error_first=summary.prediction_error.first_second,
         error_last=summary.prediction_error.last_second,

@@ -1,4 +1,4 @@
-"""The three oracles keep one contract: value, Jacobian, learning, parameters as data."""
+"""The oracles keep one contract: value, Jacobian, learning, parameters as data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.helpers.science import adapt, compressor, describe, features, functio
 MODEL = compressor()
 
 
-@pytest.mark.parametrize("name", ["linear", "l2nw", "dnn"])
+@pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
 def test_jacobian_and_numpy_agree_with_the_expression(name: str) -> None:
     rng = np.random.default_rng(3)
     oracle = oracle_named(name, MODEL)
@@ -103,7 +103,7 @@ def test_the_window_forgets_its_oldest_sample() -> None:
 
 
 def test_learning_leaves_the_given_state_as_it_was() -> None:
-    for name in ("l2nw", "dnn"):
+    for name in ("constant", "l2nw", "dnn"):
         oracle = oracle_named(name, MODEL)
         state = oracle.initial_state(np.random.default_rng(0))
         before = {key: value.copy() for key, value in state.items()}

@@ -14,13 +14,19 @@ from lbmpc.plants import PLANTS, Plant, PlantDefinitionError, get_plant
 from lbmpc.plants.base import Domain
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
-from tests.helpers.integrator import INTEGRATOR
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.integrator import INTEGRATOR
+from tests.helpers.plants.pendulum import PENDULUM, inverted
+from tests.helpers.plants.pendulum import equations as pendulum_of
+from tests.helpers.plants.quadrotor import QUADROTOR
+from tests.helpers.plants.two_tanks import TWO_TANKS
+from tests.helpers.plants.unstable import unstable
 
 INF, NAN = float("inf"), float("nan")
 
 
 def changed(**fields: object) -> Plant:
+    if "rhs" in fields:
+        fields = {"parameters": {}, "equations": None, **fields}
     return replace(PENDULUM, **fields)
 
 
@@ -120,6 +126,23 @@ FAULTY: dict[str, tuple[Plant, str]] = {
         replace(INTEGRATOR, scale={"speed": 0.0}),
         "scale of speed is 0.0: .* a positive number",
     ),
+    "parameters that nothing takes": (
+        changed(equations=None),
+        "parameters has stiffness, gain and equations is None: give the function",
+    ),
+    "a parameter in words": (changed(parameters={"gain": "high"}), "parameters is .*: give numbers by name"),
+    "parameters that the equations do not have": (
+        changed(parameters={"gain": 1.0}),
+        "equations fails with symbols for gain: TypeError",
+    ),
+    "a condition on a parameter": (
+        changed(equations=lambda stiffness, gain: pendulum_of(stiffness if stiffness > 0 else 0.0, gain)),
+        "equations fails with symbols for stiffness, gain",
+    ),
+    "other parameters than in rhs": (
+        changed(parameters={"stiffness": 5.0, "gain": 1.0}),
+        r"rhs is not what equations makes of parameters: write rhs=equations\(\*\*parameters\)",
+    ),
 }
 
 
@@ -150,7 +173,13 @@ def test_a_model_of_a_faulty_plant_is_refused_as_well() -> None:
         build_model(changed(u_min=[4.0]), 0.1)
 
 
-@pytest.mark.parametrize("plant", [MOORE_GREITZER, PENDULUM, INTEGRATOR, one_state()], ids=lambda p: p.name)
+SOUND = [
+    *(MOORE_GREITZER, PENDULUM, INTEGRATOR, TWO_TANKS, QUADROTOR, one_state()),
+    *(unstable(12.0), inverted(1.0), inverted(0.1)),
+]
+
+
+@pytest.mark.parametrize("plant", SOUND, ids=lambda p: p.name)
 def test_a_sound_plant_has_no_faults(plant: Plant) -> None:
     assert faults(plant) == ()
 

@@ -24,7 +24,7 @@ from lbmpc.sets.enclosures.disturbance import (
 )
 from lbmpc.sets.enclosures.flow import Flow, FlowEnclosure
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product, up
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM
 
 SAMPLES = 2000
 # What the integrator of the truth may be off by, per unit of the state's size.

@@ -16,7 +16,7 @@ from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, volume_fraction
 from lbmpc.sets.guard import Guard
-from tests.helpers.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM
 
 
 def one_state(rhs: Rhs) -> Model:

@@ -26,7 +26,7 @@ SMALL = np.array([0.003, 0.0005, 1e-5, 1.1e-4])
 
 
 @pytest.mark.parametrize("tightening", ["none", "first_step", "tube"])
-@pytest.mark.parametrize("name", ["linear", "l2nw", "dnn"])
+@pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
 def test_the_optimum_is_that_of_ipopt(name: str, tightening: str) -> None:
     rng = np.random.default_rng(7)
     oracle = oracle_named(name, MODEL)

@@ -135,7 +135,7 @@ def closed_loop(name: str, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return inputs
 
 
-@pytest.mark.parametrize("name", ["linear", "l2nw", "dnn"])
+@pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
 def test_one_real_time_iteration_is_close_to_the_optimum(name: str) -> None:
     differences = [abs(float(a[0] - b[0])) for a, b in closed_loop(name, 40)]
     # For a linear model one step is exact; else the error is of second order in what the sample had not predicted.

@@ -11,7 +11,7 @@ import pytest
 from msgspec import inspect
 
 from lbmpc.plants import get_plant
-from node_runtime.config.plant import plant_of
+from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import (
     Config,
     from_json,
@@ -70,9 +70,9 @@ def test_commented_values_of_the_shipped_file_are_valid():
     [
         (
             "controller.oracle=dn",
-            "controller.oracle = 'dn' is not one of dnn, l2nw, linear, perfect; did you mean 'dnn'?",
+            "controller.oracle = 'dn' is not one of constant, dnn, l2nw, linear, perfect; did you mean 'dnn'?",
         ),
-        ("controller.oracle=7", "controller.oracle = 7 is not one of dnn, l2nw, linear"),
+        ("controller.oracle=7", "controller.oracle = 7 is not one of constant, dnn, l2nw, linear"),
         ("trainer.batch=0", "trainer.batch = 0 is not an integer of at least 1"),
         ("trainer.batch=1.5", "trainer.batch = 1.5 is not an integer of at least 1"),
         ("realtime.priority=100", "realtime.priority = 100 is not an integer of at least 0 and at most 99"),
@@ -173,11 +173,26 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
         ("controller.R=[1.0, 1.0]", "controller.R has 2 entries; moore_greitzer has 1 inputs (u)"),
         ('l2nw.variables=["z", "q"]', "l2nw.variables: 'q' is not one of moore_greitzer's z, y, r, rdot, u"),
         ("l2nw.variables=[]", "l2nw.variables is empty"),
+        (
+            "plant.truth.slop=1.4",
+            "plant.truth: moore_greitzer has no parameter 'slop'; did you mean 'slope'?",
+        ),
+        ("plant.truth.mass=1.4", "no parameter 'mass'; it has beta, z_c, slope"),
+        ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),
     ],
 )
 def test_what_the_plant_does_not_have(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
         plant_of(override(Config(), [given]), get_plant)
+
+
+def test_a_wrong_model_has_a_true_plant_beside_it():
+    config = override(Config(), ["plant.truth.slope=1.4"])
+    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    assert model is get_plant("moore_greitzer")
+    assert truth.parameters == {**model.parameters, "slope": 1.4}
+    assert (truth.x_e == model.x_e).all()
+    assert true_plant_of(Config(), get_plant) is model
 
 
 def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -225,6 +240,7 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "Q",
         "R",
         "x0",
+        "truth",
         "options",
         "output_scale",
         "max_layer_norm",

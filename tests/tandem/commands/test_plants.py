@@ -18,7 +18,7 @@ from run_log.replaying.replay import replay
 from run_log.writing.save import save
 from tandem.cli import main
 from tandem.experiments.simulation.lockstep import simulate
-from tests.helpers.integrator import INTEGRATOR
+from tests.helpers.plants.integrator import INTEGRATOR
 
 ON_TRACK = [
     *("plant.model=integrator", "rate=20", "controller.horizon=10", "controller.solver.compile=never"),
@@ -84,6 +84,18 @@ def test_every_command_refuses_a_faulty_plant_with_one_message(
     assert "x_min of speed is -inf and x_max is inf: give both bounds, or scale=" in said
     assert "Traceback" not in said
     assert {path.name for path in tmp_path.iterdir()} == {"own.toml", "good.mcap"}
+
+
+@pytest.mark.parametrize("command", [name for name, words in COMMANDS.items() if "--set" in words])
+def test_every_command_refuses_a_true_plant_with_unknown_parameters(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PLANTS, "integrator", INTEGRATOR)
+    assert main([*COMMANDS[command], "--set", "plant.truth.frictoin=0.1"]) == 2
+    said = capsys.readouterr().err
+    assert "plant.truth: integrator has no parameter 'frictoin'; did you mean 'friction'?" in said
+    assert not list(tmp_path.iterdir())
 
 
 UNBOUNDED: dict[str, Plant] = {

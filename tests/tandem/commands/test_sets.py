@@ -6,6 +6,7 @@ import gzip
 import json
 import os
 import shutil
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,15 +17,19 @@ import pytest
 from controller_node.build import build_model
 from controller_node.certified_sets import (
     SHIPPED,
+    SLACK,
     CertifiedSets,
     SavedArrays,
+    Work,
     find_sets,
     read_sets,
+    start_of,
     write_sets,
 )
 from lbmpc.plants import PLANTS
 from lbmpc.sets import construct as construction
 from lbmpc.sets.certificate import CertificateError, model_of
+from lbmpc.sets.geometry.polytope import SetError
 from node_runtime.config.sections import Config, load
 from node_runtime.config.strict import ConfigError
 from protocol import topics
@@ -36,7 +41,8 @@ from run_log.writing.save import save
 from tandem.cli import main
 from tandem.experiments.simulation.lockstep import simulate
 from tandem.live.monitor import Monitor
-from tests.helpers.pendulum import PENDULUM, pendulum
+from tests.helpers.plants.pendulum import PENDULUM, pendulum
+from tests.helpers.science import compressor
 
 START = [0.62, 0.0]
 SETTINGS = [
@@ -53,12 +59,16 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache that has the regions of the pendulum."""
+    """A cache that has the regions of the pendulum, made where groups share what they write."""
     home = tmp_path_factory.mktemp("home")
+    before = os.umask(0o002)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PLANTS, "pendulum", PENDULUM)
         patch.setenv("XDG_CACHE_HOME", str(home / "cache"))
-        assert main(["sets", "compute", *OPTIONS, "--out", str(home / "sets.json")]) == 0
+        try:
+            assert main(["sets", "compute", *OPTIONS, "--out", str(home / "sets.json")]) == 0
+        finally:
+            os.umask(before)
     return home
 
 
@@ -146,6 +156,25 @@ def test_a_whole_file_passes(cached: Path, capsys: pytest.CaptureFixture[str]):
     assert result["certificate"] == "ok"
     assert result["samples"] >= 20_000
     assert result["invariance_margin"] > 0
+    assert result["W"].startswith("proved by interval arithmetic on")
+    assert main(["sets", "check", "sets.json", *OPTIONS, "--no-prove"]) == 0
+    assert "h stays in W: sampled at" in (shown := capsys.readouterr().out)
+    assert "not proved" in shown
+
+
+def test_a_w_that_samples_do_not_leave_and_h_does_is_refused(
+    cached: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A few states in a corner of X are enough, which none of 100 samples met."""
+    sets = read_sets(cached / "sets.json")
+    base = sets.certificate.pieces[0]
+    W = np.array(base.W)
+    smaller = msgspec.structs.replace(base, W=(W.mean(axis=0) + 0.97 * (W - W.mean(axis=0))).tolist())
+    wrong = msgspec.structs.replace(sets.certificate, pieces=[smaller, *sets.certificate.pieces[1:]])
+    write_sets(CertifiedSets.of(wrong, sets.found), cached / "wrong.json")
+    assert main(["sets", "check", "wrong.json", *OPTIONS, "--no-prove", "--samples", "100"]) == 0
+    assert main(["sets", "check", "wrong.json", *OPTIONS, "--samples", "100"]) == 3
+    assert "its W is not proved for the true plant: in piece C, from x =" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("at", [0.0, 0.003, 0.3, 0.7, 0.999])
@@ -199,6 +228,80 @@ def test_a_damaged_cache_is_as_good_as_none(tmp_path: Path):
     assert list(saved) == ["stage"]
     (tmp_path / "stage.npz").write_bytes(b"PK torn")
     assert "stage" not in saved
+
+
+def test_the_cache_is_written_for_its_owner_alone_whatever_the_umask(cached: Path):
+    found = [cached / "cache", *(cached / "cache").rglob("*")]
+    assert {path.suffix for path in found} >= {".json", ".npz"}
+    assert {stat.S_IMODE(path.lstat().st_mode) for path in found} == {0o700, 0o600}
+    assert stat.S_IMODE((cached / "sets.json").stat().st_mode) & 0o044
+
+
+def spoil(cached: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cache as somebody else could have written it, or may."""
+    folder = cached / "cache" / "tandem" / "sets"
+    (file,) = folder.glob("*.json")
+    if how == "folder":
+        folder.chmod(0o775)
+    elif how == "file":
+        file.chmod(0o664)
+    elif how == "link":
+        file.rename(cached / "elsewhere.json")
+        file.symlink_to(cached / "elsewhere.json")
+    elif how == "above":
+        (cached / "cache").chmod(0o777)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: cached.stat().st_uid + 1)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("folder", r"can be written by others \(mode 0775\)"),
+        ("file", r"can be written by others \(mode 0664\)"),
+        ("link", "is a link"),
+        ("above", "which everybody can write"),
+        ("owner", "belongs to"),
+    ],
+)
+def test_sets_that_somebody_else_may_have_written_are_not_in_force(
+    cached: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str, says: str
+):
+    assert find_sets(invariant(), pendulum()).sha256 == read_sets(cached / "sets.json").sha256
+    spoil(cached, how, monkeypatch)
+    with pytest.raises(ConfigError, match=rf"{says}.*chmod -R go-w") as refused:
+        find_sets(invariant(), pendulum())
+    assert "tandem sets compute" in str(refused.value)
+    before = sorted((cached / "cache").rglob("*"))
+    monkeypatch.setattr(construction, "controllable_sets", lambda *_: [])
+    monkeypatch.setattr(construction, "predecessor_iteration", _none)
+    assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 3
+    assert "not believed" in (shown := " ".join(capsys.readouterr().out.split()))
+    assert "computed without it" in shown
+    assert sorted((cached / "cache").rglob("*")) == before
+
+
+def _none(*_: object) -> None:
+    raise SetError("begun anew")
+
+
+def test_what_is_believed_again_is_taken_again(cached: Path, monkeypatch: pytest.MonkeyPatch):
+    spoil(cached, "folder", monkeypatch)
+    spoil(cached, "file", monkeypatch)
+    for path in (cached / "cache").rglob("*"):
+        path.chmod(path.stat().st_mode & ~0o022)
+    assert find_sets(invariant(), pendulum()).found.contains_x0
+
+
+def test_sets_that_are_installed_are_in_force_where_the_cache_is_not_believed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    config, model = Config(), compressor()
+    work = Work.of(model, "regions", start_of(config, model), None, SLACK, tmp_path)
+    write_sets(read_sets(SHIPPED / "moore_greitzer-20Hz-regions.json.gz"), work.sets, 0o666)
+    work.sets.chmod(0o666)
+    assert find_sets(config, model, tmp_path).certificate.model.plant == "moore_greitzer"
+    assert "chmod -R go-w" in caplog.text
 
 
 def test_a_gzipped_file_is_the_same_sets(cached: Path):

@@ -4,6 +4,7 @@ needs nothing else."""
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -11,23 +12,28 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from lbmpc.plants import get_plant
 from node_runtime.config.strict import ConfigError
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
+from run_log.reporting.performance import Performance
 from tandem.experiments import experiment
 from tandem.experiments.experiment import Finished
-from tandem.experiments.reporting import findings
+from tandem.experiments.reporting import findings, pictures
+from tandem.experiments.reporting.page import _table
 from tandem.experiments.study import results
-from tandem.experiments.study.declaration import Resolved, load, resolve
+from tandem.experiments.study.declaration import Picture, Resolved, load, resolve
 from tandem.experiments.study.plan import Job, code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
-from tandem.experiments.study.work import Record, read, work
+from tandem.experiments.study.work import Record, Traces, read, work
 from tests.helpers.paths import CONFIGS, write_namesakes
+from tests.helpers.plants.pendulum import PENDULUM
 
 PLANT = get_plant("moore_greitzer")
 SHIPPED = CONFIGS / "experiments" / "paper.toml"
@@ -35,7 +41,7 @@ SMALL = """
 name = "small"
 title = "A small one"
 steps = 30
-[base]
+[set]
 controller = { horizon = 15, solver = { compile = "never" } }
 network = { hidden = [6] }
 trainer = { steps = 5 }
@@ -131,9 +137,8 @@ def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
     assert found["dnn"].x0s == [[0.4, 1.6, 1.1547, 0.0], [0.6, 1.6, 1.1547, 0.0]]
     assert found["gamma: gamma = 0.5"].config.adaptation.gamma == 0.5
     plans = list(rows(list(found.values())))
-    assert len(plans) == 2 * 2 + 2 + 2 * 2 + 2
-    # linear draws nothing: both its seeds are one run; so is the floor of every controller from one state.
-    assert len({plan.job.key for plan in plans if plan.case.name == "linear"}) == 2
+    # linear draws nothing: one seed stands for both; so does the floor of every controller from one state.
+    assert len(plans) == 2 + 2 + 2 * 2 + 2
     assert len({plan.floor.key for plan in plans if plan.floor is not None}) == 3
 
 
@@ -146,8 +151,10 @@ def test_a_key_changes_with_the_settings_and_with_nothing_else(small: Path) -> N
 def test_the_shipped_experiment_is_valid_whole_and_quick() -> None:
     whole, quick = cases(SHIPPED), cases(SHIPPED, quick=True)
     assert {case.group for case in quick} <= {case.group for case in whole}
-    network = next(case for case in whole if case.name == "dnn")
-    assert network.seeds == list(range(20))
+    seeds = {case.name: case.seeds for case in whole}
+    assert seeds["compressor: oracle = dnn"] == list(range(20))
+    # What draws nothing is the same for every seed.
+    assert seeds["compressor: oracle = linear"] == [0]
     assert any(len(case.x0s) == 25 for case in whole)
 
 
@@ -174,14 +181,19 @@ def test_figures_do_not_depend_on_the_number_of_processes(finished: tuple[Path, 
 def test_the_summary_has_what_it_promises(finished: tuple[Path, Finished]) -> None:
     _folder, made = finished
     told = json.loads(made.summary.read_text())
-    assert len(told["rows"]) == 12
-    promised = "case oracle seed x0 cost regret overshoot settling_step violations infeasible_ticks solve_ms"
+    assert len(told["rows"]) == 10
+    promised = (
+        "case oracle seed x0 J regret deviation overshoot settled_s settled_by_state_s violations solve_ms "
+        "excess_between_samples iteration_limit_ticks soft_ticks fallback_ticks"
+    )
     for row in told["rows"]:
         assert set(promised.split()) <= row.keys()
         assert len(row["x0"]) == 4
+        assert set(row["overshoot"]) == {"z", "y"}
+        assert row["excess_between_samples"] == 0.0
         assert set(row["solve_ms"]) == {"p50", "p99", "max"}
-    regrets = [row["regret"] for row in told["rows"] if row["oracle"] == "linear"]
-    assert regrets[0] == regrets[1]
+        assert row["J_by_episode"] == [row["J"]]
+        assert row["regret_by_episode"] == [row["regret"]]
 
 
 def test_the_page_needs_nothing_else(finished: tuple[Path, Finished]) -> None:
@@ -256,36 +268,52 @@ def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
 
 
 SHIPPED_CASES = cases(SHIPPED)
+NETWORK = next(case for case in SHIPPED_CASES if case.name == "compressor: oracle = dnn")
+NETWORK = msgspec.structs.replace(NETWORK, varied={}, words={})
 
 
-def a_record(cost: float, overshoot: float, violations: int = 0) -> Record:
-    job = Job(config=SHIPPED_CASES[0].config, steps=200, faults=SHIPPED_CASES[0].faults)
-    return Record(
+def a_record(cost: float, overshoot: float = 0.0, violations: int = 0, **changes: Any) -> Record:
+    job = Job(config=SHIPPED_CASES[0].config, steps=200, episodes=1, faults=SHIPPED_CASES[0].faults)
+    found = Performance(
+        J=cost,
+        deviation=0.8 * cost,
+        overshoot={"z": overshoot, "y": None},
+        settled_s=5.0,
+        settled_by_state_s={"z": 5.0, "y": 2.0},
+        constraint_violations=violations,
+        excess_between_samples=0.0,
+    )
+    record = Record(
         job=job,
         lost=None,
-        cost=cost,
-        overshoot=overshoot,
-        settling_step=100,
-        violations=violations,
-        infeasible_ticks=0,
+        episodes=[found],
+        performance=found,
+        iteration_limit_ticks=0,
+        soft_ticks=0,
+        fallback_ticks=0,
         weights_adopted=0,
         error_first=None,
         error_last=None,
         traces=None,
         lemma=None,
     )
+    changed = msgspec.structs.replace(record, **changes)
+    return (
+        changed if "episodes" in changes else msgspec.structs.replace(changed, episodes=[changed.performance])
+    )
 
 
 def a_result(
-    name: str, costs: list[float], overshoot: float = 0.0, violations: int = 0
+    name: str, costs: list[float], overshoot: float = 0.0, violations: int = 0, **changes: Any
 ) -> results.CaseResult:
-    case = next(case for case in SHIPPED_CASES if case.name == "dnn")
-    case = msgspec.structs.replace(case, name=name, label=name, seeds=list(range(len(costs))))
+    """With a floor of 20."""
+    case = msgspec.structs.replace(NETWORK, name=name, label=name, seeds=list(range(len(costs))))
     plans = list(rows([case]))
-    floor = a_record(20.0, 0.0)
+    floor = a_record(20.0)
     records: dict[str, Record] = {plan.floor.key: floor for plan in plans if plan.floor is not None}
     records |= {
-        plan.job.key: a_record(cost, overshoot, violations) for plan, cost in zip(plans, costs, strict=True)
+        plan.job.key: a_record(cost, overshoot, violations, **changes)
+        for plan, cost in zip(plans, costs, strict=True)
     }
     return results.collect(plans, records, {}, PLANT)[0]
 
@@ -317,12 +345,64 @@ def test_words_follow_from_the_figures() -> None:
     said = findings.compare([base, worse, same, breaks], "base")
     assert said[0] == "Matters, against base: worse, breaks."
     assert said[1] == "No clear difference from base: same."
-    assert "more regret, 2.15 against 1.15 in the median in all 4 pairs" in said[2]
-    assert "keeps all constraints in 0 of 4 runs, against 4 of 4 runs" in said[3]
+    assert "more J, 22.1 against 21.1 in the median in all 4 pairs" in said[2]
+    assert "keeps all constraints at samples in 0 of 4 runs, against 4 of 4 runs" in said[3]
 
 
-def test_regret_is_the_cost_above_the_floor() -> None:
-    assert a_result("some", [21.0, 23.5]).values("regret").tolist() == [1.0, 3.5]
+def test_regret_is_signed_and_a_page_says_where_the_true_h_is_beaten() -> None:
+    better, worse = a_result("better", [19.0, 23.0]), a_result("worse", [20.0, 21.0])
+    assert better.values("regret") == pytest.approx([-0.05, 0.15])
+    (said,) = findings.below_perfect([better, worse])
+    assert said.startswith("J below that of the true h: better in 1 of 2 runs, by up to 5.0%.")
+    assert findings.below_perfect([worse]) == []
+
+
+def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
+    settled = a_result("fine", [20.0, 21.0], overshoot=0.1)
+    assert settled.median("overshoot") == pytest.approx(0.1)
+    assert settled.median("settled_s") == 5.0
+    performance = msgspec.structs.replace(
+        a_record(20.0).performance, settled_s=None, excess_between_samples=None, overshoot={"z": None}
+    )
+    restless = a_result("restless", [20.0, 20.0], performance=performance)
+    lost = a_result("lost", [20.0, 20.0], lost="at step 3")
+    assert np.isnan(restless.worst("excess_between_samples"))
+    assert np.isnan(restless.median("overshoot"))
+    assert np.isinf(lost.worst("J"))
+    table = _table([settled, restless, lost], PLANT)
+    column = {name: i for i, name in enumerate(table.head)}
+    shown = [
+        [row[column[name]] for name in ("J", "settled (s)", "excess, also between samples (%)")]
+        for row in table.body
+    ]
+    assert shown == [["20.5", "5", "0.0"], ["20", "not settled", "–"], ["lost", "lost", "lost"]]
+    assert "z within 0.02 and y within 0.02 of the equilibrium (4% of the half-width)" in table.note
+
+
+@pytest.mark.parametrize("states", [1, 2])
+@pytest.mark.parametrize("kind", ["trajectories", "states", "survival", "recovery", "rows"])
+def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, states: int) -> None:
+    plant = dataclasses.replace(
+        PENDULUM,
+        **{name: getattr(PENDULUM, name)[:states] for name in ("states", "x_e", "x_min", "x_max", "x0")},
+        names={"angle": "angle of the arm"},
+    )
+    traces = Traces(x=[[0.5], [0.2], [0.0]], u=[[1.0], [0.0]], error=[None, 0.1])
+    case = msgspec.structs.replace(NETWORK, x0s=[[0.5, 0.0][:states]], seeds=[0])
+    plans = list(rows([case]))
+    performance = msgspec.structs.replace(
+        a_record(1.0).performance, overshoot={"angle": 0.1}, settled_by_state_s={"angle": 5.0}
+    )
+    record = a_record(1.0, performance=performance, traces=traces)
+    records = {job.key: record for plan in plans for job in (plan.job, plan.floor) if job is not None}
+    found = results.collect(plans, records, {}, plant)
+    drawn = pictures.draw(kind, found, plant, None)
+    assert drawn
+    labels = {ax.get_xlabel() for one in drawn for ax in one.figure.axes}
+    labels |= {ax.get_ylabel() for one in drawn for ax in one.figure.axes}
+    if kind in ("trajectories", "states", "recovery"):
+        assert "angle of the arm (rad)" in labels
+    assert "angle" in _table(found, plant).note
 
 
 def test_a_record_that_lacks_what_is_wanted_is_not_taken(tmp_path: Path) -> None:

@@ -37,11 +37,16 @@ def states(run: Run) -> np.ndarray:
     return np.array([state.x for state in run.plant_states])
 
 
-@pytest.mark.parametrize("rate", [10.0, 20.0, 100.0])
-def test_the_perfect_oracle_knows_h_and_its_slopes(rate: float) -> None:
-    model = build_model(PLANT, 1 / rate)
-    truth, evaluate = Truth(PLANT), function(PerfectOracle(model))
+@pytest.mark.parametrize(
+    ("rate", "parameters"),
+    [(10.0, {}), (20.0, {}), (100.0, {}), (20.0, {"slope": 1.3, "beta": 0.8, "z_c": 0.05})],
+)
+def test_the_perfect_oracle_knows_h_and_its_slopes(rate: float, parameters: dict[str, float]) -> None:
+    model, true_plant = build_model(PLANT, 1 / rate), PLANT.varied(**parameters)
+    oracle = PerfectOracle(model, true_plant)
+    truth, evaluate = Truth(true_plant), function(oracle)
     rng = np.random.default_rng(5)
+    theta = oracle.theta(oracle.initial_state(rng))
 
     def h(xu: np.ndarray) -> np.ndarray:
         x, u = xu[:4], xu[4:]
@@ -58,7 +63,7 @@ def test_the_perfect_oracle_knows_h_and_its_slopes(rate: float) -> None:
         except PlantError:
             continue
         followed += 1
-        value, slopes = (np.array(part) for part in evaluate(xu[:4], xu[4:], []))
+        value, slopes = (np.array(part) for part in evaluate(xu[:4], xu[4:], theta))
         np.testing.assert_allclose(value[:, 0], expected, atol=2e-9)
         np.testing.assert_allclose(slopes, numeric, atol=2e-6)
     assert followed >= 15
@@ -153,8 +158,62 @@ def test_a_plant_that_drifts_moves_otherwise_from_then_on() -> None:
         assert np.abs(calm - moved)[30:].max() > 1e-3
 
 
+def prediction_errors(run: Run) -> np.ndarray:
+    return np.array([r.prediction_error for r in run.results if r.prediction_error is not None])
+
+
+def test_the_true_plant_moves_by_its_own_parameters_and_only_perfect_knows() -> None:
+    runs = {
+        (oracle, slope): follow(config(f"controller.oracle={oracle}", f"plant.truth.slope={slope}"), 20).run
+        for oracle in ("linear", "perfect")
+        for slope in (1.5, 1.4)
+    }
+    truth = Truth(PLANT.varied(slope=1.4))
+    run = runs["linear", 1.4]
+    for state, after, command in zip(run.plant_states, run.plant_states[1:], run.commands, strict=False):
+        np.testing.assert_allclose(
+            truth.step(np.array(state.x), np.array(command.u), 0.05), after.x, atol=1e-12
+        )
+    # The model is the nominal one: its first plan is made of the same numbers, whatever the truth.
+    assert runs["linear", 1.4].commands[0].plan == runs["linear", 1.5].commands[0].plan
+    assert np.abs(states(runs["linear", 1.4]) - states(runs["linear", 1.5])).max() > 1e-2
+    assert prediction_errors(runs["perfect", 1.4]).max() < 1e-8
+    assert runs["perfect", 1.4].commands[0].plan != runs["perfect", 1.5].commands[0].plan
+    assert replay(runs["perfect", 1.4]).equal
+
+
+@pytest.mark.parametrize("over", [0.0, 0.5])
+def test_perfect_knows_the_present_equations_of_a_plant_that_drifts_and_replays(over: float) -> None:
+    faults = Faults(drift=Drift(to={"slope": 1.4, "z_c": 0.05}, at=1.0, over=over))
+    run = follow(config("controller.oracle=perfect", "controller.keyframe_every=7"), 45, faults).run
+    assert prediction_errors(run).max() < 1e-8
+    told = [tick.seq for tick in run.ticks if tick.truth]
+    assert told[0] == 20
+    assert told[-1] == (30 if over else 20)
+    assert run.ticks[told[-1]].truth == {"beta": 1.0, "z_c": 0.05, "slope": 1.4}
+    known = [keyframe.arrays["oracle.parameters"].numpy().tolist() for keyframe in run.keyframes]
+    assert known[0] == [1.0, 0.0, 1.5]
+    assert known[-1] == [1.0, 0.05, 1.4]
+    assert replay(run).equal
+    assert replay(run, from_tick=30).equal
+
+
+@pytest.mark.parametrize("setting", ["plant.truth.slope=1e9", "rate=1e-6"])
+def test_a_truth_too_fast_for_perfect_is_refused_and_takes_no_memory(setting: str) -> None:
+    config_too_fast = config("controller.oracle=perfect", setting)
+    with pytest.raises(ConfigError, match=r"too fast, or too wild|not Schur stable|no stabilising K"):
+        ControllerCore(config_too_fast, "controller")
+
+
+def test_who_learns_is_not_told_of_a_drift() -> None:
+    faults = Faults(drift=Drift(to={"slope": 1.4}, at=1.0))
+    run = follow(config("controller.oracle=l2nw"), 25, faults).run
+    assert prediction_errors(run)[20] > 1e-4
+    assert replay(run).equal
+
+
 def test_faults_that_do_not_fit_the_plant_are_named() -> None:
-    with pytest.raises(ConfigError, match="no parameter bta; it has beta, z_c, slope"):
+    with pytest.raises(ConfigError, match=r"faults\.drift: .* no parameter 'bta'; did you mean 'beta'"):
         follow(config(), 5, Faults(drift=Drift(to={"bta": 2.0}, at=0.0)))
     with pytest.raises(ConfigError, match="2 entries, the plant has 4 states"):
         follow(config(), 5, Faults(noise=[0.1, 0.1]))

@@ -17,7 +17,7 @@ from protocol import messages as m
 from protocol.topics import Topic
 from tandem.live import view
 from tandem.live.monitor import Monitor, Snapshot
-from tests.helpers.integrator import INTEGRATOR
+from tests.helpers.plants.integrator import INTEGRATOR
 
 CONFIG = Config()
 PLANT = get_plant(CONFIG.plant.model)

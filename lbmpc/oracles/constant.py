@@ -1,0 +1,52 @@
+"""The oracle that learns one number a state: classical offset-free MPC.
+
+    h_hat_{t+1} = h_hat_t + gain (h(x_t, u_t) - h_hat_t),    h_hat_0 = 0
+
+h_hat is the same all over X x U, and at rest it equals the disturbance there: nothing is left of it in the prediction
+error (Pannocchia and Rawlings 2003). The target of the cost stays (x_e, u_e), so an offset is left where an input other
+than u_e holds the plant and costs something. It is the baseline of all that learns a function.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.oracles.base import Oracle, OracleState, by_point
+
+
+class ConstantOracle(Oracle):
+    """h_hat is the filtered label.
+
+    Args:
+        d, m: states and inputs.
+        gain: share of a new label, above 0 and at most 1; 1: h_hat is the last label.
+    """
+
+    name = "constant"
+
+    def __init__(self, d: int, m: int, gain: float):
+        self.d, self.m, self.gain = d, m, gain
+        self.parameters = d
+
+    def split(self, theta: ca.MX) -> list[ca.MX]:
+        return [theta]
+
+    def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
+        return ca.repmat(parts[0], 1, su.shape[1])
+
+    def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
+        return by_point([ca.MX.zeros(self.d, su.shape[1]) for _ in range(su.shape[0])])
+
+    def initial_state(self, rng: np.random.Generator) -> OracleState:
+        return {"h_hat": np.zeros(self.d)}
+
+    def theta(self, state: OracleState) -> np.ndarray:
+        return state["h_hat"]
+
+    def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return state["h_hat"]
+
+    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
+        # Written so that it is h itself for a gain of 1, without rounding.
+        return {"h_hat": (1.0 - self.gain) * state["h_hat"] + self.gain * h}

@@ -1,0 +1,124 @@
+"""The last layer as Bayesian linear regression: a Kalman filter for its weights, projected in its own norm.
+
+Every label is h = K' phi with an error of variance r, in units of the output scale; that is the same for all columns of
+K, so they share one covariance Sigma.
+
+    s_t = r + phi' Sigma_t phi
+    Kbar_{t+1} = K_t - Sigma_t phi xtilde_{t+1}' / s_t,    Sigmabar_{t+1} = Sigma_t - Sigma_t phi phi' Sigma_t / s_t
+    Sigma_{t+1} = a Sigmabar_{t+1} + (1 - a) p I,          Sigma_0 = p I
+    K_{t+1}^(i) = argmin (k - Kbar^(i))' Sigma_{t+1}^-1 (k - Kbar^(i))   over   |k| <= Wbar_i
+
+What is known fades towards the prior p I, with a < 1, so that a plant or features that change are followed. It also
+keeps Sigma above (1 - a) p I: rounding cannot make it indefinite.
+
+**Counterpart of Lemma 1.** For any W* with |W*^(i)| <= Wbar_i and any features, those of changing hidden layers too,
+let eps_t = h(x_t, u_t) - W*' phi and V_t = trace (K_t - W*)' Sigma_t^-1 (K_t - W*). Then
+
+    (i)    s_t <= r + p |phi|^2
+    (ii)   V_{t+1} - V_t <= |eps_t|^2 / r - |xtilde_{t+1}|^2 / s_t
+    (iii)  sum |xtilde_{t+1}|^2 / s_t  <=  V_0 + sum |eps_t|^2 / r,     V_0 = |K_0 - W*|_F^2 / p <= 4 sum Wbar_i^2 / p
+
+Proof. Completing the square in k, with Sigmabar^-1 = Sigma_t^-1 + phi phi' / r, gives for each column
+
+    (k - k_t)' Sigma_t^-1 (k - k_t) + (h - k' phi)^2 / r  =  (k - kbar)' Sigmabar^-1 (k - kbar) + xtilde^2 / s_t.
+
+At k = W* the first term is V_t, the second |eps|^2 / r, the third V of Kbar in the norm of Sigmabar^-1. From
+Sigmabar <= Sigma_t <= p I follows Sigmabar <= Sigma_{t+1} <= p I: (i), and the norm of Sigma_{t+1}^-1 is not larger. In
+that norm the projection onto a convex set which contains W* brings nothing farther from W*: (ii). The sum is (iii).
+
+It stays true where hidden layers are adopted, under which K and Sigma are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.oracles.base import OracleState
+from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw
+
+NEWTON, CLOSE = 100, 1e-13
+
+
+@dataclass(frozen=True)
+class Kalman:
+    """The filter's numbers; variances in units of the output scale squared."""
+
+    prior_variance: float
+    """p, of each entry of K before the first sample."""
+    label_variance: float
+    """r, of each entry of a label."""
+    kept: float
+    """a, the share of what is known that one sample later still counts, 0 < a < 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanLaw(AdaptationLaw):
+    """Sigma, (f, f), is remembered beside K."""
+
+    filter: Kalman
+    bounds: np.ndarray
+    """Wbar_i, (d,), in the units of K' phi."""
+    remembers = ("Sigma",)
+
+    def begin(self, features: int) -> OracleState:
+        return {"Sigma": self.filter.prior_variance * np.eye(features)}
+
+    def settings(self) -> dict[str, np.ndarray]:
+        chosen = self.filter
+        faded = (1.0 - chosen.kept) * chosen.prior_variance
+        return {
+            "label_variance": np.array([chosen.label_variance]),
+            "kept": np.array([chosen.kept]),
+            "faded": np.array([faded]),
+        }
+
+    def expression(
+        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+    ) -> dict[str, ca.MX]:
+        Sigma = memory["Sigma"]
+        along = Sigma @ phi
+        s = settings["label_variance"] + ca.dot(phi, along)
+        # The product of one vector with itself is symmetric to the last bit, and so is Sigma for ever.
+        root = along / ca.sqrt(s)
+        less = settings["kept"] * (Sigma - root @ root.T)
+        return {
+            "K": K - error @ (along / s).T,
+            "Sigma": less + settings["faded"] * ca.DM.eye(phi.shape[0]),
+        }
+
+    def bounded(self, learned: OracleState) -> OracleState:
+        K = learned["K"]
+        if ((K * K).sum(axis=0) <= self.bounds**2).all():
+            return learned
+        return {**learned, "K": nearest_within(K, learned["Sigma"], self.bounds)}
+
+
+def nearest_within(K: np.ndarray, Sigma: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Every column of K, (f, d), that exceeds its bound, (d,), brought onto it, nearest in the norm of Sigma^-1.
+
+        k = (I + lambda Sigma)^-1 kbar,    |k| = bound
+
+    The equation for lambda > 0 is that of a trust region (Moré and Sorensen 1983): Newton's method on 1 / |k| comes
+    from the left and never passes the root.
+
+    Args:
+        Sigma: symmetric and positive definite, (f, f).
+    """
+    variances, axes = np.linalg.eigh(Sigma)
+    nearest = K.copy()
+    for i in np.flatnonzero(np.sqrt((K * K).sum(axis=0)) > bounds):
+        turned, bound, multiplier = axes.T @ K[:, i], bounds[i], 0.0
+        for _ in range(NEWTON):
+            shrunk = turned / (1.0 + multiplier * variances)
+            norm = float(np.sqrt(shrunk @ shrunk))
+            if norm <= bound * (1.0 + CLOSE):
+                break
+            slope = shrunk @ (shrunk * variances / (1.0 + multiplier * variances))
+            multiplier += (norm / bound - 1.0) * norm**2 / slope
+        # What is left is rounding.
+        nearest[:, i] = axes @ shrunk * min(1.0, bound / norm)
+    return nearest

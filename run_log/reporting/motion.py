@@ -1,0 +1,110 @@
+"""The true motion of a run's plant, as arrays."""
+
+from __future__ import annotations
+
+from itertools import accumulate, pairwise
+
+import msgspec
+import numpy as np
+
+from lbmpc.plants import Plant
+from protocol.messages import PlantState
+from run_log.errors import LogError
+from run_log.run import Run
+
+Pieces = tuple[tuple[float, tuple[float, ...]], ...]
+"""(seconds, input (m,)) in the order in which they acted."""
+
+
+class Trajectory(msgspec.Struct, frozen=True):
+    """The plant's true motion from the sample that the first command answers; n samples, d states, m inputs.
+
+    An episode is the motion of one start of the plant, likewise from the sample that its first command answers.
+    """
+
+    step: np.ndarray
+    """(n,) samples since the start."""
+    t: np.ndarray
+    """(n,) seconds since the start, on the plant's clock."""
+    x: np.ndarray
+    """(n, d) plant units."""
+    applied: np.ndarray
+    """(n, m) mean input over the period before the sample; NaN where none was reported."""
+    pieces: tuple[Pieces, ...]
+    """(n,) what acted in that period; empty where it was not reported, or samples are missing before this one."""
+    starts: tuple[int, ...] = (0,)
+    """Where in these arrays the episodes begin."""
+
+    def part(self, first: int, last: int) -> Trajectory:
+        """The motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
+        within = slice(first, last + 1)
+        applied = self.applied[within].copy()
+        # What acted before the first sample is not of this part.
+        applied[:1] = np.nan
+        step, t = self.step[within], self.t[within]
+        return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, ((), *self.pieces[within][1:]))
+
+    def episodes(self) -> list[Trajectory]:
+        """Each of them as a trajectory of its own."""
+        return [self.part(first, behind - 1) for first, behind in pairwise((*self.starts, len(self.step)))]
+
+
+def trajectory(run: Run, plant: Plant) -> Trajectory:
+    """The true motion, without the hold before it, and without the hold at each later start of the plant.
+
+    States of strangers (plants that no tick of the log answers) are left out.
+
+    Raises:
+        LogError: the log holds no state of this plant's size.
+    """
+    controllers = set(run.controllers)
+    followed = {t.state.run_id for t in run.ticks if t.state is not None and t.run_id in controllers}
+    states = [s for s in run.plant_states if len(s.x) == plant.d and (s.run_id in followed or not followed)]
+    if not states:
+        raise LogError(
+            f"{run.path}: holds no state of a plant with {plant.d} states ({', '.join(plant.states)})"
+        )
+    by_plant: dict[str, list[PlantState]] = {}
+    for s in states:
+        by_plant.setdefault(s.run_id, []).append(s)
+    moved = [found for one in by_plant.values() if (found := _after_the_hold(one))]
+    # Of a plant that never moved its last sample is all there is.
+    return motion(moved or [states[-1:]], plant, run.config.period)
+
+
+def motion(episodes: list[list[PlantState]], plant: Plant, period: float) -> Trajectory:
+    """The trajectory of these samples, each with the plant's number of states; none of the lists is empty."""
+    states = [s for one in episodes for s in one]
+    nothing = [np.nan] * plant.m
+    applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
+    # A plant that was started again counts its samples from zero again; on another machine its seconds too.
+    step: list[int] = []
+    t: list[float] = []
+    offset, t_offset = -states[0].seq, -states[0].t
+    for before, s in zip([states[0], *states], states, strict=False):
+        if s.run_id != before.run_id:
+            offset = step[-1] + 1 - s.seq
+            t_offset = t_offset if s.t >= before.t else t[-1] + period - s.t
+        step.append(s.seq + offset)
+        t.append(s.t + t_offset)
+    known = [
+        _pieces(s, plant.m, period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
+        for before, s in pairwise(states)
+    ]
+    starts = (0, *accumulate(len(one) for one in episodes[:-1]))
+    x = np.array([s.x for s in states])
+    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known), starts)
+
+
+def _after_the_hold(states: list[PlantState]) -> list[PlantState]:
+    """From the sample that the first command answers on; nothing where none came."""
+    moving = next((i for i, s in enumerate(states) if s.source != "hold"), None)
+    return [] if moving is None else states[max(moving - 1, 0) :]
+
+
+def _pieces(state: PlantState, m: int, period: float) -> Pieces:
+    if state.pieces:
+        found = tuple((piece.seconds, tuple(piece.u)) for piece in state.pieces)
+    else:
+        found = () if state.applied is None else ((period, tuple(state.applied)),)
+    return found if all(len(u) == m for _seconds, u in found) else ()

@@ -1,0 +1,133 @@
+"""The yardstick: how well a true motion goes to the equilibrium, in the objective and beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import fmean
+
+import msgspec
+import numpy as np
+
+from lbmpc.plants import Plant
+from node_runtime.config.sections import Config
+from run_log.reporting.between_samples import excess
+from run_log.reporting.motion import Trajectory
+
+TOLERANCE = 1e-6
+"""Of a half-width: what is further outside X or U is a violation."""
+SETTLED = 0.04
+"""Of a half-width: a performance state this close to its equilibrium is settled."""
+FARTHEST = 1e100
+"""Where a plant that was lost counts as being: its square is still a number."""
+
+
+class Performance(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names.
+
+    Of several episodes: the mean of J and of the deviation, the sum of the violations, of all else the worst.
+    """
+
+    J: float
+    """Sum of the stage costs, dx' Q dx + du' R du times the period, with the densities Q and R of the configuration
+    and the mean input that was applied; an input that the log does not know counts nothing."""
+    deviation: float
+    """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
+    overshoot: dict[str, float | None]
+    """Per performance state: how far beyond its equilibrium it got, as a share of its initial deviation; null where
+    it began settled."""
+    settled_s: float | None
+    """Seconds after which all performance states stay within 4 % of their half-width of the equilibrium; null where
+    one of them is not settled at the end."""
+    settled_by_state_s: dict[str, float | None]
+    """The same for each performance state."""
+    constraint_violations: int
+    """Samples at which the true state, or the mean input before it, is outside X or U by more than 1e-6 of a
+    half-width."""
+    excess_between_samples: float | None
+    """Largest distance of the true motion from X, between samples too, as a share of the state's half-width; null
+    where the equations of the truth do not lead from sample to sample."""
+
+
+def performance(motion: Trajectory, plant: Plant, config: Config, truth: Plant) -> Performance:
+    """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
+
+    Args:
+        motion: the samples.
+        plant: its equilibrium, bounds and half-widths.
+        config: the weights and the rate.
+        truth: the plant whose motion this is, where its equations differ from `plant`'s.
+    """
+    names = [plant.states[i] for i in plant.performance]
+    own = list(plant.performance)
+    dx, du = (
+        np.clip(off, -FARTHEST, FARTHEST)
+        for off in (motion.x - plant.x_e, np.nan_to_num(motion.applied[1:] - plant.u_e))
+    )
+    q, r = (
+        np.ones(n) if w is None else np.array(w)
+        for n, w in ((plant.d, config.controller.Q), (plant.m, config.controller.R))
+    )
+    # The period from a sample to the next one; more than one where samples are missing.
+    seconds = np.diff(motion.step) / config.rate
+    squares = dx[:-1] ** 2
+    stages = squares @ q + du**2 @ r
+    off = np.abs(dx) > SETTLED * plant.x_scale
+    settled = {
+        name: _settled(off[:, i], motion.step, config.rate) for name, i in zip(names, own, strict=True)
+    }
+    times = [time for time in settled.values() if time is not None]
+    return Performance(
+        J=float(seconds @ stages),
+        deviation=float(seconds @ squares[:, own].sum(axis=1)),
+        overshoot={name: _overshoot(dx[:, i], bool(off[0, i])) for name, i in zip(names, own, strict=True)},
+        settled_s=max(times) if len(times) == len(settled) else None,
+        settled_by_state_s=settled,
+        constraint_violations=int(outside(motion, plant).sum()),
+        excess_between_samples=excess(motion, truth),
+    )
+
+
+def of_episodes(every: Sequence[Performance]) -> Performance:
+    """The figures of several episodes together; of a single one its own."""
+    names = list(every[0].overshoot)
+    overshoots = {name: [v for one in every if (v := one.overshoot[name]) is not None] for name in names}
+    return Performance(
+        J=fmean(one.J for one in every),
+        deviation=fmean(one.deviation for one in every),
+        overshoot={name: max(values, default=None) for name, values in overshoots.items()},
+        settled_s=_largest([one.settled_s for one in every]),
+        settled_by_state_s={
+            name: _largest([one.settled_by_state_s[name] for one in every]) for name in names
+        },
+        constraint_violations=sum(one.constraint_violations for one in every),
+        excess_between_samples=_largest([one.excess_between_samples for one in every]),
+    )
+
+
+def outside(motion: Trajectory, plant: Plant) -> np.ndarray:
+    """(n,) whether the true state or the applied input is outside X or U by more than 1e-6 of a half-width."""
+    x, u = motion.x, motion.applied
+    x_room, u_room = TOLERANCE * plant.x_scale, TOLERANCE * plant.u_scale
+    state = (x < plant.x_min - x_room) | (x > plant.x_max + x_room)
+    applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false where there was none
+    return np.asarray(state.any(axis=1) | applied.any(axis=1))
+
+
+def _largest(values: list[float | None]) -> float | None:
+    """None where one of them is."""
+    known = [value for value in values if value is not None]
+    return max(known) if len(known) == len(values) else None
+
+
+def _overshoot(dx: np.ndarray, began_off: bool) -> float | None:
+    if not began_off:
+        return None
+    return max(0.0, float((-dx / dx[0]).max()))
+
+
+def _settled(off: np.ndarray, step: np.ndarray, rate: float) -> float | None:
+    """Seconds until the first sample from which on none is off."""
+    if off[-1]:
+        return None
+    last = np.flatnonzero(off)
+    return float(step[last[-1] + 1] / rate) if last.size else 0.0

@@ -1,0 +1,35 @@
+"""The plant's own motion over a part of a period: right where the equations hold, None where they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lbmpc.model import Model, build_model
+from lbmpc.plants import get_plant
+from lbmpc.plants.base import Truth
+from lbmpc.sets.motion import Motion
+from tests.helpers.plants.pendulum import pendulum, two_inputs
+
+COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
+
+
+@pytest.mark.parametrize("model", [COMPRESSOR, pendulum(), two_inputs()], ids=lambda one: one.plant.name)
+def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
+    plant, motion, truth, rng = model.plant, Motion(model), Truth(model.plant), np.random.default_rng(0)
+    for _ in range(50):
+        x, u = rng.uniform(plant.x_min, plant.x_max), rng.uniform(plant.u_min, plant.u_max)
+        seconds = rng.uniform(0.0, 0.5 * model.period)
+        found = motion.after(x - plant.x_e, u - plant.u_e, seconds)
+        assert found is not None
+        error = (found + plant.x_e - truth.step(x, u, seconds)) / plant.x_scale
+        assert np.abs(error).max() < 1e-8
+
+
+def test_where_the_equations_do_not_hold_there_is_none() -> None:
+    plant, motion = COMPRESSOR.plant, Motion(COMPRESSOR)
+    without_pressure = np.array([0.5, -0.1, 1.0, 0.0])
+    assert motion.after(without_pressure - plant.x_e, np.zeros(1), 0.01) is None
+    assert motion.after(np.array([1e6, 0.0, 0.0, 0.0]), np.zeros(1), 0.01) is None
+    # And it goes on as if nothing had been.
+    assert motion.after(np.zeros(4), np.zeros(1), 0.01) == pytest.approx(np.zeros(4), abs=1e-6)
