@@ -139,3 +139,12 @@ def test_what_is_said_of_a_box_holds_at_its_points(family: Certificate) -> None:
         # By the mean-value theorem the steepest slope says how far two points can differ.
         steepest = slopes[i].magnitude() @ r[i]
         assert (np.ptp(left, axis=0) <= 2 * steepest + 1e-9).all()
+
+
+@pytest.mark.parametrize("state", [0, 1])
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_each_end_of_w_counts(family: Certificate, state: int, end: float) -> None:
+    """h is largest at one end of X and least at the other; only one of them is cut off here."""
+    W = np.array(family.pieces[0].W)
+    W[:, state] = end * np.minimum(end * W[:, state], 0.97 * (end * W[:, state]).max())
+    assert "h is outside of W" in prove(MODEL, changed(family, 0, W=W.tolist())).reason
