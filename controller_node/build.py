@@ -238,9 +238,9 @@ def _warm_up(controller: Controller, solver: TimedSolver, seed: int) -> None:
     edge = x.copy()
     edge[:d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
     for start in (x, edge):
-        solver.solve(start, theta, state.plan.v)
+        solver.solve(start, theta, state.plan.c)
         if controller.real_time:
-            solver.prepare(start, theta, state.plan.v)
+            solver.prepare(start, theta, state.plan.c)
             solver.feedback(start)
 
 
