@@ -113,7 +113,7 @@ def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytop
         np.concatenate([last.upper, omega.upper]),
         last.names + omega.names,
     )
-    if both.interior_point() is None:
+    if both.interior_point(model.plant.x_scale) is None:
         raise EmptySetError(
             f"the tightened set is empty at step {n}: the terminal set Omega - R_{n} holds nothing. "
             f"A smaller W, another K or a shorter horizon would help."

@@ -170,7 +170,7 @@ class TickResult(Message, frozen=True):
     status: str
     iterations: Count
     slack: float
-    """Largest state-constraint violation of the nominal plan, in units of that constraint's row."""
+    """Largest state-constraint violation of the nominal plan, as a share of that state's half-width."""
     slack_row: str
     """Which row that is, as "y at step 3"; empty when none."""
     h: list[float] | None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -41,7 +42,7 @@ SENT = {"every tick": (1, False), "every 7th": (7, False), "instead": (1, True)}
 def measure(seeds: range) -> Table:
     """One row a case: means over the seeds."""
     table = Table(
-        "what is sent", "when", "trial", "adopted", "refused", "rolled back", "cost", "overshoot", "outside"
+        "what is sent", "when", "trial", "adopted", "refused", "rolled back", "J", "overshoot", "outside"
     )
     for trial in (True, False):
         for name, faults in DISTURBANCES.items():
@@ -71,8 +72,8 @@ def _row(table: Table, words: tuple[str, str], trial: bool, runs: list[Run]) -> 
         *words,
         "on" if trial else "off",
         *(f"{mean(name):.1f}" for name in ("weights_adopted", "weights_refused", "weights_rolled_back")),
-        f"{mean('cost'):.2f}",
-        f"{mean('overshoot'):.4f}",
+        f"{mean('J'):.3f}",
+        f"{np.mean([next(iter(one.overshoot.values())) for one in found]):.1%}",
         f"{mean('constraint_violations'):.1f}",
     )
 

@@ -46,8 +46,8 @@ class Solves(Protocol):
 
 
 ABSURD = 1e6
-"""Half-widths of X from the equilibrium: a number that is no measurement, whatever a gateway means by it. Finite
-alone is not enough: what is learned from 1e307 is not."""
+"""Half-widths from the equilibrium: a number that is no measurement, and no input that acts, whatever a gateway means
+by it. Finite alone is not enough: what is learned from 1e307 is not, nor where it leads within a delay."""
 
 
 class Controller:
@@ -67,7 +67,7 @@ class Controller:
         self._first_delay = self._acceptable(input_delay)
         self._motion = None if problem.guard is None else Motion(self.model)
         self.oracle = problem.oracle
-        self._absurd = ABSURD * self.model.plant.x_scale
+        self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -95,8 +95,7 @@ class Controller:
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        if seen.x is not None and not (np.abs(seen.x) <= self._absurd).all():
-            seen = replace(seen, x=None)
+        seen = self._without_absurd(seen)
         label, oracle = self._learn(state, seen)
         rolled_back = ""
         if label is not None:
@@ -119,6 +118,15 @@ class Controller:
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
         after = ControllerState(shift(plan), pending_x, pending, predicted, delay, oracle)
         return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first)
+
+    def _without_absurd(self, seen: Observation) -> Observation:
+        most_x, most_u = self._absurd
+        if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
+            seen = replace(seen, x=None)
+        inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
+        if any(not (np.abs(u) <= most_u).all() for u in inputs):
+            seen = replace(seen, applied=None, pieces=())
+        return seen
 
     def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending

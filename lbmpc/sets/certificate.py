@@ -26,6 +26,10 @@ ROUNDING = 1e-12
 """Another processor may compute A and B with another last digit; every certified margin is far above it."""
 
 
+LARGEST = 1e60
+"""Of any number in a certificate: a product of five of them is finite."""
+
+
 class CertificateError(SetError):
     """A certificate cannot be used here; the text says what differs."""
 
@@ -153,13 +157,18 @@ def decode(data: bytes) -> Certificate:
 
 
 def _require_shapes(certificate: Certificate) -> None:
-    d, m = np.shape(certificate.model.B)
+    said = certificate.model
+    d, m = len(said.x_e), len(said.u_e)
+    wanted = {"A": (d, d), "B": (d, m), "x_e": (d,), "u_e": (m,), "X": (2, d), "U": (2, m)}
+    for name, shape in wanted.items():
+        _require(getattr(said, name), f"the model's {name}", shape)
     if not certificate.pieces:
         raise CertificateError("the certificate holds no set")
     for piece in certificate.pieces:
         rows = len(piece.g)
         wanted = {
             "G": (rows, d),
+            "g": (rows,),
             "slope_x": (d, d),
             "slope_u": (d, m),
             "x_lower": (d,),
@@ -169,18 +178,24 @@ def _require_shapes(certificate: Certificate) -> None:
             "W": (len(piece.W), d),
         }
         for name, shape in wanted.items():
-            value = _array(getattr(piece, name), f"piece {piece.name!r}: {name}")
-            if value.shape != shape:
-                raise CertificateError(f"piece {piece.name!r}: {name} has shape {value.shape}, not {shape}")
+            _require(getattr(piece, name), f"piece {piece.name!r}: {name}", shape)
         if not (rows and len(piece.W) and 0 <= piece.target < len(certificate.pieces)):
             raise CertificateError(f"piece {piece.name!r}: no rows, no W, or a target that is not there")
+        if not (np.abs(np.array(piece.G)).max(axis=1) >= 1 / LARGEST).all():
+            raise CertificateError(f"piece {piece.name!r}: a row of G has no direction")
+        lower, upper = np.array(piece.u_lower), np.array(piece.u_upper)
+        if not ((said.U[0] <= lower) & (lower <= upper) & (upper <= said.U[1])).all():
+            raise CertificateError(
+                f"piece {piece.name!r}: the inputs allowed are not in order, or outside of U"
+            )
 
 
-def _array(value: object, what: str) -> np.ndarray:
+def _require(value: object, what: str, shape: tuple[int, ...]) -> None:
     try:
         array = np.array(value, dtype=float)
     except ValueError as error:
         raise CertificateError(f"{what}: its rows have different lengths") from error
-    if not np.isfinite(array).all():
-        raise CertificateError(f"{what}: not finite")
-    return array
+    if array.shape != shape:
+        raise CertificateError(f"{what} has shape {array.shape}, not {shape}")
+    if not (np.abs(array) <= LARGEST).all():
+        raise CertificateError(f"{what}: not finite, or beyond {LARGEST:g}")

@@ -11,6 +11,7 @@ from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
 from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
 from lbmpc.sets.geometry.operations import Body, body, body_of
+from lbmpc.sets.geometry.polytope import SetError
 from lbmpc.sets.invariance.regions import ControllableSet, controllable_sets
 from lbmpc.sets.invariance.robust_control import Stage, UncertainSystem, predecessor, predecessor_iteration
 
@@ -66,7 +67,7 @@ def construct(
 
 
 def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
-    X = body_of(state_set(model), "X")
+    X = body_of(state_set(model), "X", model.plant.x_scale)
     G, g = predecessor(X, UncertainSystem(model.A, model.B, bound, input_set(model)))
     once = body(np.vstack([X.G, G]), np.concatenate([X.g, g]), "X with its predecessor", X.scale).reduced()
     pieces = [_piece("X with Pre(X)", once, bound, 0)]
@@ -83,8 +84,21 @@ def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
 
 
 def whole(model: Model) -> Region:
-    """All of X and U."""
-    X, U = state_set(model), input_set(model)
+    """All of X and U. Raises `SetError` where they have no end."""
+    X, U, plant = state_set(model), input_set(model), model.plant
+    open_ends = [
+        f"{name} {end}"
+        for names, lower, upper in ((plant.states, X.lower, X.upper), (plant.inputs, U.lower, U.upper))
+        for name, low, high in zip(names, lower, upper, strict=True)
+        for end, bound in (("below", low), ("above", high))
+        if not np.isfinite(bound)
+    ]
+    if open_ends:
+        raise SetError(
+            f"{plant.name}: not bounded: {', '.join(open_ends)}. The model error h is bounded over all of X and U, so "
+            "certified sets need a finite x_min, x_max, u_min and u_max of each state and input. Give the plant such "
+            "bounds, as wide as its use; its `scale` is no bound"
+        )
     return Region(X.lower, X.upper, U.lower, U.upper)
 
 
@@ -102,7 +116,7 @@ def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report:
 def _invariant(
     model: Model, bound: DisturbanceBound, slack: float, patience: int, saved: Saved, report: Report
 ) -> Stage:
-    X = body_of(state_set(model), "X")
+    X = body_of(state_set(model), "X", model.plant.x_scale)
     plant = UncertainSystem(model.A, model.B, bound, input_set(model))
     stage = _thaw(saved["stage"], X) if "stage" in saved else None
     first = None

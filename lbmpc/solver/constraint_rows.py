@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from lbmpc.problem import Problem
+from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.least_distance import (
     NO_ROWS,
-    PRIMAL_TOLERANCE,
     Nearest,
     Penalty,
     Shown,
@@ -17,6 +17,8 @@ from lbmpc.solver.least_distance import (
     violation,
 )
 
+KEPT = 1e-7
+"""A row that is off by less of its scale counts as kept: that much a QP's own tolerance may leave."""
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds, (m,) each."""
 
@@ -47,10 +49,9 @@ class Rows:
         )
         self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
         plant = problem.model.plant
-        # A row f counts in shares of its range over the half-widths, |f|' scale: for a box, the half-width itself.
-        # Tightening must not make a violation weigh more.
+        # Of the plain sets' half-widths: tightening must not make a violation weigh more.
         of_inputs, of_states, of_terminal = (
-            np.abs(F) @ half
+            row_ranges(F, half)
             for F, half in (
                 (self.input_rows, plant.u_scale),
                 (self.state_rows, plant.x_scale),
@@ -59,7 +60,7 @@ class Rows:
         )
         scale = np.concatenate([np.tile(of_inputs, n), np.tile(of_states, n), of_terminal])
         soft = np.arange(len(self.lower)) >= self.count_inputs
-        self.penalty = Penalty(soft, np.maximum(scale, np.finfo(float).tiny), problem.penalty)
+        self.penalty = Penalty(soft, scale, problem.penalty)
         self._hard = replace(self.penalty, soft=np.zeros_like(soft))
         self.names = [
             f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
@@ -119,4 +120,4 @@ class Rows:
         states = (outside / self.penalty.scale)[self.count_inputs :]
         worst = int(states.argmax())
         slack = float(states[worst])
-        return (slack, self.names[worst]) if slack > PRIMAL_TOLERANCE else (0.0, "")
+        return (slack, self.names[worst]) if slack > KEPT else (0.0, "")

@@ -25,8 +25,6 @@ from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
-# Above the QP's own tolerance; what a row may be off by, as a share of its scale, before it counts as broken.
-ROW_TOLERANCE = 1e-7
 MAX_HALVINGS = 12
 # Steps that shrink this fast need no watching: the next one will be this much smaller again.
 FAST = 0.1
@@ -311,11 +309,10 @@ class Solver:
     ) -> Solution:
         found = self._rollout(x, v)
         slack, slack_row = self._rows.slack(found["outside"][:, 0])
-        broken = slack > ROW_TOLERANCE
-        hard_broken = broken and not self.problem.soft and status is not Status.INFEASIBLE
+        hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > 0.0
         if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
             status = Status.NUMERICAL
-        elif broken and status in (Status.CONVERGED, Status.REAL_TIME):
+        elif slack > 0.0 and status in (Status.CONVERGED, Status.REAL_TIME):
             status = Status.INFEASIBLE
         u = np.minimum(np.maximum(u, self._u_min), self._u_max)
         # Both begin in x_t: bounds on v_0 are bounds on u_0.

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import io
 import os
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,12 +56,37 @@ def drawing(what: str | Path) -> Iterator[None]:
 
 
 def load_matplotlib() -> None:
-    """Import it without the person's choice of a backend and of a settings file, either of which may be a mistake."""
+    """Import it with the settings that it comes with: a person's backend or settings file may be a mistake.
+
+    Its import reads the first `matplotlibrc` of the current folder, `MATPLOTLIBRC`, and the person's configuration; one
+    that is no text ends it.
+    """
+    found = find_spec("matplotlib")
+    if "matplotlib" in sys.modules or found is None or found.origin is None:
+        import matplotlib
+
+        return
+    own = Path(found.origin).parent / "mpl-data"
     kept = {name: os.environ.pop(name) for name in ("MPLBACKEND", "MATPLOTLIBRC") if name in os.environ}
+    os.environ["MATPLOTLIBRC"] = str(own / "matplotlibrc")
     try:
-        import matplotlib  # noqa: F401
+        with _elsewhere(own) if os.path.lexists("matplotlibrc") else nullcontext():
+            import matplotlib  # noqa: F401
     finally:
+        del os.environ["MATPLOTLIBRC"]
         os.environ.update(kept)
+
+
+@contextmanager
+def _elsewhere(folder: Path) -> Iterator[None]:
+    """With `folder` as the current one."""
+    here = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.chdir(folder)
+        yield
+    finally:
+        os.fchdir(here)
+        os.close(here)
 
 
 def save(make: Callable[[], Figure], path: Path, dpi: int | None = None) -> Path:

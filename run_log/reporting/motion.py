@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import msgspec
 import numpy as np
@@ -22,8 +22,6 @@ class Trajectory(msgspec.Struct, frozen=True):
     An episode is the motion of one start of the plant, likewise from the sample that its first command answers.
     """
 
-    episode: np.ndarray
-    """(n,) which start of the plant it is, from 0 on."""
     step: np.ndarray
     """(n,) samples since the start."""
     t: np.ndarray
@@ -34,6 +32,8 @@ class Trajectory(msgspec.Struct, frozen=True):
     """(n, m) mean input over the period before the sample; NaN where none was reported."""
     pieces: tuple[Pieces, ...]
     """(n,) what acted in that period; empty where it was not reported, or samples are missing before this one."""
+    starts: tuple[int, ...] = (0,)
+    """Where in these arrays the episodes begin."""
 
     def part(self, first: int, last: int) -> Trajectory:
         """The motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
@@ -41,13 +41,12 @@ class Trajectory(msgspec.Struct, frozen=True):
         applied = self.applied[within].copy()
         # What acted before the first sample is not of this part.
         applied[:1] = np.nan
-        step, t, pieces = self.step[within], self.t[within], ((), *self.pieces[within][1:])
-        return Trajectory(self.episode[within], step - step[:1], t - t[:1], self.x[within], applied, pieces)
+        step, t = self.step[within], self.t[within]
+        return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, ((), *self.pieces[within][1:]))
 
     def episodes(self) -> list[Trajectory]:
         """Each of them as a trajectory of its own."""
-        begins = [0, *(np.flatnonzero(np.diff(self.episode)) + 1).tolist(), len(self.episode)]
-        return [self.part(first, behind - 1) for first, behind in pairwise(begins)]
+        return [self.part(first, behind - 1) for first, behind in pairwise((*self.starts, len(self.step)))]
 
 
 def trajectory(run: Run, plant: Plant) -> Trajectory:
@@ -65,13 +64,17 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
         raise LogError(
             f"{run.path}: holds no state of a plant with {plant.d} states ({', '.join(plant.states)})"
         )
-    starts: dict[str, list[PlantState]] = {}
+    by_plant: dict[str, list[PlantState]] = {}
     for s in states:
-        starts.setdefault(s.run_id, []).append(s)
-    moved = [found for one in starts.values() if (found := _after_the_hold(one))]
+        by_plant.setdefault(s.run_id, []).append(s)
+    moved = [found for one in by_plant.values() if (found := _after_the_hold(one))]
     # Of a plant that never moved its last sample is all there is.
-    moved = moved or [states[-1:]]
-    states = [s for one in moved for s in one]
+    return motion(moved or [states[-1:]], plant, run.config.period)
+
+
+def motion(episodes: list[list[PlantState]], plant: Plant, period: float) -> Trajectory:
+    """The trajectory of these samples, each with the plant's number of states; none of the lists is empty."""
+    states = [s for one in episodes for s in one]
     nothing = [np.nan] * plant.m
     applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
     # A plant that was started again counts its samples from zero again; on another machine its seconds too.
@@ -81,17 +84,16 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
     for before, s in zip([states[0], *states], states, strict=False):
         if s.run_id != before.run_id:
             offset = step[-1] + 1 - s.seq
-            t_offset = t_offset if s.t >= before.t else t[-1] + run.config.period - s.t
+            t_offset = t_offset if s.t >= before.t else t[-1] + period - s.t
         step.append(s.seq + offset)
         t.append(s.t + t_offset)
     known = [
-        _pieces(s, plant.m, run.config.period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
+        _pieces(s, plant.m, period) if (s.run_id, s.seq) == (before.run_id, before.seq + 1) else ()
         for before, s in pairwise(states)
     ]
-    episode = np.repeat(np.arange(len(moved)), [len(one) for one in moved])
-    return Trajectory(
-        episode, np.array(step), np.array(t), np.array([s.x for s in states]), np.array(applied), ((), *known)
-    )
+    starts = (0, *accumulate(len(one) for one in episodes[:-1]))
+    x = np.array([s.x for s in states])
+    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known), starts)
 
 
 def _after_the_hold(states: list[PlantState]) -> list[PlantState]:

@@ -74,16 +74,19 @@ def _label(plant: Plant, name: str, what: str = "") -> str:
     return f"{what}{name} ({'–' if unit in ('', '1') else unit})"
 
 
-def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float) -> None:
-    """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve."""
+def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float, scale: float) -> None:
+    """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve.
+
+    scale: the half-width.
+    """
     values = values[np.isfinite(values)]
     if not values.size:
         return
     bottom, top = min(float(values.min()), rest), max(float(values.max()), rest)
-    reach = 2 * max(top - bottom, 1e-9)
+    reach = 2 * max(top - bottom, 1e-9 * scale)
     drawn = [bound for bound in (low, high) if bottom - reach < bound < top + reach]
     bottom, top = min(bottom, *drawn, top), max(top, *drawn, bottom)
-    margin = 0.06 * max(top - bottom, 1e-9)
+    margin = 0.06 * max(top - bottom, 1e-9 * scale)
     ax.set_ylim(bottom - margin, top + margin)
     for i, bound in enumerate(drawn):
         label = "bounds" if i == 0 else "_nolegend_"
@@ -97,21 +100,20 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float)
     if not np.isfinite(distance):
         # No bounds on either side.
         return
-    inside = (
-        f"inside by {max(distance, 0.0):.2g}" if distance >= -TOLERANCE else f"OUTSIDE by {-distance:.2g}"
-    )
-    ax.plot([], [], " ", label=inside)
+    kept = distance >= -TOLERANCE * scale
+    inside = f"inside by {max(distance, 0.0):.2g}" if kept else f"OUTSIDE by {-distance:.2g}"
+    ax.plot([], [], " ", label=f"{inside}\nat samples")
 
 
 def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
     x = motion.x[:, i]
     # A plant that starts again jumps, which is no motion.
-    starts = np.flatnonzero(np.diff(motion.episode)) + 1
-    t, unbroken = np.insert(motion.t, starts, np.nan), np.insert(x, starts, np.nan)
+    later = list(motion.starts[1:])
+    t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
     ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-    _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i])
+    _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i], plant.x_scale[i])
     ax.set_ylabel(_label(plant, plant.states[i]))
 
 
@@ -126,7 +128,8 @@ def _input(data: Traces, j: int, ax: Axes) -> None:
     if data.fallback.any():
         ax.plot(data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver")
     ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
-    _bounded(ax, plant.u_min[j], plant.u_max[j], np.concatenate([u, applied]), plant.u_e[j])
+    values = np.concatenate([u, applied])
+    _bounded(ax, plant.u_min[j], plant.u_max[j], values, plant.u_e[j], plant.u_scale[j])
     ax.set_ylabel(_label(plant, plant.inputs[j]))
 
 

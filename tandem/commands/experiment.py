@@ -40,6 +40,9 @@ class Experiment(Command):
         return self._run(self.out)
 
     def _list(self) -> int:
+        from run_log.reporting.canvas import load_matplotlib
+
+        load_matplotlib()
         from tandem.experiments.experiment import overview
         from tandem.experiments.study.declaration import load
 

@@ -57,7 +57,8 @@ class ReferenceSolver:
             "ipopt.print_level": 0,
             "print_time": False,
             "ipopt.sb": "yes",
-            "ipopt.tol": tolerance,
+            # Of the cost, which shrinks with the period.
+            "ipopt.tol": tolerance * model.period,
             "ipopt.constr_viol_tol": tolerance,
             # IPOPT otherwise solves a problem whose bounds it has moved by 1e-8.
             "ipopt.bound_relax_factor": 0.0,

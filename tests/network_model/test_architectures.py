@@ -78,7 +78,7 @@ def test_the_optimum_is_that_of_ipopt(name: str, window: int) -> None:
         s, theta = somewhere(oracle, rng)
         ours = solver.solve(s, theta, rng.uniform(-1, 1, (12, M)))
         theirs = reference.solve(s, theta, ours.c)
-        assert ours.status is (Status.INFEASIBLE if ours.slack > 1e-7 else Status.CONVERGED)
+        assert ours.status is (Status.INFEASIBLE if ours.slack else Status.CONVERGED)
         assert theirs.status is Status.CONVERGED
         np.testing.assert_allclose(ours.v[0], theirs.v[0], atol=1e-6)
         active += bool(ours.slack) or bool(np.isin(ours.v, [MODEL.plant.u_min, MODEL.plant.u_max]).any())
@@ -258,8 +258,8 @@ def test_the_loop_learns(name: str) -> None:
     assert error.first_second is not None
     assert error.last_second is not None
     assert error.last_second < 0.05 * error.first_second
-    # Linear MPC overshoots by 0.0085.
-    assert summary.overshoot < 0.0085
+    # Linear MPC overshoots by 0.024.
+    assert summary.overshoot["z"] < 0.024
     assert summary.constraint_violations == 0
     assert summary.fallback_ticks == 0
     assert summary.weights_adopted >= 5

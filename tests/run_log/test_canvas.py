@@ -53,6 +53,46 @@ def test_a_picture_is_the_same_under_any_settings(tmp_path: Path) -> None:
     not_text = tmp_path / "bytes.rc"
     not_text.write_bytes(b"font.size: \xff\n")
     assert drawn(tmp_path / "bytes", MATPLOTLIBRC=str(not_text)) == plain
+    for name in ("here", "home"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "matplotlibrc").write_bytes(not_text.read_bytes())
+    assert drawn(tmp_path / "here") == plain
+    assert drawn(tmp_path / "elsewhere", MPLCONFIGDIR=str(tmp_path / "home")) == plain
+
+
+@pytest.mark.parametrize("command", [["experiment", "list"], ["report", "none.mcap"]])
+def test_settings_that_are_no_text_end_no_command(tmp_path: Path, command: list[str]) -> None:
+    (tmp_path / "matplotlibrc").write_bytes(b"font.size: \xff\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "tandem", *command],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr
+    assert (done.returncode == 0) == (command[0] == "experiment")
+
+
+def test_the_current_folder_and_the_environment_are_as_before(tmp_path: Path) -> None:
+    (tmp_path / "matplotlibrc").write_text("font.size: 31\n")
+    code = (
+        "import os\nfrom run_log.reporting.canvas import load_matplotlib\nload_matplotlib()\n"
+        "import matplotlib\nassert matplotlib.rcParams['font.size'] == 10.0\n"
+        "print(os.getcwd(), os.environ.get('MATPLOTLIBRC'), os.environ['MPLBACKEND'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "MPLBACKEND": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert done.stdout.split() == [str(tmp_path.resolve()), "None", "nonsense"]
 
 
 def test_settings_of_the_program_around_are_as_before() -> None:

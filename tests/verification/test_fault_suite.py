@@ -38,7 +38,7 @@ from verification.faults.suite import Outcome, Results
 CALM = Facts(
     violations=0,
     deepest=0.0,
-    cost=24.0,
+    J=24.0,
     samples=200,
     ticks=200,
     late=0,
@@ -116,7 +116,7 @@ def seen(**changes: Any) -> Facts:
         (holds.view_said, {}),
         (holds.log_time, {"log_time_off": 3600.0}),
         (holds.as_fast, {"tick_p99_ms": 10.0}),
-        (holds.as_good, {"cost": 25.3}),
+        (holds.as_good, {"J": 25.3}),
     ],
 )
 def test_every_check_can_fail(check: holds.Held, bad: dict[str, Any]) -> None:

@@ -13,15 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from controller_node.certified_sets import CertifiedSets
+from controller_node.certified_sets import CertifiedSets, Found
 from lbmpc.sets.certificate import CertificateError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
 from verification.fuzz import __main__ as fuzz
 from verification.fuzz import mutate
+from verification.fuzz.certified import small_sets
 from verification.fuzz.seeds import seeds
-from verification.fuzz.targets import Target
+from verification.fuzz.targets import Target, targets
 from verification.fuzz.work import Report, merge
 
 WEIGHTS = topics.HIDDEN_WEIGHTS
@@ -45,6 +46,49 @@ def test_twenty_thousand_bad_payloads(tmp_path: Path) -> None:
         assert kinds["accepted"] > 0
         assert kinds["malformed"] > 10
     assert fuzz.growth(report) < fuzz.GROWTH_KB
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("certified sets, forged", 150),
+        ("a control step with certified sets", 300),
+        ("configuration of a log, its controller", 25),
+    ],
+)
+def test_what_somebody_made_up_is_refused_or_borne(readers: dict[str, Target], name: str, count: int) -> None:
+    reader = readers[name]
+    kinds = {reader.read(reader.make()) for _ in range(count)}
+    assert len(kinds) > 1
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+    return {target.name: target for target in targets(11, tmp_path_factory.mktemp("fuzz"))}
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "says"),
+    [
+        ("A", [[1.0], [1.0, 2.0]], "the model's A: its rows have different lengths"),
+        ("B", [], r"the model's B has shape \(0,\)"),
+        ("X", ([1.0], [2.0]), r"the model's X has shape \(2, 1\), not \(2, 4\)"),
+        ("g", [1.0], "G has shape"),
+        ("u_upper", [5.0], "not in order, or outside of U"),
+        ("u_upper", [-0.9], "not in order, or outside of U"),
+        ("u_lower", [-5.0], "not in order, or outside of U"),
+    ],
+)
+def test_forged_sets_are_refused_by_what_is_wrong(part: str, value: Any, says: str) -> None:
+    sets = small_sets()
+    if part in sets.model.__struct_fields__:
+        sets = msgspec.structs.replace(sets, model=msgspec.structs.replace(sets.model, **{part: value}))
+    else:
+        sets = msgspec.structs.replace(
+            sets, pieces=[msgspec.structs.replace(sets.pieces[0], **{part: value})]
+        )
+    with pytest.raises(CertificateError, match=says):
+        CertifiedSets.from_bytes(CertifiedSets.of(sets, Found(0.5, 0.1, True, 1.0)).to_bytes())
 
 
 def test_what_a_reader_does_not_declare_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

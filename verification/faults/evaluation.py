@@ -20,7 +20,8 @@ from protocol import topics
 from run_log.errors import LogError
 from run_log.reading.reader import Run, read_run
 from run_log.replaying.replay import replay
-from run_log.reporting.summary import TOLERANCE
+from run_log.reporting.motion import motion
+from run_log.reporting.performance import outside, performance
 from tandem.live.monitor import Monitor
 from tandem.live.view import render
 from verification.faults.facts import Facts, Replayed
@@ -37,7 +38,7 @@ SETTLE_S = 0.25
 
 
 def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
-    """The figures of a run that has ended; its first `seconds` count for the cost."""
+    """The figures of a run that has ended; its first `seconds` count for J."""
     config, plant, witness = rig.config, get_plant(rig.config.plant.model), Witness(rig)
     traced = read(rig.trace)
     sampled = [one for one in traced if isinstance(one, Sampled) and one.state.t < rig.ended_at]
@@ -46,14 +47,11 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         raise RigError("the plant never moved")
     fault_at = rig.events[0].at if rig.events else math.inf
     after = [one for one in moving if one.state.t > fault_at]
-    # What a late command cost before the fault, the fault has not done.
+    # What a late command did before the fault, the fault has not done.
     judged = after or moving
-    x = np.array([one.state.x for one in judged])
-    applied = np.array([one.state.applied or [np.nan] * plant.m for one in judged])
-    outside = (x < plant.x_min - TOLERANCE) | (x > plant.x_max + TOLERANCE)
-    beyond = (applied < plant.u_min - TOLERANCE) | (applied > plant.u_max + TOLERANCE)
-    every = np.array([one.state.x for one in moving])
-    deviation = (every - plant.x_e)[:, list(plant.performance)][: round(seconds * config.rate)]
+    known = motion([[one.state for one in judged]], plant, config.period)
+    every = motion([[one.state for one in moving]], plant, config.period)
+    counted = every.part(0, min(round(seconds * config.rate), len(every.step) - 1))
 
     back_at = _back_at(rig, fault_at)
     control_at = _control_at(moving, fault_at, back_at)
@@ -64,10 +62,10 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     made, held = _samples(witness)
     log, replayed = _log(rig)
     return Facts(
-        violations=int((outside.any(axis=1) | beyond.any(axis=1)).sum()),
-        deepest=_deepest(x, applied, plant),
-        cost=float((deviation**2).sum()),
-        samples=len(deviation),
+        violations=int(outside(known, plant).sum()),
+        deepest=_deepest(known.x, known.applied, plant),
+        J=performance(counted, plant, config, truth=plant).J,
+        samples=len(counted.step) - 1,
         ticks=len(results),
         late=late,
         late_by_machine=by_machine,

@@ -20,11 +20,12 @@ class Facts(msgspec.Struct, kw_only=True):
     """One run in figures. Seconds throughout; None where there is nothing of the kind."""
 
     violations: int
-    """Samples of the true plant outside X, or inputs outside U, by more than 1e-6, from the fault on."""
+    """Samples of the true plant outside X, or inputs outside U, by more than 1e-6 of a half-width, from the
+    fault on."""
     deepest: float
     """How far outside at most, as a share of the half-width of X or U, from the fault on."""
-    cost: float
-    """Sum of squared deviations of the performance states over the run's first `samples`."""
+    J: float
+    """Sum of the stage costs, weights per second, over the run's first `samples`."""
     samples: int
     ticks: int
     late: int

@@ -200,6 +200,6 @@ def as_fast(run: Facts, calm: Facts) -> str | None:
 
 def as_good(run: Facts, calm: Facts) -> str | None:
     """The closed loop costs at most 5 % more."""
-    if run.cost > (1.0 + COST_SHARE) * calm.cost:
-        return f"cost {run.cost:.2f}, {calm.cost:.2f} without"
+    if run.J > (1.0 + COST_SHARE) * calm.J:
+        return f"J {run.J:.3g}, {calm.J:.3g} without"
     return None

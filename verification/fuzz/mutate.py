@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 import struct
 from collections.abc import Callable, Sequence
@@ -196,3 +197,45 @@ class Mutator:
         if rng.random() < 0.2:
             payload = self._mutations[int(rng.random() * len(self._mutations))](payload, self._others, rng)
         return payload
+
+
+STRANGE: tuple[Any, ...] = (
+    *(0, -1, 1, 0.5, -0.0, 1e-300, 5e-324, 1e-9, 1e9, 1e150, 1e308, -1e308, 2**62, 2**70),
+    *(True, None, "", "x", "../x", "/dev/null", "\u001b[2J", [], [[]], [0.0], [[0.0]], {}, "x" * 5000),
+)
+"""Anything that JSON holds, where something else is expected."""
+NUMBERS_IN_STRANGE = 14
+
+
+class Reteller:
+    """Endless JSON, well-formed, in which a few values are others."""
+
+    def __init__(self, text: bytes, seed: int):
+        self._text, self._rng = text, random.Random(seed)
+
+    def __call__(self) -> bytes:
+        tree = msgspec.json.decode(self._text)
+        for _ in range(self._rng.choice((0, 1, 1, 2, 5))):
+            self._change(tree)
+        return msgspec.json.encode(tree)
+
+    def _change(self, node: Any) -> None:
+        rng = self._rng
+        while node:
+            key = rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
+            inner = node[key]
+            if not isinstance(inner, (dict, list)) or not inner or rng.random() < 0.1:
+                break
+            node = inner
+        else:
+            return
+        change = rng.random()
+        if isinstance(node, list) and change < 0.2:
+            del node[key]
+        elif isinstance(node, list) and change < 0.3:
+            node.append(copy.deepcopy(inner))
+        elif isinstance(inner, float) and change < 0.5:
+            node[key] = inner * rng.choice((-1.0, 0.0, 0.9, 1.1, 1e6))
+        else:
+            like = isinstance(inner, (int, float)) and rng.random() < 0.8
+            node[key] = copy.deepcopy(rng.choice(STRANGE[:NUMBERS_IN_STRANGE] if like else STRANGE))

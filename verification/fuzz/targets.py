@@ -12,11 +12,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from controller_node.build import build_model
 from controller_node.certified_sets import CertifiedSets, Found
 from controller_node.codegen.compiler import SEAL, is_sealed, sealed
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
-from lbmpc.sets.certificate import CertificateError
+from lbmpc.sets.certificate import CertificateError, encode
 from network_model.description import NetworkDescription
 from node_runtime.bus.batches import unbatch
 from node_runtime.bus.mailbox import Delivery
@@ -30,8 +31,8 @@ from protocol.topics import Topic
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.writing.writer import LogWriter
-from verification.fuzz import mutate
-from verification.fuzz.mutate import Mutator
+from verification.fuzz import certified, mutate
+from verification.fuzz.mutate import Mutator, Reteller
 from verification.fuzz.seeds import ANSWERS, config, seeds
 
 SHARE_OF_SLOW = 0.01
@@ -50,7 +51,7 @@ class Target:
 
     name: str
     read: Read
-    make: Mutator
+    make: Callable[[], bytes]
     weight: float
     """Of the payloads, as a share relative to the others'."""
 
@@ -88,6 +89,13 @@ def targets(seed: int, folder: Path) -> list[Target]:
     sets = _sets()
     add("certified sets", _certifying, [sets, gzip.compress(sets, mtime=0)], 0.1)
     add("compiled code", _loading, [sealed(b"\x7fELF" + bytes(range(256)), LIBRARY)], 0.2)
+    small = certified.small_sets()
+    retold = Reteller(encode(small), seed * 1000 + len(found))
+    found.append(Target("certified sets, forged", certified.forged(small), retold, SHARE_OF_SLOW))
+    states = certified.States(small, seed * 1000 + len(found))
+    found.append(Target("a control step with certified sets", certified.asked(small), states, 0.05))
+    retold = Reteller(to_json(settings).encode(), seed * 1000 + len(found))
+    found.append(Target("configuration of a log, its controller", _building, retold, 0.2 * SHARE_OF_SLOW))
     log = _log(settings, payloads, folder)
     add("log file", _logging(folder / f"fuzzed-{seed}.mcap"), [log], SHARE_OF_SLOW)
     return found
@@ -197,6 +205,19 @@ def _configuring(payload: bytes) -> str:
 def _reconfiguring(payload: bytes) -> str:
     try:
         from_json(payload.decode(errors="replace"))
+    except ConfigError:
+        return "refused"
+    return "accepted"
+
+
+def _building(payload: bytes) -> str:
+    """As far as a replay goes: the controller of a recorded configuration, where that is a small one."""
+    try:
+        said = from_json(payload.decode(errors="replace"))
+        build_model(said)
+        if said.controller.horizon > 20 or said.controller.solver.compile != "never":
+            return "accepted"
+        ControllerCore(said, "controller-1")
     except ConfigError:
         return "refused"
     return "accepted"

@@ -79,12 +79,28 @@ class Polytope:
                 f"{-gap[worst]:.3g}. A smaller W, another K or a shorter period would help."
             )
 
-    def interior_point(self) -> np.ndarray | None:
-        """Some point of the set, or None when it is empty."""
-        solution = linprog(np.zeros(self.dimension), *self.one_sided(), bounds=(None, None), method="highs")
-        return solution.x if solution.status == 0 else None
+    def interior_point(self, scale: np.ndarray | float = 1.0) -> np.ndarray | None:
+        """Some point of the set, or None when it is empty; `scale` (n,): what counts as 1 in each variable."""
+        G, g = in_shares(*self.one_sided(), scale)
+        solution = linprog(np.zeros(self.dimension), G, g, bounds=(None, None), method="highs")
+        return solution.x * scale if solution.status == 0 else None
 
     def one_sided(self) -> tuple[np.ndarray, np.ndarray]:
         """The same set as G x <= g, finite rows only."""
         high, low = np.isfinite(self.upper), np.isfinite(self.lower)
         return np.vstack([self.F[high], -self.F[low]]), np.concatenate([self.upper[high], -self.lower[low]])
+
+
+def row_ranges(F: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+    """|F| scale, (rows,): how far each row reaches where every variable reaches its `scale`, (n,); 1 for a row of zeros."""
+    ranges = np.abs(F * scale).sum(axis=1)
+    return np.where(ranges > 0.0, ranges, 1.0)
+
+
+def in_shares(G: np.ndarray, g: np.ndarray, scale: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """G x <= g in units of `scale`, (n,), each row as a share of its range.
+
+    The tolerances of a linear program are absolute: in other units the same rows would be kept more or less well.
+    """
+    ranges = row_ranges(G, scale)
+    return G * scale / ranges[:, None], g / ranges

@@ -86,7 +86,7 @@ def _along(
 def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: str) -> Body:
     """The states of the bound's cell, inside X, from which an input of the cell leads into the target."""
     region = bound.region
-    X = body_of(state_set(model), "X")
+    X = body_of(state_set(model), "X", model.plant.x_scale)
     inputs = Polytope.box(region.u_lower, region.u_upper, model.plant.inputs)
     plant = UncertainSystem(model.A + bound.slope_x, model.B + bound.slope_u, bound, inputs)
     G, g = predecessor(target, plant, SPARE, X.scale)

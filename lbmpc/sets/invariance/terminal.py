@@ -10,7 +10,7 @@ import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.sets.geometry.linear_program import linprog
-from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
+from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, in_shares, row_ranges
 
 
 def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps: int = 200) -> Polytope:
@@ -26,7 +26,8 @@ def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps:
     if not len(rows):
         # Nothing is bounded: the whole space.
         return Polytope(rows, bounds, bounds, ())
-    names = _names(X) + _names(U)
+    names, scale = _names(X) + _names(U), model.plant.x_scale
+    ranges = row_ranges(rows, scale)
     closed = model.closed_loop
     kept_rows, kept_bounds = rows.copy(), bounds.copy()
     power, margin = rows.copy(), np.zeros(len(rows))
@@ -34,14 +35,15 @@ def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps:
         margin = margin + [W.support(row) for row in power]
         power = power @ closed
         bound = bounds - margin
-        worst = int(np.argmin(bound))
+        worst = int(np.argmin(bound / ranges))
         if bound[worst] < 0:
             raise EmptySetError(
                 f"no robust positively invariant set of A + BK exists: after {k} steps the disturbance alone moves "
                 f"{names[worst]} past its bound by {-bound[worst]:.3g}. "
                 "A smaller W, another K or a shorter period would help."
             )
-        new = [i for i in range(len(power)) if not _redundant(power[i], bound[i], kept_rows, kept_bounds)]
+        known, candidates = in_shares(kept_rows, kept_bounds, scale), in_shares(power, bound, scale)
+        new = [i for i, row in enumerate(zip(*candidates, strict=True)) if not _redundant(*row, *known)]
         if not new:
             infinite = np.full(len(kept_rows), -np.inf)
             return Polytope(

@@ -111,7 +111,7 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
         "case",
         "runs",
         "keep X and U at samples",
-        "excess between (%)",
+        "excess, also between samples (%)",
         *(["J in the first"] if several else []),
         *(["its regret (%)"] if several and regret else []),
         "J in the later" if several else "J",
@@ -150,8 +150,8 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
             ]
         )
     of_several = (
-        "Of several episodes, all that does not say first is of the later ones: J and deviation are their mean, overshoot "
-        "and settling the worst of them; constraints and ticks are those of all. "
+        "Of several episodes, all that does not say first is of the later ones: J and deviation are their mean, "
+        "overshoot and settling the worst of them; constraints and ticks are those of all. "
     )
     note = (
         "Medians over the runs, where it does not say worst; the excess is the worst run's. Excess: the largest "

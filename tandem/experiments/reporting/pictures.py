@@ -15,6 +15,9 @@ from tandem.experiments.reporting.style import Picture, figure, legend_above, lo
 from tandem.experiments.study.declaration import Picture as Kind
 from tandem.experiments.study.results import CaseResult
 
+WIDE = 50.0
+"""Percent of regret from which on the axis is logarithmic, but for its first percent on either side of 0."""
+
 
 def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | None) -> list[Picture]:
     """The pictures of one group."""
@@ -75,6 +78,9 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
     elif regret:
         # What is left of it is better than the true h.
         ax.axvline(0.0, color=GREY, linewidth=0.9, zorder=0)
+        if high > WIDE:
+            ax.set_xscale("symlog", linthresh=1.0)
+            ax.xaxis.set_major_formatter("{x:g}")
     ax.set_yticks(range(len(results)), [_wrapped(result.label) for result in results])
     ax.set_ylim(len(results) - 0.5, -0.5)
     what = "regret" if regret else "J"
@@ -93,8 +99,8 @@ def _wrapped(label: str) -> str:
 
 def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
     """Each initial state where it lies: kept, kept for some seeds, or not."""
-    others = (i for i in range(plant.d) if i not in plant.performance)
-    first, second = (*plant.performance, *others, None)[:2]
+    first, *more = [*plant.performance, *(i for i in range(plant.d) if i not in plant.performance)]
+    second = more[0] if more else None
     columns = 2
     made, axes = figure(rows=-(-len(results) // columns), columns=columns, height=2.3)
     for ax in axes[len(results) :]:

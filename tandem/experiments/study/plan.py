@@ -22,6 +22,9 @@ CODE = (
     "controller_node",
     "trainer_node",
     "plant_sim",
+    "run_log/reporting/motion.py",
+    "run_log/reporting/between_samples.py",
+    "run_log/reporting/performance.py",
     "tandem/experiments/simulation/lockstep.py",
 )
 

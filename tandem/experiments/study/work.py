@@ -39,9 +39,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """Why the true motion could not be followed to the end."""
     episodes: list[Performance]
     """Those that could be followed to their end."""
-    violations: int
-    """Samples outside X or U, in all that could be followed."""
-    excess_between_samples: float | None
+    performance: Performance
+    """Of all that could be followed."""
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
@@ -55,7 +54,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def kept(self) -> bool:
         """All constraints, at all samples, on the true plant."""
-        return self.lost is None and self.violations == 0
+        return self.lost is None and self.performance.constraint_violations == 0
 
 
 def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -> None:
@@ -82,8 +81,7 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
         job=job,
         lost=outcome.lost,
         episodes=summary.episodes[: outcome.episodes],
-        violations=summary.constraint_violations,
-        excess_between_samples=summary.excess_between_samples,
+        performance=Performance(**{name: getattr(summary, name) for name in Performance.__struct_fields__}),
         iteration_limit_ticks=summary.iteration_limit_ticks,
         soft_ticks=summary.soft_ticks,
         fallback_ticks=summary.fallback_ticks,

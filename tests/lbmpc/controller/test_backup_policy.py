@@ -83,9 +83,9 @@ def test_the_margin_is_kept_once_it_has_grown() -> None:
     ("flow", "margin", "least", "most"),
     [
         (0.15, 0.02, 0.02, 0.02),  # leads back with all of it
-        (0.15, 0.06, 0.02, 0.04),  # with all of it the flow falls to a half
-        (0.14, 0.02, 0.003, 0.01),
-        (0.13, 0.06, 0.0, 0.0),  # too late, but nearer
+        (0.15, 0.06, 0.01, 0.02),  # with all of it the flow falls to a third
+        (0.145, 0.02, 0.001, 0.003),
+        (0.135, 0.06, 0.0, 0.0),  # too late, but nearer
     ],
 )
 def test_as_much_of_the_margin_is_kept_as_leads_back(

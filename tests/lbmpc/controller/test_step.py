@@ -168,6 +168,25 @@ def test_a_number_that_is_no_measurement_is_no_state(absurd: float) -> None:
     assert result.mode == "solver"
 
 
+@pytest.mark.parametrize("absurd", [1.7e308, -1e160, 3e6])
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_number_that_is_no_input_is_none_that_acts(absurd: float, which: int) -> None:
+    """Finite, but where it would lead within the delay is not, and no command answers a state that is not finite."""
+    state = CONTROLLER.initial_state(0)
+    for i in range(3):
+        state, _ = CONTROLLER.step(state, late(X, i, 0.1, 0.004, 0.1))
+    good = late(X, 3, 0.1, 0.004, 0.1)
+    pieces = tuple(
+        (seconds, np.array([absurd]) if i == which else u) for i, (seconds, u) in enumerate(good.pieces)
+    )
+    after, result = CONTROLLER.step(state, replace(good, pieces=pieces))
+    assert np.isfinite(result.plan).all()
+    without, _ = CONTROLLER.step(state, replace(good, applied=None, pieces=()))
+    assert same_memory(after, without) is None
+    _, result = CONTROLLER.step(after, late(X_NEXT, 4, 0.1, 0.004, 0.1))
+    assert result.mode == "solver"
+
+
 def test_what_is_learned_from_a_wild_measurement_is_finite() -> None:
     state = CONTROLLER.initial_state(0)
     half = 0.5 * (MODEL.plant.x_max - MODEL.plant.x_min)

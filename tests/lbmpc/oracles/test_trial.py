@@ -226,13 +226,13 @@ def calm() -> Summary:
 )
 def test_the_plant_does_not_notice_a_stolen_trainer(forge: Forge, every: int, instead: bool) -> None:
     summary = summarise(follow_attacked(load(None, ["seed=0"]), STEPS, forge, every, instead))
-    assert summary.cost < 1.05 * calm().cost
+    assert summary.J < 1.05 * calm().J
     assert summary.constraint_violations == 0
     assert summary.fallback_ticks == 0
     if forge is crude:
         assert summary.weights_refused >= 180
         assert summary.weights_adopted == calm().weights_adopted
-        assert summary.cost == calm().cost
+        assert summary.J == calm().J
 
 
 def test_ordinary_training_is_neither_refused_nor_rolled_back() -> None:

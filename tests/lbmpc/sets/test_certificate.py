@@ -16,7 +16,7 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.problem import build_problem
 from lbmpc.sets import check as checker
-from lbmpc.sets.certificate import Certificate, CertificateError, Piece, decode, encode, require_match
+from lbmpc.sets.certificate import Certificate, CertificateError, Kind, Piece, decode, encode, require_match
 from lbmpc.sets.check import check
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.sets.construct import construct, points_in, volume_fraction
@@ -27,7 +27,7 @@ from lbmpc.sets.invariance.approach import one_period
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
-from tests.helpers.plants.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import PENDULUM, pendulum, two_inputs
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
@@ -407,3 +407,19 @@ def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() 
     )
     certificate = construct(build_model(fast, 0.1), "given", np.zeros(2), W=np.array([0.01, 0.01]))
     assert check(certificate).ok
+
+
+@pytest.mark.parametrize(
+    ("changes", "open_end"),
+    [
+        ({"x_min": np.array([-1.0, -np.inf]), "x_max": np.array([1.0, np.inf])}, "rate below, rate above"),
+        ({"x_max": np.array([1.0, np.inf])}, "rate above"),
+        ({"u_min": np.array([-np.inf])}, "torque below"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["box", "regions", "given"])
+def test_a_plant_without_bounds_is_told_which_it_needs(changes: dict, open_end: str, kind: Kind) -> None:
+    plant = replace(PENDULUM, scale={"rate": 2.0, "torque": 3.0}, **changes)
+    with pytest.raises(SetError, match=rf"not bounded: {open_end}\. .*Give the plant such bounds") as refused:
+        construct(build_model(plant, 0.1), kind, np.zeros(2))
+    assert "`scale` is no bound" in str(refused.value)

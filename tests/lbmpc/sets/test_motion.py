@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
 from lbmpc.plants.base import Truth
 from lbmpc.sets.motion import Motion
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
 

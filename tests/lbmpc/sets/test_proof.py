@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 from controller_node.certified_sets import SHIPPED, read_sets
 from lbmpc.model import Model, build_model
@@ -15,6 +14,7 @@ from lbmpc.sets.construct import construct
 from lbmpc.sets.enclosures.affine_forms import DisturbanceError
 from lbmpc.sets.enclosures.proof import prove
 from lbmpc.sets.invariance.approach import one_period
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 MODEL = pendulum()
 HALF = MODEL.plant.x_scale

@@ -149,7 +149,7 @@ def test_a_tube_needs_no_bounds(case: str, monkeypatch: pytest.MonkeyPatch) -> N
         *ON_TRACK,
         "controller.oracle=linear",
         "controller.tightening=tube",
-        "controller.W=[0.0005,0.0005]",
+        "controller.W=[0.01,0.01]",
     ]
     ran = simulate(override(Config(), tube), 20)
     assert {result.mode for result in ran.results} == {"solver"}

@@ -134,7 +134,7 @@ def test_ctrl_c_loses_nothing_and_says_how_to_go_on(
 def test_a_plant_without_sets_ends_with_3_and_says_what_would_help(
     cached: Path, capsys: pytest.CaptureFixture[str]
 ):
-    options = [*OPTIONS, "--set", "controller.W=[0.5,1.0]"]
+    options = [*OPTIONS, "--set", "controller.W=[5.0,10.0]"]
     assert main(["sets", "compute", *options, "--kind", "given", "--out", "none.json", "--json"]) == 3
     shown = capsys.readouterr()
     assert "would help" in json.loads(shown.out)["certificate"]
@@ -143,7 +143,7 @@ def test_a_plant_without_sets_ends_with_3_and_says_what_would_help(
 
 
 def test_a_given_w_that_the_plant_leaves_is_said(cached: Path, capsys: pytest.CaptureFixture[str]):
-    options = [*OPTIONS, "--set", "controller.W=[1e-5,1e-5]"]
+    options = [*OPTIONS, "--set", "controller.W=[1e-4,1e-4]"]
     assert main(["sets", "compute", *options, "--kind", "given", "--out", "given.json"]) == 0
     assert "Warning: the plant's own equations leave that W" in capsys.readouterr().out
     assert main(["sets", "check", "given.json", *OPTIONS]) == 3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +12,7 @@ from lbmpc.plants import PLANTS, Plant
 from node_runtime.config.sections import load
 from run_log.run import Run
 from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.rescaled import rescaled
 
 STEPS = 50
@@ -19,7 +20,7 @@ ORACLES = ("linear", "l2nw", "dnn", "perfect")
 COMPRESSOR = PLANTS["moore_greitzer"]
 TWO = (2.0**20, 2.0**-20, 2.0**7, 2.0**-11), (2.0**-17,)
 TEN = (1e6, 1e-6, 1e-3, 1e4), (1e5,)
-W = COMPRESSOR.W / 20.0
+W = COMPRESSOR.W
 Q, R = np.array([1.0, 2.0, 0.1, 0.01]), np.array([0.5])
 
 
@@ -81,3 +82,45 @@ def test_in_units_of_powers_of_ten_the_loop_is_the_same_up_to_rounding(oracle: s
     assert here.said == there.said
     for name in ("x", "u", "h_hat", "slack"):
         np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=0, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("oracle", ["linear", "dnn"])
+def test_a_state_that_gives_way_does_so_by_the_same_share_in_any_units(oracle: str) -> None:
+    """From where X cannot be kept: the penalty decides, and the row with the largest share is named."""
+    low = [0.1, 1.2, COMPRESSOR.x0[2], 0.0]
+    plant = replace(COMPRESSOR, x0=np.array(low))
+    here, there = run(plant, np.ones(4), np.ones(1), oracle, 20), run(plant, *map(np.array, TWO), oracle, 20)
+    assert here.slack.max() > 0.01
+    assert here.said == there.said
+    np.testing.assert_array_equal(there.slack, here.slack)
+    np.testing.assert_array_equal(there.u, here.u)
+
+
+def test_bounds_of_a_millionth_are_kept_as_well_as_bounds_of_one() -> None:
+    """A pendulum whose X is +-1e-6 wide and whose torque goes to 3e6, with the terminal set of its tube."""
+    pendulum = replace(PENDULUM, x0=np.array([0.25, -0.5]))
+    x, u = np.array([1e-6, 0.5e-6]), np.array([1e6])
+    runs = [
+        simulate_pendulum(pendulum, factors, inputs) for factors, inputs in ((np.ones(2), np.ones(1)), (x, u))
+    ]
+    assert runs[0].said == runs[1].said
+    assert {said[0] for said in runs[1].said} == {"converged"}
+    assert np.abs(runs[1].x).max() <= 1.0
+    np.testing.assert_allclose(runs[1].x, runs[0].x, rtol=0, atol=1e-7)
+
+
+def simulate_pendulum(plant: Plant, x: np.ndarray, u: np.ndarray) -> Loop:
+    settings = [
+        "plant.model=pendulum",
+        "rate=10",
+        "controller.oracle=linear",
+        "controller.horizon=15",
+        "controller.tightening=tube",
+        f"controller.W={(np.array([0.01, 0.1]) * x).tolist()}",
+        f"controller.Q={(1.0 / x**2).tolist()}",
+        f"controller.R={(0.1 / u**2).tolist()}",
+        "controller.solver.compile=never",
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PLANTS, "pendulum", rescaled(plant, x, u))
+        return loop(simulate(load(None, settings), 25))

@@ -261,7 +261,7 @@ def test_a_process_that_cannot_start_is_named_with_its_own_words(tmp_path: Path)
 
 
 def test_a_configuration_that_admits_no_controller_is_a_configuration_error(tmp_path: Path):
-    arguments = ("--oracle", "linear", "--set", "controller.W=[1.0, 1.0, 1.0, 50.0]")
+    arguments = ("--oracle", "linear", "--set", "controller.W=[20.0, 20.0, 20.0, 1000.0]")
     with launched(tmp_path, *arguments) as run:
         code, result = run.ends()
     assert code == 2, result
