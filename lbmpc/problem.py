@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.model import Model
+from lbmpc.model import Model, require_horizon
 from lbmpc.oracles.base import Oracle
 from lbmpc.sets.certificate import Certificate, CertificateError, require_match
 from lbmpc.sets.constraint_sets import disturbance_set, input_set, state_set
@@ -70,9 +70,11 @@ def build_problem(
       outside of the sets, as for `first_step`.
 
     Raises:
+        ModelError: the plant runs away within the horizon.
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
         CertificateError: `invariant` without a certificate, or with that of another model.
     """
+    require_horizon(model, horizon)
     guard = None
     if tightening == "invariant":
         if certificate is None:
