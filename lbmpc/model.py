@@ -280,7 +280,11 @@ def require_horizon(model: Model, horizon: int) -> None:
     if horizon * rate <= math.log(LARGEST_GROWTH):
         return
     most = int(math.log(LARGEST_GROWTH) / rate)
-    remedy = f"at most {most} steps ({most * model.period:.3g} s)" if most else "no horizon at this rate: sample faster"
+    remedy = (
+        f"at most {most} steps ({most * model.period:.3g} s)"
+        if most
+        else "no horizon at this rate: sample faster"
+    )
     raise ModelError(
         f"{model.plant.name} is unstable, and over a horizon of {horizon} steps ({horizon * model.period:.3g} s) what is "
         f"predicted grows by 10^{horizon * rate / math.log(10.0):.1f}; above 10^{math.log10(LARGEST_GROWTH):g} rounding "

@@ -93,7 +93,15 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
         nominal = a @ nominal + b @ minimiser[i]
         nominal_states.append(nominal)
         learned_states.append(z[:, i + 1] + step[:d])
-    blocks = {"vs": minimiser, "us": steered, "zs": nominal_states, "A": a_i, "B": b_i, "K": gains, "L": inverses}
+    blocks = {
+        "vs": minimiser,
+        "us": steered,
+        "zs": nominal_states,
+        "A": a_i,
+        "B": b_i,
+        "K": gains,
+        "L": inverses,
+    }
     if constrained == "learned":
         blocks |= {"zs": learned_states, "z": ca.horzsplit(z[:, 1:])}
     return ca.Function(

@@ -101,4 +101,6 @@ class ReferenceSolver:
         )
         stats = self._solver.stats()
         status = Status.CONVERGED if stats["success"] else Status.NUMERICAL
-        return Solution(status, v, c, np.empty((0, m)), zbar, float(result["f"]), int(stats["iter_count"]), slack, row)
+        return Solution(
+            status, v, c, np.empty((0, m)), zbar, float(result["f"]), int(stats["iter_count"]), slack, row
+        )
