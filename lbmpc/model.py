@@ -286,9 +286,9 @@ def require_horizon(model: Model, horizon: int) -> None:
         else "no horizon at this rate: sample faster"
     )
     raise ModelError(
-        f"{model.plant.name} is unstable, and over a horizon of {horizon} steps ({horizon * model.period:.3g} s) what is "
-        f"predicted grows by 10^{horizon * rate / math.log(10.0):.1f}; above 10^{math.log10(LARGEST_GROWTH):g} rounding "
-        f"decides. What makes sense: {remedy}"
+        f"{model.plant.name} is unstable: over a horizon of {horizon} steps ({horizon * model.period:.3g} s) what is "
+        f"predicted grows by 10^{horizon * rate / math.log(10.0):.1f}, and above "
+        f"10^{math.log10(LARGEST_GROWTH):g} rounding decides. What makes sense: {remedy}"
     )
 
 

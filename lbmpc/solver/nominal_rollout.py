@@ -14,8 +14,9 @@ from lbmpc.problem import Problem
 def build_nominal(problem: Problem) -> ca.Function:
     """(x, v, lower, upper) -> (zbar, c, values, outside, total) for x_t = x (d,) and inputs v (m, n).
 
-    zbar (d, n) are the nominal states zbar_1..n; c (m, n) is v_i - K zbar_i; values (rows,) those of the rows of `constraint_rows`; outside (rows,)
-    how far each is beyond its bounds, 0 where it keeps them; total the sum of all values, finite where all are.
+    zbar (d, n) are the nominal states zbar_1..n; c (m, n) is v_i - K zbar_i; values (rows,) those of the rows of
+    `constraint_rows`; outside (rows,) how far each is beyond its bounds, 0 where it keeps them; total the sum of all
+    values, finite where all are.
     """
     model, n = problem.model, problem.horizon
     a, b = ca.DM(model.A), ca.DM(model.B)

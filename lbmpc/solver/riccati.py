@@ -11,7 +11,9 @@ the nominal states move with w, by
 
     dv_i = du_i - K (dz_i - dzbar_i),   dzbar_{i+1} = A dzbar_i + B dv_i,
 
-so that v and zbar of any step keep the nominal model exactly, whatever the linearisation of z is worth. No Hessian is formed and nothing is factorised but m x m blocks.
+so that v and zbar of any step keep the nominal model exactly, whatever the linearisation of z is worth.
+
+No Hessian is formed and nothing is factorised but m x m blocks.
 
 The rows look at the nominal states zbar. A backup policy (`controller.backup_policy`) has them look at the learned
 states z instead, of which the recursion holds the linearisation anyway, and there u is v: `constrained`.
@@ -38,9 +40,9 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     """(x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
 
     Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
-    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs
-    (m, n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along the learned trajectory A (d, D n),
-    B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m,
+    n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along
+    the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
     With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
     d, m, behind = model.d, model.m, remembered(oracle)
@@ -116,7 +118,8 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
 def build_rows(model: Model, n: int, behind: int = 0, constrained: Constrained = "nominal") -> ca.Function:
     """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n), U' (m n, m n), transposed.
 
-    M: how v_0..n-1, then zbar_1..n, move with w; U: how u_0..n-1 do. `behind`: D - d. With `learned`, z_1..n instead of zbar_1..n.
+    M: how v_0..n-1, then zbar_1..n, move with w; U: how u_0..n-1 do. `behind`: D - d. With `learned`, z_1..n instead
+    of zbar_1..n.
     """
     return _propagation(model, n, behind, follow_state=False, constrained=constrained)
 

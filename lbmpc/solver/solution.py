@@ -28,8 +28,9 @@ class Solution:
     """Outcome of one solve, in deviation coordinates.
 
     v is (N, m), c (N, m) the same without K zbar_i, zbar (N, d) the nominal states zbar_1..zbar_N that it leads to, u
-    (N, m) the inputs of the learned trajectory, inside U: what to apply if nothing else comes. u_0 is v_0. `slack` is the largest state-row violation of zbar, as a
-    share of that row's half-width, 0 when all are kept, and `slack_row` names it ("y at step 3").
+    (N, m) the inputs of the learned trajectory, inside U: what to apply if nothing else comes. u_0 is v_0. `slack` is
+    the largest state-row violation of zbar, as a share of that row's half-width, 0 when all are kept, and `slack_row`
+    names it ("y at step 3").
     """
 
     status: Status
