@@ -25,7 +25,7 @@ run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
 simulate: $(READY)  ## the same in lock-step, faster than real time
 	$(BIN)/tandem simulate $(ARGS)
 
-paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html: about 20 minutes on two cores
+paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html
 	$(BIN)/tandem experiment paper --out paper $(ARGS)
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes

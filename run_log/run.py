@@ -136,3 +136,16 @@ def plant_of(run: Run) -> Plant:
         ) from error
     except PlantDefinitionError as error:
         raise LogError(f"{run.path}: {error}") from error
+
+
+def true_plant_of(run: Run) -> Plant:
+    """The plant as it really moved: `plant_of` with the parameters of `plant.truth`.
+
+    Raises:
+        LogError: as `plant_of`, or the plant has no such parameters.
+    """
+    plant, changes = plant_of(run), run.config.plant.truth
+    try:
+        return plant.varied(**changes) if changes else plant
+    except (LookupError, ArithmeticError) as error:
+        raise LogError(f"{run.path}: plant.truth: {error.args[0]}") from error

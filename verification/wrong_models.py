@@ -20,11 +20,8 @@ import tyro
 from rich.console import Console
 
 from lbmpc.plants import PLANTS, get_plant
-from node_runtime.config.plant import true_plant_of
 from node_runtime.config.sections import load
 from node_runtime.config.shipped import config_file
-from run_log.reporting.motion import trajectory
-from run_log.reporting.performance import Performance, performance
 from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.lockstep import follow
@@ -109,14 +106,13 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[str]) -> Row:
-    """One run, deterministic."""
-    PLANTS.update({one.name: one for one in (two_tanks.TWO_TANKS, quadrotor.QUADROTOR)})
+    """One run, deterministic; its plant is among `lbmpc.plants.PLANTS`."""
     wrong = WRONG[plant]
     seconds = f"controller.horizon_seconds={horizon * wrong.second}"
     config = load(config_file(wrong.config), [*wrong.settings, *ROWS[oracle], *more, seconds])
     outcome = follow(config, wrong.steps, episodes=episodes)
-    found, summary = by_episode(outcome.run), summarise(outcome.run)
-    costs = [one.J for one in found]
+    summary = summarise(outcome.run)
+    costs = [one.J for one in summary.episodes]
     if outcome.lost is not None:
         costs = [*costs[:-1], *[math.inf] * (episodes - len(costs) + 1)]
     return Row(
@@ -124,7 +120,7 @@ def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[s
         horizon=horizon,
         oracle=oracle,
         J=costs,
-        violations=sum(one.constraint_violations for one in found),
+        violations=summary.constraint_violations,
         iteration_limit=summary.iteration_limit_ticks,
         soft=summary.soft_ticks,
         fallback=summary.fallback_ticks,
@@ -133,15 +129,9 @@ def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[s
     )
 
 
-def by_episode(run: Run) -> list[Performance]:
-    """Figures of each time that the plant was started."""
-    plant, truth = get_plant(run.config.plant.model), true_plant_of(run.config, get_plant)
-    motion, found, first = trajectory(run, plant), [], 0
-    for _run_id, states in groupby(run.plant_states, key=lambda state: state.run_id):
-        after = first + len(list(states))
-        found.append(performance(motion.part(first, after - 1), plant, run.config, truth))
-        first = after
-    return found
+def _know_the_plants() -> None:
+    """In a process of the pool: plants of the tests are not shipped."""
+    PLANTS.update({one.name: one for one in (two_tanks.TWO_TANKS, quadrotor.QUADROTOR)})
 
 
 def _chatter(run: Run, last: int) -> float:
@@ -211,7 +201,7 @@ def main(
         json: rows as JSON instead of a table.
     """
     wanted = [(plant, horizon, oracle) for plant in plants for horizon in horizons for oracle in oracles]
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _know_the_plants) as pool:
         futures = [pool.submit(run_one, *one, episodes, list(set)) for one in wanted]
         rows = [future.result() for future in futures]
     if json:

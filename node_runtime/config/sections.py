@@ -31,6 +31,8 @@ Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 LONGEST_PERIOD = 1e6
+Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
+"""Two of them differ by so little that rounding leaves a covariance positive."""
 LONGEST_HORIZON = 1000
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
@@ -160,11 +162,11 @@ class TrialConfig(Section, frozen=True):
 class KalmanConfig(Section, frozen=True):
     """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
 
-    prior_variance: Positive = 0.02
+    prior_variance: Variance = 0.02
     """Of each entry of K, before the first sample."""
-    label_variance: Positive = 0.01
+    label_variance: Variance = 1e-3
     """Of each entry of a label: measuring noise, and what the features cannot explain."""
-    memory: Seconds = 10.0
+    memory: Seconds = 2.0
     """Seconds in which what is known fades towards the prior, by a factor of e."""
 
 

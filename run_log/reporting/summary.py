@@ -10,7 +10,7 @@ from protocol import messages as m
 from run_log.reading.gaps import lost_ticks
 from run_log.reporting.motion import trajectory
 from run_log.reporting.performance import Performance, of_episodes, performance
-from run_log.run import Run, plant_of
+from run_log.run import Run, plant_of, true_plant_of
 
 SOFT = 1e-9
 
@@ -66,13 +66,12 @@ class Summary(Performance, frozen=True, kw_only=True):
 
 def summarise(run: Run) -> Summary:
     """Raises `LogError`: the plant is unknown here, or the log holds none of its states."""
-    plant = plant_of(run)
+    plant, truth = plant_of(run), true_plant_of(run)
     controllers = set(run.controllers)
     ticks = [tick for tick in run.ticks if tick.run_id in controllers]
     results = [r for r in run.results if r.run_id in controllers]
     margins = [r.set_margin for r in results if r.set_margin is not None]
     timings = [timing for timing in run.timings if timing.run_id in controllers]
-    truth = plant.varied(**run.config.plant.truth) if run.config.plant.truth else plant
     episodes = [performance(one, plant, run.config, truth) for one in trajectory(run, plant).episodes()]
     return Summary(
         **msgspec.structs.asdict(of_episodes(episodes)),

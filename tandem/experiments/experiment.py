@@ -16,11 +16,13 @@ from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import STEPS, Declaration, config_of, resolve
 from tandem.experiments.study.plan import code_version, rows
-from tandem.experiments.study.runner import run_all, time_all, wanted
+from tandem.experiments.study.runner import file_name, run_all, time_all, wanted
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
-REPEATS = 5
+REPEATS = 3
+SHORT = 0.2
+"""Share of a timed run that --quick makes."""
 
 Progress = Callable[[str, int, int], None]
 """Told the stage, what is done and of how many."""
@@ -82,17 +84,21 @@ def run(
     timings = time_all(
         cases,
         lambda case: repeats if case.group in shown and not quick else 1,
-        (declared.steps or STEPS) * base.period,
+        (declared.steps or STEPS) * base.period * (SHORT if quick else 1.0),
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
     )
     found = results.collect(plans, records, timings, plant)
     code = code_version()
-    html = page(declared, found, plant, base, command, code, quick)
+    made = page(declared, found, plant, base, command, code, quick)
     every = [row for result in found for row in result.rows]
     told = results.summary(declared, every, plant, command, code, processes, quick)
     report, summary = out / "report.html", out / "summary.json"
-    write_whole(report, html.encode())
+    write_whole(report, made.html.encode())
+    drawn = out / "pictures"
+    drawn.mkdir(exist_ok=True)
+    for name, png in made.pictures.items():
+        write_whole(drawn / f"{file_name(name)}.png", png)
     write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
     return Finished(report, summary, sum(len(want.logs) for want in wants.values()), every)
 

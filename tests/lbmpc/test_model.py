@@ -121,8 +121,8 @@ def test_a_terminal_cost_that_bounds_nothing_is_refused_with_what_helps() -> Non
 
 
 def test_numbers_that_give_no_P_are_refused() -> None:
-    """A plant that grows by e^10 to e^15 a period: what the equations give is not even positive."""
-    for growth in (100.0, 150.0):
+    """A plant that grows by e^12 to e^15 a period: what the equations give is not even positive."""
+    for growth in (120.0, 150.0):
         steep = dataclasses.replace(
             PENDULUM,
             rhs=lambda x, u, a=growth: [a * x[0] + x[1], a * x[1] + u[0]],

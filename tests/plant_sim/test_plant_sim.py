@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from lbmpc.plants import Plant, PlantError, Truth, get_plant
 from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.sections import Config, override
 from node_runtime.router import open_router
 from plant_sim import node
 from plant_sim.simulator import PlantSim
@@ -64,6 +65,11 @@ def backup(
 
 def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
     return PlantSim(PLANT, period, x0, 1.5, "plant-a")
+
+
+def test_the_process_has_the_true_plant() -> None:
+    sim = node.build(override(Config(), ["plant.truth.slope=1.4"]), "plant-a")
+    assert sim.plant.parameters == {**PLANT.parameters, "slope": 1.4}
 
 
 # -- in virtual time -------------------------------------------------------------------------------------

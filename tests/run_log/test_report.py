@@ -22,6 +22,7 @@ from protocol import topics
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
+from run_log.reporting.motion import trajectory
 from run_log.reporting.report import picture, report
 from run_log.reporting.summary import summarise
 from run_log.reporting.traces import traces
@@ -106,6 +107,38 @@ def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, mes
     assert disturbed == plain
 
 
+def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: list[Logged]) -> None:
+    """Half of the run, then a plant of another name that is held for a while and goes the same way."""
+    middle = STEPS // 2
+    first = [one for one in messages if one[0] is not topics.PLANT_STATE or one[1].seq <= middle]
+    states = [message for topic, message, _ in messages if topic is topics.PLANT_STATE]
+    begin = states[0].t + 100.0
+    held = [msgspec.structs.replace(states[0], run_id="plant-2", seq=i, t=begin + 0.05 * i) for i in range(4)]
+    moving = [
+        msgspec.structs.replace(s, run_id="plant-2", seq=s.seq + 3, t=begin + 0.05 * (s.seq + 3))
+        for s in states[1 : middle + 1]
+    ]
+    tick = next(message for topic, message, _ in messages if topic is topics.TICK)
+    answered = [
+        (topics.TICK, msgspec.structs.replace(tick, seq=STEPS + s.seq, state=s), 2_000_000_000)
+        for s in held[-1:]
+    ]
+    later = [(topics.PLANT_STATE, s, 2_000_000_000) for s in (*held, *moving)]
+    run = gather(config, [*first, *later, *answered])
+    summary = summarise(run)
+    one, other = summary.episodes
+    assert one.J > 0.0
+    assert other == one
+    assert (summary.J, summary.constraint_violations) == (one.J, 2 * one.constraint_violations)
+    motion = trajectory(run, PLANT)
+    assert motion.starts == (0, middle + 1)
+    # The clock goes on; the hold at the second start is no motion.
+    assert motion.t[motion.starts[1]] == pytest.approx(100.0 + 3 * 0.05)
+    assert motion.x[motion.starts[1]] == pytest.approx(PLANT.x0)
+    line = plots.pictures(traces(run))["states"]().axes[0].lines[0]
+    assert np.isnan(line.get_ydata()).sum() == 1
+
+
 def test_summary_of_applied_input_and_settled_states(config: Config, messages: list[Logged]) -> None:
     at_rest = moved(messages, x=lambda s: PLANT.x_e.tolist(), applied=lambda s: [2.1547 + 5e-7])
     summary = summarise(gather(config, at_rest))
@@ -118,6 +151,14 @@ def test_summary_of_applied_input_and_settled_states(config: Config, messages: l
     assert summarise(gather(config, outside)).constraint_violations == 1
     late = moved(at_rest, x=lambda s: np.add(PLANT.x_e, [0, 0.021 * (s.seq == 17), 0, 0]).tolist())
     assert summarise(gather(config, late)).settled_by_state_s == {"z": 0.0, "y": 0.9}
+
+
+def test_a_true_plant_that_cannot_be_is_named_and_no_traceback(
+    config: Config, messages: list[Logged]
+) -> None:
+    run = gather(override(config, ["plant.truth.slop=1.4"]), messages)
+    with pytest.raises(LogError, match=r"plant\.truth: .* no parameter 'slop'; did you mean 'slope'"):
+        summarise(run)
 
 
 def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged]) -> None:

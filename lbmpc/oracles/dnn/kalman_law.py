@@ -109,6 +109,7 @@ def nearest_within(K: np.ndarray, Sigma: np.ndarray, bounds: np.ndarray) -> np.n
         Sigma: symmetric and positive definite, (f, f).
     """
     variances, axes = np.linalg.eigh(Sigma)
+    variances = np.maximum(variances, np.finfo(float).eps * variances[-1])
     nearest = K.copy()
     for i in np.flatnonzero(np.sqrt((K * K).sum(axis=0)) > bounds):
         turned, bound, multiplier = axes.T @ K[:, i], bounds[i], 0.0

@@ -92,7 +92,7 @@ class Polytope:
 
 
 def row_ranges(F: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
-    """|F| scale, (rows,): how far each row reaches where every variable reaches its `scale`, (n,); 1 for a row of zeros."""
+    """|F| scale, (rows,): each row's range where every variable goes to its `scale`, (n,); 1 for a row of zeros."""
     ranges = np.abs(F * scale).sum(axis=1)
     return np.where(ranges > 0.0, ranges, 1.0)
 

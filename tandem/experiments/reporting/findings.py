@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -149,15 +150,17 @@ def _kept(result: CaseResult) -> str:
 
 
 def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The figure of both for every seed and x0 where both have it; rows that draw nothing stand for all seeds."""
-    for_all_seeds = result.oracle != "dnn" and base.oracle == "dnn"
+    """The figure of both for every seed and x0 where both have it; a case that draws nothing stands for all seeds."""
+    same_seed = result.case.draws == base.case.draws
 
-    def by_start(one: CaseResult) -> list[tuple[tuple[float, ...], float]]:
-        starts = [tuple(row.x0) if for_all_seeds else (row.seed, *row.x0) for row in one.rows]
-        return list(zip(starts, one.values(name), strict=True))
+    def by_start(one: CaseResult) -> dict[tuple[float, ...], list[float]]:
+        found: dict[tuple[float, ...], list[float]] = {}
+        for row, value in zip(one.rows, one.values(name), strict=True):
+            found.setdefault((row.seed if same_seed else 0, *row.x0), []).append(value)
+        return found
 
-    own = dict(by_start(result))
-    pairs = [(own[start], value) for start, value in by_start(base) if start in own]
+    own, others = by_start(result), by_start(base)
+    pairs = [pair for start in own for pair in product(own[start], others.get(start, []))]
     both = np.reshape(pairs, (-1, 2))
     one, other = both[~np.isnan(both).any(axis=1)].T
     return one, other

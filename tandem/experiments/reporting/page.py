@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jinja2
@@ -17,7 +18,14 @@ from tandem.experiments.study.declaration import Declaration, Group
 from tandem.experiments.study.results import CaseResult, spread
 
 
+class Page(NamedTuple):
+    html: str
+    pictures: dict[str, bytes]
+    """PNG by name, of those that could be drawn."""
+
+
 class Drawn(NamedTuple):
+    png: bytes
     uri: str
     """Empty where it could not be drawn; the caption says why."""
     caption: str
@@ -39,6 +47,12 @@ class Part(NamedTuple):
     table: Table
     words: list[str]
 
+    def named_pictures(self) -> Iterator[tuple[str, bytes]]:
+        """(name, PNG): the group's name, with a number from the second one on."""
+        for number, drawn in enumerate(self.pictures, 1):
+            if drawn.png:
+                yield self.group.name + (f"-{number}" if number > 1 else ""), drawn.png
+
 
 def page(
     declared: Declaration,
@@ -48,8 +62,8 @@ def page(
     command: str,
     code: str,
     quick: bool,
-) -> str:
-    """The whole report as HTML.
+) -> Page:
+    """The whole report as HTML, and its pictures.
 
     Args:
         declared: the experiment.
@@ -67,7 +81,7 @@ def page(
             parts.append(_part(group, own, plant))
     loader = jinja2.PackageLoader("tandem.experiments.reporting", "")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.get_template("page.html.j2").render(
+    html = environment.get_template("page.html.j2").render(
         declared=declared,
         parts=parts,
         config=to_toml(base),
@@ -79,6 +93,7 @@ def page(
         quick=quick,
         squares=_squares(plant),
     )
+    return Page(html, {name: png for part in parts for name, png in part.named_pictures()})
 
 
 def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
@@ -86,11 +101,11 @@ def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
     try:
         with drawing(f"the picture of {group.name}"):
             drawn = [
-                Drawn(style.data_uri(one.figure), one.caption, one.alt)
+                Drawn(style.png(one.figure), style.data_uri(one.figure), one.caption, one.alt)
                 for one in pictures.draw(group.picture, results, plant, group.reference)
             ]
     except PictureError as error:
-        drawn = [Drawn("", str(error), "")]
+        drawn = [Drawn(b"", "", str(error), "")]
     return Part(
         group=group,
         claims=findings.claims(results) if group.picture == "trajectories" else [],

@@ -16,6 +16,8 @@ from tandem.experiments.study.results import CaseResult
 
 WIDTH = 5.4
 """Inches: narrow, so that letters can still be read on a phone."""
+DOTS = 150
+"""Per inch."""
 FONT: Any = {"font.size": 9, "axes.titlesize": 9.5, "svg.hashsalt": "tandem", "svg.fonttype": "path"}
 
 
@@ -82,6 +84,14 @@ def named(plant: Plant, index: int) -> str:
     """A state for an axis: its full name, and its unit where it has one."""
     unit = plant.units.get(plant.states[index], "")
     return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else unit})"
+
+
+def png(made: Figure) -> bytes:
+    """The figure for a document that takes no SVG."""
+    buffer = io.BytesIO()
+    with rc_context(FONT):
+        made.savefig(buffer, format="png", dpi=DOTS, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def data_uri(made: Figure) -> str:

@@ -43,7 +43,7 @@ class Runs(Section, frozen=True, kw_only=True):
 
     config: str | None = None
     """What to start from: a shipped configuration by its name, or a file."""
-    set: dict[str, Any] = {}
+    set: dict[str, Any] = msgspec.field(default_factory=dict)
     """Changes of the configuration, as a table like it: a case's over its group's, a group's over the experiment's."""
     seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count | None = None
     """Which, or how many from 0 on; 1 where nothing is said. A case that draws nothing has the first alone."""
@@ -73,7 +73,7 @@ class Case(Runs, frozen=True, kw_only=True):
     group: Name
     label: str = ""
     """What the report calls it; the name where there is none."""
-    vary: dict[str, list[Any]] = {}
+    vary: dict[str, list[Any]] = msgspec.field(default_factory=dict)
     """Makes a case of each combination: "section.key" -> values."""
     x0s: Name | None = None
     """Others than its group's."""
@@ -99,7 +99,7 @@ class Declaration(Runs, frozen=True, kw_only=True):
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
     title: str
     about: str = ""
-    x0s: dict[str, Starts] = {}
+    x0s: dict[str, Starts] = msgspec.field(default_factory=dict)
     quick: Quick = Quick()
     group: list[Group]
     case: list[Case]

@@ -57,7 +57,7 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
 
     for plan in plans:
         case = plan.case
-        name = f"{_file_name(case.name)}-seed{plan.job.config.seed}.mcap"
+        name = f"{file_name(case.name)}-seed{plan.job.config.seed}.mcap"
         want(plan.job, case.group in detailed, *([logs / name] if case.log and plan.x0 is None else []))
         want(plan.floor, False)
     return wants
@@ -134,7 +134,7 @@ def _effort(job: Job) -> float:
     return job.steps * job.episodes * job.config.controller.horizon * learning
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
     """Two names are two files, also where what a file's name had better not have is replaced."""
     clean = "".join(c if c.isascii() and (c.isalnum() or c in "-_=.") else "-" for c in name)[:LONGEST_NAME]
     return clean if clean == name else f"{clean}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
@@ -154,7 +154,9 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
     plant = PlantConfig(model=config.plant.model)
-    config = msgspec.structs.replace(config, seed=seed, plant=plant, controller=controller)
+    config = msgspec.structs.replace(
+        config, seed=seed, plant=plant, controller=controller, constant=Config().constant
+    )
     if config.controller.oracle == "dnn":
         trainer = msgspec.structs.replace(Config().trainer, enabled=True)
         config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)

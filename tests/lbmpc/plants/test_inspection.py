@@ -15,8 +15,11 @@ from lbmpc.plants.base import Domain
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from tests.helpers.plants.integrator import INTEGRATOR
-from tests.helpers.plants.pendulum import PENDULUM
+from tests.helpers.plants.pendulum import PENDULUM, inverted
 from tests.helpers.plants.pendulum import equations as pendulum_of
+from tests.helpers.plants.quadrotor import QUADROTOR
+from tests.helpers.plants.two_tanks import TWO_TANKS
+from tests.helpers.plants.unstable import unstable
 
 INF, NAN = float("inf"), float("nan")
 
@@ -170,7 +173,13 @@ def test_a_model_of_a_faulty_plant_is_refused_as_well() -> None:
         build_model(changed(u_min=[4.0]), 0.1)
 
 
-@pytest.mark.parametrize("plant", [MOORE_GREITZER, PENDULUM, INTEGRATOR, one_state()], ids=lambda p: p.name)
+SOUND = [
+    *(MOORE_GREITZER, PENDULUM, INTEGRATOR, TWO_TANKS, QUADROTOR, one_state()),
+    *(unstable(12.0), inverted(1.0), inverted(0.1)),
+]
+
+
+@pytest.mark.parametrize("plant", SOUND, ids=lambda p: p.name)
 def test_a_sound_plant_has_no_faults(plant: Plant) -> None:
     assert faults(plant) == ()
 

@@ -11,8 +11,8 @@ from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
 from lbmpc.sets.certificate import Certificate, Piece
 from lbmpc.sets.construct import construct
-from lbmpc.sets.enclosures.affine_forms import DisturbanceError
-from lbmpc.sets.enclosures.proof import prove
+from lbmpc.sets.enclosures.affine_forms import Disturbance, DisturbanceError
+from lbmpc.sets.enclosures.proof import _rows, prove
 from lbmpc.sets.invariance.approach import one_period
 from tests.helpers.plants.pendulum import pendulum, two_inputs
 
@@ -117,3 +117,25 @@ def test_where_the_plants_equations_do_not_hold_there_is_no_proof() -> None:
     except DisturbanceError as error:
         reason = str(error)
     assert "h is outside of W" in reason or "reaches where it is not defined" in reason
+
+
+def test_what_is_said_of_a_box_holds_at_its_points(family: Certificate) -> None:
+    """Over h less a steep slope, so that every part of the bound counts."""
+    rng, disturbance, move = np.random.default_rng(1), Disturbance(MODEL), one_period(MODEL)
+    rows = _rows(np.array(family.pieces[0].W), HALF)
+    assert rows is not None
+    slope = rng.normal(size=(2, 3))
+    c = rng.uniform([-0.9, -1.8, -2.7], [0.9, 1.8, 2.7], (20, 3))
+    r = rng.uniform(0.0, 0.1, (20, 3))
+    forms = disturbance.forms(c - r, c + r)
+    broken, slopes, room = rows.on(forms, slope)
+    assert (room <= -broken).all()
+    for i in range(20):
+        p = c[i] + r[i] * rng.uniform(-1, 1, (200, 3))
+        after = np.asarray(move(p[:, :2].T, p[:, 2:].T)).T
+        rest = after - p[:, :2] @ MODEL.A.T - p[:, 2:] @ MODEL.B.T - p @ slope.T
+        left = rows.b - rest @ rows.F.T
+        assert (left >= room[i] - 1e-9).all()
+        # By the mean-value theorem the steepest slope says how far two points can differ.
+        steepest = slopes[i].magnitude() @ r[i]
+        assert (np.ptp(left, axis=0) <= 2 * steepest + 1e-9).all()

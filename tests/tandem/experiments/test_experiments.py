@@ -27,6 +27,7 @@ from tandem.experiments import experiment
 from tandem.experiments.experiment import Finished
 from tandem.experiments.reporting import findings, pictures
 from tandem.experiments.reporting.page import _table
+from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Picture, Resolved, load, resolve
 from tandem.experiments.study.plan import Job, code_version, rows
@@ -139,7 +140,70 @@ def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
     plans = list(rows(list(found.values())))
     # linear draws nothing: one seed stands for both; so does the floor of every controller from one state.
     assert len(plans) == 2 + 2 + 2 * 2 + 2
-    assert len({plan.floor.key for plan in plans if plan.floor is not None}) == 3
+    assert len({plan.floor.key for plan in plans}) == 3
+
+
+def test_the_floor_of_a_plant_that_drifts_drifts_as_well(small: Path) -> None:
+    drift = Drift(to={"slope": 1.45}, at=1.0)
+    case = msgspec.structs.replace(cases(small)[0], faults=Faults(drift=drift))
+    (plan, *_) = rows([case])
+    assert plan.floor.config.controller.oracle == "perfect"
+    assert plan.floor.faults.drift == drift
+
+
+LEVELS = """
+name = "levels"
+title = "Who says it"
+config = "compressor-cheap"
+steps = 10
+episodes = 4
+set.adaptation = { gamma = 0.3, start = "zero" }
+[quick]
+episodes = 3
+[[group]]
+name = "a"
+title = "a"
+seeds = 3
+steps = 20
+set.adaptation.gamma = 0.4
+[[case]]
+name = "own"
+group = "a"
+config = "published"
+steps = 30
+episodes = 1
+vary."controller.oracle" = ["linear", "dnn"]
+[[case]]
+name = "others"
+group = "a"
+vary."controller.horizon" = [7]
+[[case]]
+name = "seconds"
+group = "a"
+config = "compressor"
+vary."plant.truth" = [{ slope = 1.4 }]
+vary."controller.horizon_seconds" = [2.0]
+"""
+
+
+def test_the_nearest_level_that_says_something_counts(tmp_path: Path) -> None:
+    path = tmp_path / "levels.toml"
+    path.write_text(LEVELS)
+    linear, network, others, seconds = cases(path)
+    assert (network.steps, network.episodes, network.seeds) == (30, 1, [0, 1, 2])
+    assert (network.config.rate, network.config.controller.terminal) == (100.0, "published")
+    assert (network.config.adaptation.gamma, network.config.adaptation.start) == (0.4, "zero")
+    assert (linear.seeds, linear.label, linear.family) == ([0], "linear MPC", "own")
+    assert (others.steps, others.episodes) == (20, 4)
+    # The configuration that it starts from has a horizon too, in seconds and in steps.
+    assert (others.config.controller.horizon, others.config.controller.R) == (7, [0.1])
+    assert seconds.config.controller.horizon == 40
+    assert seconds.config.plant.truth == {"slope": 1.4}
+    assert seconds.label == "slope = 1.4, horizon_seconds = 2.0"
+    assert [case.episodes for case in cases(path, quick=True)] == [1, 1, 3, 3]
+    path.write_text(LEVELS.replace('"published"', '"publisht"'))
+    with pytest.raises(ConfigError, match=r"case 'own': config: .*did you mean 'published'"):
+        cases(path)
 
 
 def test_a_key_changes_with_the_settings_and_with_nothing_else(small: Path) -> None:
@@ -298,7 +362,9 @@ def a_record(cost: float, overshoot: float = 0.0, violations: int = 0, **changes
         lemma=None,
     )
     changed = msgspec.structs.replace(record, **changes)
-    return changed if "episodes" in changes else msgspec.structs.replace(changed, episodes=[changed.performance])
+    return (
+        changed if "episodes" in changes else msgspec.structs.replace(changed, episodes=[changed.performance])
+    )
 
 
 def a_result(
@@ -308,7 +374,7 @@ def a_result(
     case = msgspec.structs.replace(NETWORK, name=name, label=name, seeds=list(range(len(costs))))
     plans = list(rows([case]))
     floor = a_record(20.0)
-    records: dict[str, Record] = {plan.floor.key: floor for plan in plans if plan.floor is not None}
+    records: dict[str, Record] = {plan.floor.key: floor for plan in plans}
     records |= {
         plan.job.key: a_record(cost, overshoot, violations, **changes)
         for plan, cost in zip(plans, costs, strict=True)
@@ -355,6 +421,53 @@ def test_regret_is_signed_and_a_page_says_where_the_true_h_is_beaten() -> None:
     assert findings.below_perfect([worse]) == []
 
 
+def test_figures_of_several_episodes_are_those_with_a_memory() -> None:
+    first, second, third = (a_record(J).performance for J in (30.0, 21.0, 23.0))
+    job = msgspec.structs.replace(a_record(20.0).job, episodes=3)
+    floor = [a_record(20.0).performance] * 3
+    (row,) = collected(job, [first, second, third], floor).rows
+    assert row.J_by_episode == [30.0, 21.0, 23.0]
+    assert row.regret_by_episode == pytest.approx([0.5, 0.05, 0.15])
+    assert (row.J, row.regret, row.deviation) == pytest.approx((22.0, 0.1, 0.8 * 22.0))
+    # Lost in the second episode: only the first one is known.
+    (row,) = collected(job, [first], floor, lost="at step 3 of 200 in episode 2 of 3").rows
+    assert row.J_by_episode == [30.0, None, None]
+    assert (row.J, row.regret, row.J_first) == (None, None, 30.0)
+
+
+def collected(
+    job: Job, episodes: list[Performance], floor: list[Performance], lost: str | None = None
+) -> results.CaseResult:
+    (plan,) = rows([msgspec.structs.replace(NETWORK, episodes=job.episodes, seeds=[0])])
+    records = {
+        plan.floor.key: a_record(20.0, job=job, episodes=floor),
+        plan.job.key: a_record(20.0, job=job, episodes=episodes, lost=lost),
+    }
+    return results.collect([plan], records, {}, PLANT)[0]
+
+
+def test_the_picture_of_episodes_has_a_line_for_each_oracle_and_a_panel_for_all_else() -> None:
+    job = msgspec.structs.replace(a_record(20.0).job, episodes=3)
+    learns = collected(
+        job, [a_record(J).performance for J in (30.0, 21.0, 19.9)], [a_record(20.0).performance] * 3
+    )
+    wrong = [
+        learns._replace(case=msgspec.structs.replace(learns.case, words={"plant.truth": f"slope = {slope}"}))
+        for slope in (1.4, 1.6)
+    ]
+    (picture,) = pictures.draw("episodes", wrong, PLANT, None)
+    assert [ax.get_title() for ax in picture.figure.axes if ax.get_visible()] == [
+        "slope = 1.4",
+        "slope = 1.6",
+    ]
+    line = picture.figure.axes[0].lines[0]
+    assert list(line.get_xdata()) == [1, 2, 3]
+    assert list(line.get_ydata()) == pytest.approx([50.0, 5.0, -0.5])
+    low, high = picture.figure.axes[0].get_ylim()
+    assert low < -0.5
+    assert high > 50.0
+
+
 def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
     settled = a_result("fine", [20.0, 21.0], overshoot=0.1)
     assert settled.median("overshoot") == pytest.approx(0.1)
@@ -378,7 +491,7 @@ def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
 
 
 @pytest.mark.parametrize("states", [1, 2])
-@pytest.mark.parametrize("kind", ["trajectories", "states", "survival", "recovery", "rows"])
+@pytest.mark.parametrize("kind", ["trajectories", "states", "survival", "recovery", "rows", "episodes"])
 def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, states: int) -> None:
     plant = dataclasses.replace(
         PENDULUM,
@@ -386,15 +499,13 @@ def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, sta
         names={"angle": "angle of the arm"},
     )
     traces = Traces(x=[[0.5], [0.2], [0.0]], u=[[1.0], [0.0]], error=[None, 0.1])
-    case = msgspec.structs.replace(
-        NETWORK, x0s=[[0.5, 0.0][:states]], seeds=[0]
-    )
+    case = msgspec.structs.replace(NETWORK, x0s=[[0.5, 0.0][:states]], seeds=[0])
     plans = list(rows([case]))
     performance = msgspec.structs.replace(
         a_record(1.0).performance, overshoot={"angle": 0.1}, settled_by_state_s={"angle": 5.0}
     )
     record = a_record(1.0, performance=performance, traces=traces)
-    records = {job.key: record for plan in plans for job in (plan.job, plan.floor) if job is not None}
+    records = {job.key: record for plan in plans for job in (plan.job, plan.floor)}
     found = results.collect(plans, records, {}, plant)
     drawn = pictures.draw(kind, found, plant, None)
     assert drawn

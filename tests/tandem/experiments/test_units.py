@@ -37,7 +37,7 @@ class Loop:
 
 
 def run(plant: Plant, x: np.ndarray, u: np.ndarray, oracle: str, steps: int = STEPS) -> Loop:
-    """The plant with its states times x, its inputs times u, and with it everything that a configuration has in units."""
+    """The plant with its states times x and its inputs times u, and the configuration's W, Q and R with it."""
     settings = [
         f"controller.oracle={oracle}",
         f"controller.W={(W * x).tolist()}",
