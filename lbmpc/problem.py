@@ -8,7 +8,7 @@
 
 in deviation coordinates. With the paper's c_i = v_i - K zbar_i each trajectory is steered by its own state, v_i =
 K zbar_i + c_i and u_i = K z_i + c_i: what h_hat moves z away from zbar by grows with A + BK, not with A, and zbar need
-not follow what h_hat asks of z (docs/decisions/0032). u_0 is v_0. Deciding in v and in c is the same, and v is far
+not follow what h_hat asks of z (docs/decisions/0033). u_0 is v_0. Deciding in v and in c is the same, and v is far
 better conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices.
 """
 
