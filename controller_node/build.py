@@ -11,7 +11,7 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
-from lbmpc.model import Model, ModelError
+from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import Realise
@@ -151,12 +151,14 @@ def describe_trial(config: Config) -> Trial | None:
 
 
 def build_model(config: Config) -> Model:
-    """The nominal model of the configuration's plant at its rate. Raises `ConfigError`."""
+    """The nominal model of the configuration's plant at its rate. Raises `ConfigError`, for its horizon too."""
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        return nominal_model(build_plant(config), config.period, Q, R, settings.terminal)
+        model = nominal_model(build_plant(config), config.period, Q, R, settings.terminal)
+        require_horizon(model, settings.horizon)
+        return model
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
 
@@ -238,9 +240,9 @@ def _warm_up(controller: Controller, solver: TimedSolver, seed: int) -> None:
     edge = x.copy()
     edge[:d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
     for start in (x, edge):
-        solver.solve(start, theta, state.plan.v)
+        solver.solve(start, theta, state.plan.c)
         if controller.real_time:
-            solver.prepare(start, theta, state.plan.v)
+            solver.prepare(start, theta, state.plan.c)
             solver.feedback(start)
 
 

@@ -71,7 +71,7 @@ class ControllerCore:
         """Build now what `backup` would build when it is first called."""
         state = self.controller.initial_state(self.config.seed)
         theta = self.controller.oracle.theta(state.oracle)
-        self._planner().policy(state.predicted, theta, state.plan.v)
+        self._planner().policy(state.predicted, theta, state.plan.u)
 
     def _planner(self) -> BackupPlanner:
         if self._backup is None:

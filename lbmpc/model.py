@@ -28,6 +28,9 @@ Pieces = tuple[tuple[float, np.ndarray], ...]
 SERIES_NORM = 0.5
 TERMS = 19
 
+LARGEST_GROWTH = 1e8
+"""Of a prediction over the horizon: of 16 digits half are left."""
+
 
 class ModelError(ValueError):
     """The plant's equations and the chosen period give no usable model."""
@@ -266,6 +269,27 @@ def _terminal_weight(
             f"{missing:.2g} of P; {remedy}"
         )
     return p
+
+
+def require_horizon(model: Model, horizon: int) -> None:
+    """Raises `ModelError` where the plant runs away so fast that a prediction of so many steps has no digits left.
+
+    The largest |eigenvalue| of A to the power of the horizon may be `LARGEST_GROWTH` at most.
+    """
+    rate = math.log(max(float(np.abs(np.linalg.eigvals(model.A)).max()), 1.0))
+    if horizon * rate <= math.log(LARGEST_GROWTH):
+        return
+    most = int(math.log(LARGEST_GROWTH) / rate)
+    remedy = (
+        f"at most {most} steps ({most * model.period:.3g} s)"
+        if most
+        else "no horizon at this rate: sample faster"
+    )
+    raise ModelError(
+        f"{model.plant.name} is unstable: over a horizon of {horizon} steps ({horizon * model.period:.3g} s) what is "
+        f"predicted grows by 10^{horizon * rate / math.log(10.0):.1f}, and above "
+        f"10^{math.log10(LARGEST_GROWTH):g} rounding decides. What makes sense: {remedy}"
+    )
 
 
 def _weights(name: str, given: np.ndarray | None, length: int) -> np.ndarray:

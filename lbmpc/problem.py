@@ -1,12 +1,15 @@
 """The optimisation problem of learning-based MPC, (e:LBMPC), as data.
 
-    min over v      |z_N - x^r_N|_P^2 + sum_i |z_i - x^r_i|_Q^2 + |v_i - u^r_i|_R^2         (learned trajectory z)
-    subject to      z_{i+1}    = A z_i + B v_i + h_hat(z_i, v_i),       z_0 = x_t
+    min over v      |z_N - x^r_N|_P^2 + sum_i |z_i - x^r_i|_Q^2 + |u_i - u^r_i|_R^2         (learned trajectory z)
+    subject to      z_{i+1}    = A z_i + B u_i + h_hat(z_i, u_i),       z_0 = x_t
+                    u_i        = v_i + K (z_i - zbar_i)
                     zbar_{i+1} = A zbar_i + B v_i,                      zbar_0 = x_t         (nominal trajectory)
                     v_i in V_i,   zbar_{i+1} in Z_{i+1}                                      i = 0 .. N-1
 
-in deviation coordinates. Deciding in v and in the paper's c is the same (c_i = v_i - K zbar_i), and far better
-conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices.
+in deviation coordinates. With the paper's c_i = v_i - K zbar_i each trajectory is steered by its own state, v_i =
+K zbar_i + c_i and u_i = K z_i + c_i: what h_hat moves z away from zbar by grows with A + BK, not with A, and zbar need
+not follow what h_hat asks of z (docs/decisions/0033). u_0 is v_0. Deciding in v and in c is the same, and v is far
+better conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.model import Model
+from lbmpc.model import Model, require_horizon
 from lbmpc.oracles.base import Oracle
 from lbmpc.sets.certificate import Certificate, CertificateError, require_match
 from lbmpc.sets.constraint_sets import disturbance_set, input_set, state_set
@@ -67,9 +70,11 @@ def build_problem(
       outside of the sets, as for `first_step`.
 
     Raises:
+        ModelError: the plant runs away within the horizon.
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
         CertificateError: `invariant` without a certificate, or with that of another model.
     """
+    require_horizon(model, horizon)
     guard = None
     if tightening == "invariant":
         if certificate is None:

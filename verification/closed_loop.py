@@ -66,7 +66,9 @@ class LyingSolver:
         low, high = (plant.u_min - plant.u_e, plant.u_max - plant.u_e) if first is None else first
         share = self._rng.random(m) if self._inputs == "random" else self._rng.integers(0, 2, m)
         v = np.vstack([low + share * (high - low), warm_start[1:]])
-        return Solution(Status.CONVERGED, v, np.zeros((len(v), self._model.d)), 0.0, 0, 0.0, "")
+        return Solution(
+            Status.CONVERGED, v, warm_start, v, np.zeros((len(v), self._model.d)), 0.0, 0, 0.0, ""
+        )
 
     def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
         """Never asked."""

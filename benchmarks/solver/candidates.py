@@ -97,7 +97,7 @@ class RealTime:
 
     def keep(self) -> None:
         if self._last is not None:
-            self._warm = shifted(self._case.problem.model, self._last)
+            self._warm = shifted(self._last)
 
 
 class Other:

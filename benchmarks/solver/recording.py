@@ -116,10 +116,10 @@ def build_case(
         case.tight.append(solution)
         predicted = model.A @ x + model.B @ u + learner.estimate(memory, x, u)
         memory = learner.learn(memory, x, u, h)
-        warm = shifted(model, solution)
+        warm = shifted(solution)
     return case
 
 
-def shifted(model: Model, solution: Solution) -> np.ndarray:
-    """A plan one tick later, (N, m), with the feedback behind its end."""
-    return np.vstack([solution.v[1:], (model.K @ solution.zbar[-1])[None]])
+def shifted(solution: Solution) -> np.ndarray:
+    """c of a plan one tick later, (N, m), with the feedback behind its end."""
+    return np.vstack([solution.c[1:], np.zeros_like(solution.c[:1])])

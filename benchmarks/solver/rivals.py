@@ -97,13 +97,12 @@ class Rival:
         return v, int(stats["iter_count"]), bool(stats["success"])
 
     def _guess(self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray) -> np.ndarray:
-        if not self._multiple:
-            return np.concatenate([warm.ravel(), np.full(self._slacks, 1e-3)])
         model, parts, z, nominal = self._problem.model, [], x, x
-        for v in warm:
-            z = np.asarray(self._stage(z, v, theta)).ravel()
+        for c in warm:
+            v, u = model.K @ nominal + c, model.K @ z + c
+            z = np.asarray(self._stage(z, u, theta)).ravel()
             nominal = model.A @ nominal + model.B @ v
-            parts += [v, z, nominal]
+            parts += [u, z, nominal] if self._multiple else [v]
         return np.concatenate([*parts, np.full(self._slacks, 1e-3)])
 
 
@@ -119,7 +118,7 @@ def sqpmethod(problem: Problem, qp: str) -> Rival:
 
 
 def _stage(problem: Problem) -> ca.Function:
-    """(z, v, theta) -> A z + B v + h_hat(z, v)."""
+    """(z, u, theta) -> A z + B u + h_hat(z, u)."""
     model, oracle = problem.model, problem.oracle
     z, v, theta = (
         ca.MX.sym("z", model.d),
@@ -131,35 +130,37 @@ def _stage(problem: Problem) -> ca.Function:
 
 
 def _multiple(problem: Problem, stage: ca.Function, soft: bool) -> _Written:
-    """Variables (v_i, z_{i+1}, zbar_{i+1}) stage by stage, then slacks."""
+    """Variables (u_i, z_{i+1}, zbar_{i+1}) stage by stage, then slacks."""
     model, n = problem.model, problem.horizon
     d, m = model.d, model.m
     x, theta = ca.MX.sym("x", d), ca.MX.sym("theta", problem.oracle.parameters)
     a, b, q, r, p = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R, model.P))
     z, nominal, cost = x, x, ca.MX(0)
-    variables, gaps, blocks, nominals = [], [], [], []
+    gain = ca.DM(model.K)
+    variables, gaps, blocks, nominals, inputs = [], [], [], [], []
     free = np.full(d, np.inf)
     lower, upper = [], []
     for i in range(n):
-        v, z_next, nominal_next = ca.MX.sym("v", m), ca.MX.sym("z", d), ca.MX.sym("zbar", d)
-        gaps += [stage(z, v, theta) - z_next, a @ nominal + b @ v - nominal_next]
-        cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, v, v))
-        variables += [v, z_next, nominal_next]
+        u, z_next, nominal_next = ca.MX.sym("u", m), ca.MX.sym("z", d), ca.MX.sym("zbar", d)
+        inputs.append(u - gain @ (z - nominal))
+        gaps += [stage(z, u, theta) - z_next, a @ nominal + b @ inputs[i] - nominal_next]
+        cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, u, u))
+        variables += [u, z_next, nominal_next]
         blocks += [r, p if i == n - 1 else q, ca.DM(d, d)]
         states = problem.states[i]
-        lower += [problem.inputs[i].lower, -free, -free if soft else states.lower]
-        upper += [problem.inputs[i].upper, free, free if soft else states.upper]
+        lower += [np.full(m, -np.inf), -free, -free if soft else states.lower]
+        upper += [np.full(m, np.inf), free, free if soft else states.upper]
         z, nominal = z_next, nominal_next
         nominals.append(nominal)
     cost += 0.5 * ca.bilin(p, z, z)
     zeros = np.zeros(2 * d * n)
     written = _Written(
-        {"x": ca.vertcat(*variables), "p": ca.vertcat(x, theta), "f": cost, "g": ca.vertcat(*gaps)},
+        {"x": ca.vertcat(*variables), "p": ca.vertcat(x, theta), "f": cost, "g": ca.vertcat(*gaps, *inputs)},
         ca.diagcat(*blocks),
         np.concatenate(lower),
         np.concatenate(upper),
-        zeros,
-        zeros,
+        np.concatenate([zeros, *(part.lower for part in problem.inputs)]),
+        np.concatenate([zeros, *(part.upper for part in problem.inputs)]),
         (np.arange(n)[:, None] * (m + 2 * d) + np.arange(m)).ravel(),
     )
     return _softened(problem, written, ca.vertcat(*nominals)) if soft else written
@@ -177,8 +178,9 @@ def _single(problem: Problem, stage: ca.Function, soft: bool) -> _Written:
     v = ca.MX.sym("v", model.m, n)
     z, nominal, residuals, rows = x, x, [], []
     for i in range(n):
-        residuals += [q @ z, r @ v[:, i]]
-        z, nominal = stage(z, v[:, i], theta), a @ nominal + b @ v[:, i]
+        u = v[:, i] + ca.DM(model.K) @ (z - nominal)
+        residuals += [q @ z, r @ u]
+        z, nominal = stage(z, u, theta), a @ nominal + b @ v[:, i]
         rows.append(nominal)
     residual = ca.vertcat(*residuals, p @ z)
     decision = ca.vec(v)

@@ -11,23 +11,24 @@ from lbmpc.model import Model
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Inputs still to come, (N, m), deviation coordinates; the first `left` of them come from a solution.
+    """What is still to come, (N, m) each, deviation coordinates; the first `left` entries come from a solution."""
 
-    Behind those stands K along the nominal prediction, so that a plan is never short.
-    """
-
-    v: np.ndarray
+    u: np.ndarray
+    """Inputs, to be followed if nothing better comes."""
+    c: np.ndarray
+    """The nominal inputs without K zbar_i: where the next solve starts."""
     left: int
 
 
 def empty_plan(horizon: int, m: int) -> Plan:
     """No solution yet: zeros, none of which may be followed."""
-    return Plan(np.zeros((horizon, m)), 0)
+    return Plan(np.zeros((horizon, m)), np.zeros((horizon, m)), 0)
 
 
-def shift(plan: Plan, last: np.ndarray) -> Plan:
-    """The plan one period later; `last` (m,) goes behind its end. Also the warm start of the next solve."""
-    return Plan(np.concatenate([plan.v[1:], last[None]]), max(plan.left - 1, 0))
+def shift(plan: Plan) -> Plan:
+    """The plan one period later. Behind its end the last input goes on, and c is 0: K along the nominal prediction."""
+    c = np.concatenate([plan.c[1:], np.zeros_like(plan.c[:1])])
+    return Plan(np.concatenate([plan.u[1:], plan.u[-1:]]), c, max(plan.left - 1, 0))
 
 
 def feedback_plan(model: Model, x: np.ndarray, horizon: int) -> np.ndarray:

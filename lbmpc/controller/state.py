@@ -28,7 +28,8 @@ class ControllerState:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
-            "plan.v": self.plan.v,
+            "plan.u": self.plan.u,
+            "plan.c": self.plan.c,
             "plan.left": np.array([self.plan.left], dtype=np.int64),
             "pending.x": self.pending_x,
             "pending": np.array(self.pending, dtype=np.int64),
@@ -45,7 +46,7 @@ class ControllerState:
         oracle = {
             name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
         }
-        plan = Plan(arrays["plan.v"], int(arrays["plan.left"][0]))
+        plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
             plan,
             arrays["pending.x"],

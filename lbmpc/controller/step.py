@@ -84,14 +84,14 @@ class Controller:
         by itself, with the same numbers.
         """
         if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
-            self._solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+            self._solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.c)
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
         """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
         if state.plan.left == 0:
             return None
-        return planner.policy(state.predicted, self.oracle.theta(state.oracle), state.plan.v)
+        return planner.policy(state.predicted, self.oracle.theta(state.oracle), state.plan.u)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
@@ -114,10 +114,10 @@ class Controller:
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         s = self._with_past(oracle, start) if start is not None else state.predicted
-        x, u = s[: self.model.d], plan.v[0]
+        x, u = s[: self.model.d], plan.u[0]
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        after = ControllerState(self._shifted(plan, solution), pending_x, pending, predicted, delay, oracle)
-        return after, StepResult(plan.v, mode, solution, label, verdict, rolled_back, delay, first)
+        after = ControllerState(shift(plan), pending_x, pending, predicted, delay, oracle)
+        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first)
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
@@ -182,13 +182,13 @@ class Controller:
         if x is not None:
             solution = self._solve(state, oracle, x, first)
             if solution.usable:
-                return Plan(solution.v, horizon), "solver", solution
+                return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
             return _begun_within(plan, first), "shifted_plan", solution
         if x is None:
             # Neither a plan nor a state: the equilibrium input is all that is left.
-            return Plan(np.zeros((horizon, self.model.m)), 0), "feedback", solution
-        fed_back = Plan(feedback_plan(self.model, x, horizon), 0)
+            return empty_plan(horizon, self.model.m), "feedback", solution
+        fed_back = Plan(feedback_plan(self.model, x, horizon), np.zeros((horizon, self.model.m)), 0)
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
@@ -197,7 +197,7 @@ class Controller:
         s = self._with_past(oracle, x)
         if not self.real_time or state.plan.left == 0:
             # Without a plan to start from, one step is not enough.
-            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.v, first=first)
+            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.c, first=first)
         self.prepare(state)
         self._prepared_for = None
         return self._solver.feedback(s, first)
@@ -205,10 +205,6 @@ class Controller:
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
-
-    def _shifted(self, plan: Plan, solution: Solution | None) -> Plan:
-        end = solution.zbar[-1] if solution is not None and solution.usable else np.zeros(self.model.d)
-        return shift(plan, self.model.K @ end)
 
 
 def _acting(seen: Observation) -> np.ndarray | None:
@@ -224,4 +220,4 @@ def _begun_within(plan: Plan, first: Box | None) -> Plan:
     """The plan with its first input brought inside the bounds: what is certified holds without a solution too."""
     if first is None:
         return plan
-    return Plan(np.vstack([np.clip(plan.v[:1], *first), plan.v[1:]]), plan.left)
+    return replace(plan, u=np.vstack([np.clip(plan.u[:1], *first), plan.u[1:]]))

@@ -20,7 +20,7 @@ from lbmpc.oracles.linear import LinearOracle
 from lbmpc.problem import Problem
 from lbmpc.solver.constraint_rows import Box, Rows
 from lbmpc.solver.least_distance import NO_ROWS, Shown
-from lbmpc.solver.nominal_rollout import build_nominal
+from lbmpc.solver.nominal_rollout import build_nominal, build_start
 from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
@@ -50,6 +50,12 @@ class Prepared:
     """How those move with w, (m N, m N)."""
     follow_v: np.ndarray
     """How they follow x, (m N, D)."""
+    steered: np.ndarray
+    """The inputs of the minimiser's learned trajectory, (N, m)."""
+    slopes_u: np.ndarray
+    """How those move with w, (m N, m N)."""
+    follow_u: np.ndarray
+    """How they follow x, (m N, D)."""
     shown: Shown | None
     """The QP as it was solved at x; None where no row was violated there."""
 
@@ -75,7 +81,9 @@ class Solver:
         self.max_iterations, self.tolerance = max_iterations, tolerance
         self._realise = realise
         self._rows = Rows(problem)
-        self._per_input = 1.0 / problem.model.plant.u_scale
+        plant = problem.model.plant
+        self._per_input = 1.0 / plant.u_scale
+        self._u_min, self._u_max = plant.u_min - plant.u_e, plant.u_max - plant.u_e
         self._behind = remembered(problem.oracle)
         self._move = Bound(realise(build_rows(problem.model, problem.horizon, self._behind)))
         self._learned = self._subproblem(problem.oracle)
@@ -83,6 +91,7 @@ class Solver:
         same = problem.oracle.name == nominal.name
         self._nominal = self._learned if same else self._subproblem(nominal)
         self._follow = Bound(realise(build_nominal(problem)))
+        self._begin = Bound(realise(build_start(problem)))
         # Built at the first preparation: a controller that converges every tick does not need it.
         self._tangent: Bound | None = None
         self._prepared: Prepared | None = None
@@ -106,7 +115,7 @@ class Solver:
             x: measured state, (d,), deviation coordinates; where the oracle looks back, the past pairs behind it:
                 s of `lbmpc.oracles.base`, (D,).
             oracle_parameters: theta, as the oracle packs it.
-            warm_start: inputs to start from, (N, m); they need not be feasible.
+            warm_start: c to start from, (N, m), that of an earlier solution for one; it need not be feasible.
             xr, ur: references over the horizon, (N + 1, d) and (N, m); the equilibrium by default.
             first: hard bounds on v_0 for this solve, (m,) each, inside U; U itself by default.
 
@@ -116,7 +125,7 @@ class Solver:
         self._rows.bound_first(first)
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
-            start = self._rows.clip(_numbers(warm_start))
+            start = self._start(x, warm_start)
             self._learned.load(x, oracle_parameters, xr, ur)
             solution = self._solve(self._learned, x, start)
             if solution.usable or self._learned is self._nominal:
@@ -138,7 +147,7 @@ class Solver:
         self._rows.bound_first(None)
         rows = self._rows
         with np.errstate(all="ignore"):
-            v, status = rows.clip(_numbers(warm_start)), Status.NUMERICAL
+            v, status = self._start(x, warm_start), Status.NUMERICAL
             for subproblem, theta, trusted in (
                 (self._learned, oracle_parameters, Status.REAL_TIME),
                 (self._nominal, np.zeros(0), Status.ORACLE_REFUSED),
@@ -165,6 +174,9 @@ class Solver:
                 subproblem.free.copy(),
                 slopes[: v.size],
                 follow[: v.size],
+                subproblem.steered.copy(),
+                moved["U"].T.copy(),
+                moved["X"].T.copy(),
                 guess.shown if guess is not None else None,
             )
 
@@ -186,9 +198,11 @@ class Solver:
         rows.bound_first(first)
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow.dot(change)
-            v, status = ready.free + ready.follow_v.dot(change).reshape(ready.free.shape), ready.status
+            shape, status = ready.free.shape, ready.status
+            v = ready.free + ready.follow_v.dot(change).reshape(shape)
+            u = ready.steered + ready.follow_u.dot(change).reshape(shape)
             if status is Status.NUMERICAL or not finite(values):
-                return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 0)
+                return self._finish(Status.NUMERICAL, x, ready.free, ready.steered, np.inf, 0)
             if not rows.kept(values):
                 shown, hint = ready.shown, NO_ROWS
                 if shown is not None and first is not None and (shown.seen < rows.m).any():
@@ -196,16 +210,17 @@ class Solver:
                     hint, shown = shown.seen, None
                 nearest, feasible = rows.nearest(values, ready.slopes, hint, shown)
                 if nearest is None:
-                    return self._finish(Status.NUMERICAL, x, ready.free, np.inf, 1)
-                v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(ready.free.shape))
+                    return self._finish(Status.NUMERICAL, x, ready.free, ready.steered, np.inf, 1)
+                v = rows.clip(v + (ready.slopes_v @ nearest.w).reshape(shape))
+                u = u + (ready.slopes_u @ nearest.w).reshape(shape)
                 status = status if feasible else Status.INFEASIBLE
-            return self._finish(status, x, v, ready.cost, 1)
+            return self._finish(status, x, v, u, ready.cost, 1)
 
     # -- to convergence --------------------------------------------------------------------------------------
 
     def _solve(self, subproblem: Subproblem, x: np.ndarray, v: np.ndarray) -> Solution:
         """Step after step from inputs v, (N, m), inside their bounds, with what was loaded."""
-        merit = np.inf
+        merit, u = np.inf, v
         subproblem.linearise(v)
         status, values, seen = Status.ITERATION_LIMIT, self._rollout(x, v)["values"][:, 0].copy(), NO_ROWS
         iterations, size = 0, 0.0
@@ -225,32 +240,33 @@ class Solver:
                 size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
             ):
                 # What is left to go is not worth another linearisation. v is feasible already.
-                v, status = target.v, arrived
+                v, u, status = target.v, target.u, arrived
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
-            trial, trial_values = target.v, target.values
+            trial, trial_u, trial_values = target.v, target.u, target.values
             trial_merit = self._merit(subproblem, trial, trial_values)
             if not np.isfinite(trial_merit):
                 break
             if subproblem is self._nominal:
                 # The model is linear, and the step exact.
-                v, merit, status = trial, trial_merit, arrived
+                v, u, merit, status = trial, trial_u, trial_merit, arrived
                 break
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and self._size(step) >= self.tolerance:
                 # The rows are linear in v, so half a step has half the change.
                 step, halvings = 0.5 * step, halvings + 1
-                trial, trial_values = v + step, 0.5 * (values + trial_values)
+                trial, trial_u = v + step, 0.5 * (u + trial_u)
+                trial_values = 0.5 * (values + trial_values)
                 trial_merit = self._merit(subproblem, trial, trial_values)
             if not trial_merit <= merit:
                 # No descent is left at this precision: v is as good as this linearisation can tell.
                 status = arrived
                 break
-            v, values, merit = trial, trial_values, trial_merit
+            v, u, values, merit = trial, trial_u, trial_values, trial_merit
             if self._size(step) < self.tolerance:
                 status = arrived
                 break
-        return self._finish(status, x, v, merit, iterations)
+        return self._finish(status, x, v, u, merit, iterations)
 
     def _size(self, step: np.ndarray) -> float:
         """The largest entry of a step in the inputs, (N, m), as a share of that input's half-width."""
@@ -270,8 +286,15 @@ class Solver:
         if not finite(values):
             return None
         if self._rows.kept(values):
-            return Target(subproblem.free.copy(), values, True, hint)
+            return Target(subproblem.free.copy(), subproblem.steered.copy(), values, True, hint)
         return subproblem.constrained(self._rows, values, hint)
+
+    def _start(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Inputs inside their bounds, (N, m), from x or s by c, (N, m)."""
+        inputs = self._begin.inputs
+        inputs["x"][:, 0], inputs["c"][:] = x[: self.problem.model.d], _numbers(c).T
+        self._begin()
+        return self._rows.clip(_numbers(self._begin.outputs["v"].T))
 
     def _rollout(self, x: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """What `lbmpc.solver.nominal_rollout` says of inputs v, (N, m), from x or s; valid until the next call."""
@@ -282,15 +305,21 @@ class Solver:
         return self._follow.outputs
 
     def _finish(
-        self, status: Status, x: np.ndarray, v: np.ndarray, merit: float, iterations: int
+        self, status: Status, x: np.ndarray, v: np.ndarray, u: np.ndarray, merit: float, iterations: int
     ) -> Solution:
         found = self._rollout(x, v)
         slack, slack_row = self._rows.slack(found["outside"][:, 0])
         hard_broken = not self.problem.soft and status is not Status.INFEASIBLE and slack > 0.0
         if not isfinite(merit) or not isfinite(found["total"][0, 0]) or hard_broken:
             status = Status.NUMERICAL
+        elif slack > 0.0 and status in (Status.CONVERGED, Status.REAL_TIME):
+            status = Status.INFEASIBLE
+        u = np.minimum(np.maximum(u, self._u_min), self._u_max)
+        # Both begin in x_t: bounds on v_0 are bounds on u_0.
+        u[0] = v[0]
         cost = merit * self.problem.model.cost_scale
-        return Solution(status, v, found["zbar"].T.copy(), cost, iterations, slack, slack_row)
+        c, zbar = found["c"].T.copy(), found["zbar"].T.copy()
+        return Solution(status, v, c, u, zbar, cost, iterations, slack, slack_row)
 
 
 def _numbers(v: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The nominal trajectory of given inputs and what its rows say, in one call.
+"""The nominal trajectory of given inputs and what its rows say, in one call; and the inputs of given c in another.
 
 Every solve ends with it, and in a fast loop the dozen small array operations that it stands for would take longer than
 the rest of the feedback.
@@ -12,10 +12,11 @@ from lbmpc.problem import Problem
 
 
 def build_nominal(problem: Problem) -> ca.Function:
-    """(x, v, lower, upper) -> (zbar, values, outside, total) for x_t = x (d,) and inputs v (m, n).
+    """(x, v, lower, upper) -> (zbar, c, values, outside, total) for x_t = x (d,) and inputs v (m, n).
 
-    zbar (d, n) are the nominal states zbar_1..n; values (rows,) those of the rows of `constraint_rows`; outside (rows,)
-    how far each is beyond its bounds, 0 where it keeps them; total the sum of all values, finite where all are.
+    zbar (d, n) are the nominal states zbar_1..n; c (m, n) is v_i - K zbar_i; values (rows,) those of the rows of
+    `constraint_rows`; outside (rows,) how far each is beyond its bounds, 0 where it keeps them; total the sum of all
+    values, finite where all are.
     """
     model, n = problem.model, problem.horizon
     a, b = ca.DM(model.A), ca.DM(model.B)
@@ -29,13 +30,28 @@ def build_nominal(problem: Problem) -> ca.Function:
     # The last step may carry the rows of a terminal set behind those that all steps share.
     if len(terminal := problem.states[-1].F[len(of_states.F) :]):
         blocks.append(ca.DM(terminal) @ states[-1])
-    values = ca.vertcat(*blocks)
+    values, c = ca.vertcat(*blocks), v - ca.DM(model.K) @ ca.horzcat(*states[:-1])
     lower, upper = ca.MX.sym("lower", *values.shape), ca.MX.sym("upper", *values.shape)
     outside = ca.fmax(ca.fmax(lower - values, values - upper), 0)
     return ca.Function(
         "nominal",
         [x, v, lower, upper],
-        [ca.horzcat(*states[1:]), values, outside, ca.sum1(values)],
+        [ca.horzcat(*states[1:]), c, values, outside, ca.sum1(values)],
         ["x", "v", "lower", "upper"],
-        ["zbar", "values", "outside", "total"],
+        ["zbar", "c", "values", "outside", "total"],
     )
+
+
+def build_start(problem: Problem) -> ca.Function:
+    """(x, c) -> v: inputs K zbar_i + c_i, (m, n), brought inside their bounds one after the other.
+
+    A plan from before, put in this way, stays near its own trajectory from a state that it did not expect.
+    """
+    model, n = problem.model, problem.horizon
+    a, b, gain = ca.DM(model.A), ca.DM(model.B), ca.DM(model.K)
+    x, c = ca.MX.sym("x", model.d), ca.MX.sym("c", model.m, n)
+    state, inputs = x, []
+    for entry, bounds in zip(ca.horzsplit(c), problem.inputs, strict=True):
+        inputs.append(ca.fmin(ca.fmax(gain @ state + entry, bounds.lower), bounds.upper))
+        state = a @ state + b @ inputs[-1]
+    return ca.Function("start", [x, c], [ca.horzcat(*inputs)], ["x", "c"], ["v"])

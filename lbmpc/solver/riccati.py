@@ -1,16 +1,22 @@
 """The two CasADi functions inside the solver: one Gauss-Newton linearisation, whitened by a Riccati sweep.
 
-At an iterate v the Gauss-Newton subproblem in the step dv is a linear-quadratic problem. Its Riccati recursion gives
-gains such that, with
+The learned trajectory is steered by u_i = v_i + K (z_i - zbar_i). At an iterate v the Gauss-Newton subproblem in the
+step du is a linear-quadratic problem. Its Riccati recursion gives gains such that, with
 
-    dv_i = K_i dz_i + k_i + L_i^{-T} w_i,
+    du_i = K_i dz_i + k_i + L_i^{-T} w_i,
 
 the cost is a constant plus |w|^2 / 2. The constrained subproblem is then a least-distance problem in w: as close to
 w = 0, the unconstrained minimiser, as the rows allow. `sweep` finds that minimiser; `rows` says how the inputs and
-the nominal states move with w. No Hessian is formed and nothing is factorised but m x m blocks.
+the nominal states move with w, by
+
+    dv_i = du_i - K (dz_i - dzbar_i),   dzbar_{i+1} = A dzbar_i + B dv_i,
+
+so that v and zbar of any step keep the nominal model exactly, whatever the linearisation of z is worth.
+
+No Hessian is formed and nothing is factorised but m x m blocks.
 
 The rows look at the nominal states zbar. A backup policy (`controller.backup_policy`) has them look at the learned
-states z instead, of which the recursion holds the linearisation anyway: `constrained`.
+states z instead, of which the recursion holds the linearisation anyway, and there u is v: `constrained`.
 
 Where the oracle looks back, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D: the
 cost sees x alone, and of the Jacobians only the d rows of x+ are stored, since the rest of s+ is a shift. Without a
@@ -31,12 +37,12 @@ Constrained = Literal["nominal", "learned"]
 
 
 def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
-    """(x, v, theta, xr, ur) -> (cost, vs, zs, A, B, K, L) for a horizon of n.
+    """(x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
 
     Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
-    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs
-    (m, n) and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along the learned trajectory A (d, D n),
-    B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m,
+    n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along
+    the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
     With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
     d, m, behind = model.d, model.m, remembered(oracle)
@@ -49,17 +55,21 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     parts = oracle.split(theta)
 
     stage = _learned_stage(model, oracle, parts)
-    states = [x]
+    gain = _gain(model, constrained)
+    states, applied, nominal = [x], [], x[:d]
     for i in range(n):
-        states.append(follow_symbols(states[i], inputs[i], stage(states[i], inputs[i], *parts)))
+        applied.append(inputs[i] + gain @ (states[i][:d] - nominal))
+        states.append(follow_symbols(states[i], applied[i], stage(states[i], applied[i], *parts)))
+        nominal = a @ nominal + b @ inputs[i]
+    u = ca.horzcat(*applied)
     s = ca.horzcat(*states)
     z = s[:d, :] if behind else s
-    dz, dv = z - xr, v - ur
-    gradient_z, gradient_v = q @ dz[:, :n], r @ dv
+    dz, du = z - xr, u - ur
+    gradient_z, gradient_v = q @ dz[:, :n], r @ du
     gradient_end = p @ dz[:, n]
-    cost = 0.5 * (ca.dot(gradient_z, dz[:, :n]) + ca.dot(gradient_v, dv) + ca.dot(gradient_end, dz[:, n]))
+    cost = 0.5 * (ca.dot(gradient_z, dz[:, :n]) + ca.dot(gradient_v, du) + ca.dot(gradient_end, dz[:, n]))
 
-    stages = oracle.jacobians(ca.vertcat(s[:, :n], v), parts)
+    stages = oracle.jacobians(ca.vertcat(s[:, :n], u), parts)
     linear = ca.horzcat(a, ca.DM(d, behind)) if behind else a
     a_i = [linear + jacobian[:, : d + behind] for jacobian in stages]
     b_i = [b + jacobian[:, d + behind :] for jacobian in stages]
@@ -75,16 +85,25 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
             p_matrix, p_vector, a_i[i], b_i[i], columns_z[i], columns_v[i]
         )
 
-    step, nominal = ca.MX.zeros(d + behind), x[:d] if behind else x
-    minimiser, nominal_states, learned_states = [], [], []
+    step, nominal = ca.MX.zeros(d + behind), x[:d]
+    minimiser, steered, nominal_states, learned_states = [], [], [], []
     for i in range(n):
         move = gains[i] @ step + offsets[i]
+        steered.append(applied[i] + move)
+        minimiser.append(steered[i] - gain @ (z[:, i] + step[:d] - nominal))
         step = follow_symbols(step, move, a_i[i] @ step + b_i[i] @ move)
-        minimiser.append(inputs[i] + move)
         nominal = a @ nominal + b @ minimiser[i]
         nominal_states.append(nominal)
         learned_states.append(z[:, i + 1] + step[:d])
-    blocks = {"vs": minimiser, "zs": nominal_states, "A": a_i, "B": b_i, "K": gains, "L": inverses}
+    blocks = {
+        "vs": minimiser,
+        "us": steered,
+        "zs": nominal_states,
+        "A": a_i,
+        "B": b_i,
+        "K": gains,
+        "L": inverses,
+    }
     if constrained == "learned":
         blocks |= {"zs": learned_states, "z": ca.horzsplit(z[:, 1:])}
     return ca.Function(
@@ -97,15 +116,16 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
 
 
 def build_rows(model: Model, n: int, behind: int = 0, constrained: Constrained = "nominal") -> ca.Function:
-    """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n): how v_0..n-1, then zbar_1..n, move with w; transposed.
+    """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n), U' (m n, m n), transposed.
 
-    `behind`: D - d. With `learned`, z_1..n instead of zbar_1..n.
+    M: how v_0..n-1, then zbar_1..n, move with w; U: how u_0..n-1 do. `behind`: D - d. With `learned`, z_1..n instead
+    of zbar_1..n.
     """
     return _propagation(model, n, behind, follow_state=False, constrained=constrained)
 
 
 def build_tangent(model: Model, n: int, behind: int = 0) -> ca.Function:
-    """`build_rows`, and besides Y' (D, (m + d) n): how v_0..n-1, then zbar_1..n, follow s_0 when w stays."""
+    """`build_rows`, and besides Y' (D, (m + d) n) and X' (D, m n): how the same follow s_0 when w stays."""
     return _propagation(model, n, behind, follow_state=True)
 
 
@@ -128,22 +148,28 @@ def _propagation(
         else ca.DM.zeros(rows, length)
     )
     step, nominal = ca.MX(start), ca.MX(start[:, :d])
-    moves, states = [], []
+    gain = _gain(model, constrained).T
+    moves, steered, states = [], [], []
     for i in range(n):
         # w_i begins to act at stage i.
         own = ca.vertcat(ca.MX(before + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
-        move = step @ k_i[i].T + own
-        after = step @ a_i[i].T + move @ b_i[i].T
-        step = ca.horzcat(after, step[:, 2 * d + m :], step[:, :d], move) if behind else after
-        nominal = nominal @ a + move @ b
-        moves.append(move)
+        steered.append(step @ k_i[i].T + own)
+        moves.append(steered[i] - (step[:, :d] - nominal) @ gain)
+        after = step @ a_i[i].T + steered[i] @ b_i[i].T
+        step = ca.horzcat(after, step[:, 2 * d + m :], step[:, :d], steered[i]) if behind else after
+        nominal = nominal @ a + moves[i] @ b
         states.append(nominal if constrained == "nominal" else step[:, :d])
-    everything = ca.densify(ca.horzcat(*moves, *states))
-    outputs, names = (
-        ([everything[:before, :], everything[before:, :]], ["Y", "M"]) if before else ([everything], ["M"])
-    )
+    rows_move, inputs_move = ca.densify(ca.horzcat(*moves, *states)), ca.densify(ca.horzcat(*steered))
+    outputs, names = [rows_move[before:, :], inputs_move[before:, :]], ["M", "U"]
+    if before:
+        outputs, names = [*outputs, rows_move[:before, :], inputs_move[:before, :]], [*names, "Y", "X"]
     name = "tangent" if follow_state else "rows" if constrained == "nominal" else "backup_rows"
     return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
+
+
+def _gain(model: Model, constrained: Constrained) -> ca.DM:
+    """K, (m, d), that holds the learned trajectory at the nominal one; 0 where there is no nominal one."""
+    return ca.DM(model.K) if constrained == "nominal" else ca.DM(model.m, model.d)
 
 
 def _learned_stage(model: Model, oracle: Oracle, parts: list[ca.MX]) -> ca.Function:

@@ -17,6 +17,8 @@ class Target:
 
     v: np.ndarray
     """Inputs, (N, m)."""
+    u: np.ndarray
+    """Those of the learned trajectory, (N, m)."""
     values: np.ndarray
     """Row values there, (rows,)."""
     feasible: bool
@@ -40,6 +42,11 @@ class Subproblem:
     def free(self) -> np.ndarray:
         """The unconstrained minimiser's inputs, (N, m), valid until the next linearisation."""
         return self.sweep.outputs["vs"].T
+
+    @property
+    def steered(self) -> np.ndarray:
+        """The inputs of its learned trajectory, (N, m), valid until the next linearisation."""
+        return self.sweep.outputs["us"].T
 
     def load(
         self, x: np.ndarray, theta: np.ndarray, xr: np.ndarray | None = None, ur: np.ndarray | None = None
@@ -72,12 +79,14 @@ class Subproblem:
 
         `hint` as for `least_distance`.
         """
-        slopes, free = self.propagate(self._move)["M"].T, self.free
+        moved, free = self.propagate(self._move), self.free
+        slopes = moved["M"].T
         nearest, feasible = rows.nearest(values, rows.apply(slopes), hint)
         if nearest is None:
             return None
         v = free + (slopes[: free.size] @ nearest.w).reshape(free.shape)
-        return Target(rows.clip(v), nearest.values, feasible, nearest.shown.seen)
+        u = self.steered + (moved["U"].T @ nearest.w).reshape(free.shape)
+        return Target(rows.clip(v), u, nearest.values, feasible, nearest.shown.seen)
 
 
 def finite(values: np.ndarray) -> bool:

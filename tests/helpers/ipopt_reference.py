@@ -32,9 +32,10 @@ class ReferenceSolver:
         values_v, values_z = [], []
         for i in range(n):
             vi, z = v[:, i], s[:d]
-            cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, vi, vi))
-            after = a @ z + b @ vi + problem.oracle.value(ca.vertcat(s, vi), parts)
-            s = follow_symbols(s, vi, after)
+            ui = vi + ca.DM(model.K) @ (z - nominal)
+            cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, ui, ui))
+            after = a @ z + b @ ui + problem.oracle.value(ca.vertcat(s, ui), parts)
+            s = follow_symbols(s, ui, after)
             nominal = a @ nominal + b @ vi
             values_v.append(ca.DM(rows.input_rows) @ vi)
             values_z.append(ca.DM(rows.state_rows) @ nominal)
@@ -77,7 +78,12 @@ class ReferenceSolver:
         A nonconvex problem has several minima, and an interior-point method may leave the one it was started in.
         """
         n, m = self.problem.horizon, self.problem.model.m
-        guess = np.concatenate([np.ravel(warm_start), np.full(len(self._lbx) - n * m, 1e-3)])
+        model = self.problem.model
+        guess, state = np.zeros((n, m)), np.asarray(x, dtype=float)[: model.d]
+        for i, c in enumerate(warm_start):
+            guess[i] = model.K @ state + c
+            state = model.A @ state + model.B @ guess[i]
+        guess = np.concatenate([np.ravel(guess), np.full(len(self._lbx) - n * m, 1e-3)])
         result = self._solver(
             x0=guess,
             p=np.concatenate([x, oracle_parameters]),
@@ -86,12 +92,15 @@ class ReferenceSolver:
             lbx=self._lbx,
         )
         v = np.array(result["x"]).ravel()[: n * m].reshape(n, m)
-        zbar, state = np.zeros((n, self.problem.model.d)), np.asarray(x, dtype=float)[: self.problem.model.d]
+        zbar, c, state = np.zeros((n, model.d)), np.zeros((n, m)), np.asarray(x, dtype=float)[: model.d]
         for i in range(n):
-            state = zbar[i] = self.problem.model.A @ state + self.problem.model.B @ v[i]
+            c[i] = v[i] - model.K @ state
+            state = zbar[i] = model.A @ state + model.B @ v[i]
         slack, row = self._rows.slack(
             violation(self._rows.values(v.T, zbar.T), self._rows.lower, self._rows.upper)
         )
         stats = self._solver.stats()
         status = Status.CONVERGED if stats["success"] else Status.NUMERICAL
-        return Solution(status, v, zbar, float(result["f"]), int(stats["iter_count"]), slack, row)
+        return Solution(
+            status, v, c, np.empty((0, m)), zbar, float(result["f"]), int(stats["iter_count"]), slack, row
+        )

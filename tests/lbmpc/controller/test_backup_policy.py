@@ -61,9 +61,9 @@ def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
     """With h known the backup problem's constraints are the true plant's; the nominal plan's are not."""
     oracle, truth = PerfectOracle(MODEL), Truth(PLANT)
     nominal = Solver(problem(oracle)).solve(X0, np.zeros(oracle.parameters), np.zeros((N, 1)))
-    blind = followed(X0, Policy(nominal.v, np.zeros((1, 4)), np.zeros((N, 4)), 0.0), truth)
+    blind = followed(X0, Policy(nominal.u, np.zeros((1, 4)), np.zeros((N, 4)), 0.0), truth)
     assert max(map(outside, blind)) > 0.02
-    policy = BackupPlanner(problem(oracle), 0.0).policy(X0, np.zeros(oracle.parameters), nominal.v)
+    policy = BackupPlanner(problem(oracle), 0.0).policy(X0, np.zeros(oracle.parameters), nominal.u)
     assert policy is not None
     states = followed(X0, policy, truth)
     assert max(map(outside, states)) < 1e-4
@@ -168,7 +168,7 @@ def test_the_learned_states_are_what_the_rows_hold(architecture: str) -> None:
     s = np.concatenate([X0, oracle.past(state).ravel()]) if oracle.pairs > 1 else X0
     theta = oracle.theta(state)
     nominal = Solver(problem(oracle)).solve(s, theta, np.zeros((N, 1)))
-    policy = BackupPlanner(problem(oracle), 0.01).policy(s, theta, nominal.v)
+    policy = BackupPlanner(problem(oracle), 0.01).policy(s, theta, nominal.u)
     assert policy is not None
     assert max(map(outside, policy.states[RAMP + 4 :])) < -0.01 + 1e-3
 

@@ -123,7 +123,9 @@ class Failing:
         if self.good >= 0:
             return self.real.solve(x, oracle_parameters, warm_start)
         nothing = np.zeros_like(warm_start)
-        return Solution(Status.NUMERICAL, nothing, np.zeros((len(nothing), 4)), np.inf, 0, 0.0, "")
+        return Solution(
+            Status.NUMERICAL, nothing, nothing, nothing, np.zeros((len(nothing), 4)), np.inf, 0, 0.0, ""
+        )
 
 
 def test_without_a_solution_the_shifted_plan_and_then_K() -> None:

@@ -357,7 +357,7 @@ def test_what_is_certified_holds_without_a_solution_too(family: Certificate, goo
         state = controller.initial_state(0)
         if good:
             state, _ = controller.step(state, observation(start, 0))
-        wanted = state.plan.v[0] if good else np.clip(model.K @ x, -3.0, 3.0)
+        wanted = state.plan.u[0] if good else np.clip(model.K @ x, -3.0, 3.0)
         # Far from where the plan was made for: it would lead anywhere.
         _, result = controller.step(state, observation(x, 1))
         assert result.mode == ("shifted_plan" if good else "feedback")
