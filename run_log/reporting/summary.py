@@ -24,7 +24,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 class PredictionError(msgspec.Struct, frozen=True):
-    """Mean of |h_hat - h| over the first and the last second; null where no tick has one."""
+    """Mean of |h_hat - h| over the first and the last second, or one tick; null where no tick has one."""
 
     first_second: float | None
     last_second: float | None
@@ -116,7 +116,8 @@ def _prediction_error(period: float, ticks: list[m.Tick], results: list[m.TickRe
         run = [r for r in known if r.run_id == of]
         t = np.array([when.get((r.run_id, r.seq), r.seq * period) for r in run])
         # Half a period of slack, since the slots are on a grid that floats only approximate.
-        near = t < t[0] + 1.0 - period / 2 if first else t > t[-1] - 1.0 + period / 2
+        span = max(1.0, period) - period / 2
+        near = t < t[0] + span if first else t > t[-1] - span
         return float(np.mean([r.prediction_error for r, inside in zip(run, near, strict=True) if inside]))
 
     return PredictionError(mean(known[0].run_id, first=True), mean(known[-1].run_id, first=False))
