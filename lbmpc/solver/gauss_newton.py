@@ -223,7 +223,7 @@ class Solver:
         merit, u = np.inf, v
         subproblem.linearise(v)
         status, values, seen = Status.ITERATION_LIMIT, self._rollout(x, v)["values"][:, 0].copy(), NO_ROWS
-        iterations, size = 0, 0.0
+        iterations, size, whole, share = 0, 0.0, np.zeros_like(v), 1.0
         while iterations < self.max_iterations:
             iterations += 1
             target = self._target(subproblem, seen)
@@ -244,6 +244,12 @@ class Solver:
                 break
             # The first step leads into the feasible set; after it the true cost must fall.
             trial, trial_u, trial_values = target.v, target.u, target.values
+            scaled = step * self._per_input
+            share, whole = _share(scaled, whole, share), scaled
+            if share < 1.0:
+                step = share * step
+                trial, trial_u = v + step, u + share * (trial_u - u)
+                trial_values = values + share * (trial_values - values)
             trial_merit = self._merit(subproblem, trial, trial_values)
             if not np.isfinite(trial_merit):
                 break
@@ -254,7 +260,7 @@ class Solver:
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and self._size(step) >= self.tolerance:
                 # The rows are linear in v, so half a step has half the change.
-                step, halvings = 0.5 * step, halvings + 1
+                step, share, halvings = 0.5 * step, 0.5 * share, halvings + 1
                 trial, trial_u = v + step, 0.5 * (u + trial_u)
                 trial_values = 0.5 * (values + trial_values)
                 trial_merit = self._merit(subproblem, trial, trial_values)
@@ -320,6 +326,17 @@ class Solver:
         cost = merit * self.problem.model.cost_scale
         c, zbar = found["c"].T.copy(), found["zbar"].T.copy()
         return Solution(status, v, c, u, zbar, cost, iterations, slack, slack_row)
+
+
+def _share(step: np.ndarray, before: np.ndarray, taken: float) -> float:
+    """How much of a step to take, at most 1, where of the step `before` a share `taken` was; (N, m), scaled.
+
+    Gauss-Newton leaves the curvature of h_hat out. Where the true one is 1 + a times as large, a share t of a step
+    leaves 1 - t (1 + a) of it to go. Two steps say what a is, and 1 / (1 + a) is the best share (Aitken).
+    """
+    length = float((before * before).sum())
+    left = float((step * before).sum()) / length if length > 0.0 else 0.0
+    return taken / (1.0 - left) if left < 1.0 - taken else 1.0
 
 
 def _numbers(v: np.ndarray) -> np.ndarray:

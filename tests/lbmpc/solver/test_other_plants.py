@@ -94,6 +94,20 @@ def test_hundreds_of_random_problems_networks_and_warm_starts() -> None:
     assert same_minimum >= 0.97 * judged
 
 
+@pytest.mark.parametrize("seed", [1, 66])
+def test_gauss_newton_steps_that_overshoot_are_shortened(seed: int) -> None:
+    """Taken whole, and halved where the cost rises, they need 20 and 19 iterations."""
+    case = random_case(seed)
+    assert case is not None
+    model, oracle, theta, rng = case
+    n = int(rng.integers(1, 9))
+    solver = Solver(build_problem(model, oracle, n, "first_step"), max_iterations=10, tolerance=1e-9)
+    x = rng.uniform(model.plant.x_min, model.plant.x_max) * rng.choice([0.3, 1.0, 1.3])
+    solution = solver.solve(x, theta, rng.normal(size=(n, model.m)) * 3)
+    assert solution.status in (Status.CONVERGED, Status.INFEASIBLE)
+    assert solution.iterations < 10
+
+
 def test_ipopt_agrees_often_enough_to_be_a_judge() -> None:
     """The test above passes over what IPOPT cannot solve; that must be the exception."""
     converged = total = 0
