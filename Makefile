@@ -31,8 +31,10 @@ paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)
 
-test: $(READY)  ## all tests
-	$(BIN)/pytest $(ARGS)
+test: $(READY)  ## all tests; for some, .venv/bin/pytest PATH
+	$(BIN)/pytest -n auto --dist loadfile -m "not live"
+# Real processes run alone: what they show depends on when they get a core.
+	$(BIN)/pytest -m live
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s tests/compose/live_compose.py $(ARGS)

@@ -101,6 +101,9 @@ class Memory:
             "rate": f"{self._config.rate:g} Hz",
             "oracle": self._config.controller.oracle,
         }
+        truth = self._config.plant.truth
+        if truth:
+            words["truth"] = ", ".join(f"{name} {value!r}" for name, value in sorted(truth.items()))
         if what is not None:
             layers = "-".join(map(str, what.hidden))
             words["network"] = f"{what.architecture} {layers} {what.sha256()[:12]}"

@@ -107,8 +107,12 @@ class Rival:
 
 
 def ipopt(problem: Problem, soft: bool, gauss_newton: bool) -> Rival:
-    """IPOPT in multiple shooting, several times faster here than in single shooting; its own tolerance, 1e-8."""
-    return Rival(problem, "ipopt", True, soft, gauss_newton, IPOPT)
+    """IPOPT in multiple shooting, several times faster here than in single shooting; its own tolerance, 1e-8.
+
+    Of a cost per second: a stage's weights, and with them what IPOPT compares, shrink with the period.
+    """
+    options = {**IPOPT, "ipopt.tol": 1e-8 * problem.model.period}
+    return Rival(problem, "ipopt", True, soft, gauss_newton, options)
 
 
 def sqpmethod(problem: Problem, qp: str) -> Rival:

@@ -17,7 +17,9 @@ add up. Nothing of this is certified: h_hat is what was learned so far.
 
 The margin is room for what h_hat does not know, and where the way to x = 0 leads along a bound it can cost the way
 itself. So where the plan touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, the problem is solved
-again without one, and if that ends nearer a third time, with as much of it as should lead back.
+again without one, and if that costs less a third time, with as much of it as should lead back. What a plan costs is the
+cost above and the penalty for what leaves X itself. Where it ends would not tell: of two plans that are lost, the one
+that leaves X at once may end as near as the one that stays at its edge.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ STEPS = 2
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
 NEARER = 0.9
-"""Of |z_0|_P: where a plan that leads back ends at most. And of another plan's end, to be better than that."""
+"""Of |z_0|_P: where a plan that leads back ends at most."""
+CHEAPER = 0.9
+"""Of the cost with all of the margin: what a plan without one costs at most, to be better."""
 TOUCHES = 1e-3
 """Nearer than this share of the half-width to a margin's edge, the plan may be held up by it."""
 STIFFNESS = 25.0
@@ -54,10 +58,11 @@ STIFFNESS = 25.0
 
 
 class Rollout(NamedTuple):
-    """Inputs v, (N, m), and the learned states z_1 .. z_N that they lead to, (N, d)."""
+    """Inputs v, (N, m), the learned states z_1 .. z_N that they lead to, (N, d), and the cost, without penalties."""
 
     v: np.ndarray
     z: np.ndarray
+    cost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,20 +117,20 @@ class BackupPlanner:
             if kept is None:
                 return None
             share, found = self._less(s, theta, kept) if self._is_in_the_way(s, kept) else (1.0, kept)
-        return self._with_feedback(s, *found, share * self._margin)
+        return self._with_feedback(s, found, share * self._margin)
 
     def _is_in_the_way(self, s: np.ndarray, kept: Rollout) -> bool:
-        return self._end(s, kept) >= NEARER and _touches(self._kept, *kept)
+        return self._end(s, kept) >= NEARER and _touches(self._kept, kept)
 
     def _less(self, s: np.ndarray, theta: np.ndarray, kept: Rollout) -> tuple[float, Rollout]:
-        """The share of the margin, and the plan, that leads back, or else what ends nearer, if anything does.
+        """The share of the margin, and the plan, that leads back, or else what costs less, if anything does.
 
         Where a plan ends is taken for linear in the margin.
         """
         free = self._best(self._plain, s, theta, kept.v, 1)
-        if free is None or (end := self._end(s, free)) >= NEARER * self._end(s, kept):
+        if free is None or _price(self._plain, free) >= CHEAPER * _price(self._plain, kept):
             return 1.0, kept
-        if end >= NEARER:
+        if (end := self._end(s, free)) >= NEARER:
             return 0.0, free
         share = (NEARER - end) / (self._end(s, kept) - end)
         between = self._best(_between(self._plain, self._kept, share), s, theta, free.v, 1)
@@ -149,12 +154,13 @@ class BackupPlanner:
         subproblem, v = self._subproblem, rows.clip(v)
         subproblem.load(s, theta)
         for step in range(steps + 1):
-            cost, z = subproblem.linearise(v), subproblem.sweep.outputs["z"]
-            merit = cost + rows.price(rows.values(v.T, z))
+            cost = subproblem.linearise(v)
+            rollout = Rollout(v, subproblem.sweep.outputs["z"].T.copy(), cost)
+            merit = _price(rows, rollout)
             if not np.isfinite(merit):
                 break
             if merit < least:
-                best, least = Rollout(v, z.T.copy()), merit
+                best, least = rollout, merit
             values = subproblem.values(rows)
             if step == steps or not np.isfinite(values).all():
                 break
@@ -164,10 +170,10 @@ class BackupPlanner:
             v = target.v
         return best
 
-    def _with_feedback(self, s: np.ndarray, v: np.ndarray, z: np.ndarray, margin: float) -> Policy:
+    def _with_feedback(self, s: np.ndarray, rollout: Rollout, margin: float) -> Policy:
         gain, d = self._gain, self.problem.model.d
-        states = np.vstack([s[:d], z[:-1]])
-        return Policy(v - states @ gain.T, gain, states, margin)
+        states = np.vstack([s[:d], rollout.z[:-1]])
+        return Policy(rollout.v - states @ gain.T, gain, states, margin)
 
 
 def _rows(problem: Problem, margin: float) -> Rows:
@@ -187,9 +193,14 @@ def _between(plain: Rows, kept: Rows, share: float) -> Rows:
     return rows
 
 
-def _touches(rows: Rows, v: np.ndarray, z: np.ndarray) -> bool:
+def _price(rows: Rows, rollout: Rollout) -> float:
+    """The cost, and the penalty for what is outside these rows."""
+    return rollout.cost + rows.price(rows.values(rollout.v.T, rollout.z.T))
+
+
+def _touches(rows: Rows, rollout: Rollout) -> bool:
     """Whether a state comes to its bounds anywhere."""
-    values, near = rows.values(v.T, z.T), TOUCHES * rows.penalty.scale
+    values, near = rows.values(rollout.v.T, rollout.z.T), TOUCHES * rows.penalty.scale
     near_one = (values < rows.lower + near) | (values > rows.upper - near)
     return bool(near_one[rows.count_inputs :].any())
 

@@ -24,7 +24,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 class PredictionError(msgspec.Struct, frozen=True):
-    """Mean of |h_hat - h| over the first and the last second, or one tick; null where no tick has one."""
+    """Mean of |h_hat - h| over the first and the last second; null where no tick in it has one."""
 
     first_second: float | None
     last_second: float | None
@@ -108,16 +108,17 @@ def _late(period: float, ticks: list[m.Tick], timings: list[m.TickTiming]) -> in
 
 def _prediction_error(period: float, ticks: list[m.Tick], results: list[m.TickResult]) -> PredictionError:
     when = {(tick.run_id, tick.seq): tick.t for tick in ticks}
-    known = [r for r in results if r.prediction_error is not None]
+    known = [(r, error) for r in results if (error := r.prediction_error) is not None]
     if not known:
         return PredictionError(None, None)
 
-    def mean(of: str, *, first: bool) -> float:
-        run = [r for r in known if r.run_id == of]
-        t = np.array([when.get((r.run_id, r.seq), r.seq * period) for r in run])
+    def mean(of: str, *, first: bool) -> float | None:
+        run = [(r, error) for r, error in known if r.run_id == of]
+        t = np.array([when.get((r.run_id, r.seq), r.seq * period) for r, _error in run])
         # Half a period of slack, since the slots are on a grid that floats only approximate.
-        span = max(1.0, period) - period / 2
-        near = t < t[0] + span if first else t > t[-1] - span
-        return float(np.mean([r.prediction_error for r, inside in zip(run, near, strict=True) if inside]))
+        near = t < t[0] + 1.0 - period / 2 if first else t > t[-1] - 1.0 + period / 2
+        errors = [error for (_r, error), inside in zip(run, near, strict=True) if inside]
+        # A second may hold no tick.
+        return float(np.mean(errors)) if errors else None
 
-    return PredictionError(mean(known[0].run_id, first=True), mean(known[-1].run_id, first=False))
+    return PredictionError(mean(known[0][0].run_id, first=True), mean(known[-1][0].run_id, first=False))

@@ -67,8 +67,7 @@ def test_whatever_converges_agrees_on_the_optimum(report: Report) -> None:
     converged = [row for row in report.rows if row.mode in ("converged", "tick")]
     assert {row.solver for row in converged} >= {"tandem", "ipopt", "sqpmethod-daqp"}
     for row in converged:
-        # IPOPT stops inside soft bounds, at its own tolerance.
-        assert row.error < (3e-6 if row.solver == "ipopt" else 1e-6), row
+        assert row.error < 1e-6, row
         assert row.failures == 0, row
 
 

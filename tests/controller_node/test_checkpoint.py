@@ -253,6 +253,7 @@ def test_memory_of_another_shape_is_named() -> None:
         ("rate=25", "rate"),
         ("network.hidden=[9, 8]", "network"),
         ("controller.oracle=l2nw", "oracle"),
+        ("plant.truth.slope=1.4", "truth"),
     ],
 )
 def test_what_a_checkpoint_belongs_to(change: str, word: str) -> None:
@@ -260,7 +261,7 @@ def test_what_a_checkpoint_belongs_to(change: str, word: str) -> None:
     assert (
         mine == ControllerCore(override(config(), ["seed=5", "controller.horizon=25"]), "b").memory.belongs()
     )
-    differing = {name for name in mine if mine[name] != other.get(name)}
+    differing = {name for name in mine | other if mine.get(name) != other.get(name)}
     assert word in differing
 
 

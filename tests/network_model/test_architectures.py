@@ -258,8 +258,7 @@ def test_the_loop_learns(name: str) -> None:
     assert error.first_second is not None
     assert error.last_second is not None
     assert error.last_second < 0.05 * error.first_second
-    # Linear MPC overshoots by 0.024.
-    assert summary.overshoot["z"] < 0.024
+    assert all(share is not None and share < 0.02 for share in summary.overshoot.values())
     assert summary.constraint_violations == 0
     assert summary.fallback_ticks == 0
     assert summary.weights_adopted >= 5

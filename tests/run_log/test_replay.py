@@ -213,14 +213,14 @@ def test_one_flipped_bit_in_the_file_survives_a_rewrite_and_is_reported(run: Run
 
 
 def test_a_changed_tolerance_is_reported_with_its_tick(run: Run) -> None:
-    found = replay(run, overrides=["controller.solver.tolerance=1e-2"])
+    found = replay(run, overrides=["controller.solver.tolerance=0.1"])
     assert not found.equal
     assert found.first_difference is not None
     assert found.first_difference.field.startswith("command.u")
     assert found.differing_ticks > 5
     assert found.largest_difference is not None
     assert 0.0 < found.largest_difference < 0.1
-    assert any("changed: controller.solver.tolerance=1e-2" in note for note in found.notes)
+    assert any("changed: controller.solver.tolerance=0.1" in note for note in found.notes)
 
 
 def test_other_changes(run: Run) -> None:

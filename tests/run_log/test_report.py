@@ -24,7 +24,7 @@ from run_log.reading.reader import read_run
 from run_log.reporting import plots
 from run_log.reporting.motion import trajectory
 from run_log.reporting.report import picture, report
-from run_log.reporting.summary import summarise
+from run_log.reporting.summary import PredictionError, summarise
 from run_log.reporting.traces import traces
 from run_log.run import gather
 from tests.helpers.run_log_samples import Logged, synthetic, write
@@ -169,6 +169,15 @@ def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged
         for topic, message, t in messages
     ]
     assert summarise(gather(config, slow)).late_ticks == 3
+
+
+def test_a_second_without_a_tick_has_no_prediction_error(
+    config: Config, messages: list[Logged], recwarn: pytest.WarningsRecorder
+) -> None:
+    """At a period of 4 s."""
+    slow = summarise(gather(override(config, ["rate=0.25"]), messages))
+    assert slow.prediction_error == PredictionError(None, None)
+    assert not recwarn.list
 
 
 # -- pictures --------------------------------------------------------------------------------------------

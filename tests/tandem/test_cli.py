@@ -33,6 +33,7 @@ KEYS = {
         "soft_ticks",
     ),
     *(
+        "episodes",
         "constraint_violations",
         "excess_between_samples",
         "J",

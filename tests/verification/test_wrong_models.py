@@ -5,10 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lbmpc.plants import PLANTS
-from node_runtime.config.sections import load
-from run_log.reporting.summary import summarise
-from tandem.experiments.simulation.lockstep import follow
-from tests.helpers.plants.two_tanks import SETTINGS, TWO_TANKS
+from tests.helpers.plants.two_tanks import TWO_TANKS
 from verification.wrong_models import Row, run_one, verdict
 
 
@@ -53,14 +50,3 @@ def test_a_run_is_of_the_true_plant_in_episodes_that_begin_alike(monkeypatch: py
     costs = {oracle: run_one("tanks", 0.25, oracle, 2, more).J for oracle in ("linear", "perfect")}
     assert costs["linear"][0] == pytest.approx(costs["linear"][1], rel=1e-9)
     assert costs["perfect"][0] < 0.95 * costs["linear"][0]
-
-
-def test_where_a_sample_is_longer_than_a_second_the_first_one_is_the_first_second(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(PLANTS, "two_tanks", TWO_TANKS)
-    more = ["controller.oracle=linear", "controller.solver.compile=never"]
-    run = follow(load("compressor", ["plant.model=two_tanks", *SETTINGS, *more]), 5).run
-    error = summarise(run).prediction_error
-    assert error.first_second == pytest.approx(run.results[1].prediction_error)
-    assert error.last_second == pytest.approx(run.results[-1].prediction_error)

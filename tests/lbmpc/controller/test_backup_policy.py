@@ -37,6 +37,11 @@ def problem(oracle: Oracle, model: Model = MODEL) -> Problem:
     return build_problem(model, oracle, N)
 
 
+def theta_of(oracle: Oracle, seed: int = 1) -> np.ndarray:
+    """What the oracle begins with; of the perfect one, the plant's parameters."""
+    return oracle.theta(oracle.initial_state(np.random.default_rng(seed)))
+
+
 def outside(x: np.ndarray) -> float:
     """How far x, a deviation, lies outside X, as a share of the half-widths; negative inside."""
     return float(np.max(np.abs(x + PLANT.x_e - 0.5 * (PLANT.x_min + PLANT.x_max)) / HALF)) - 1.0
@@ -60,10 +65,11 @@ def followed(x: np.ndarray, policy: Policy, truth: Truth) -> list[np.ndarray]:
 def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
     """With h known the backup problem's constraints are the true plant's; the nominal plan's are not."""
     oracle, truth = PerfectOracle(MODEL), Truth(PLANT)
-    nominal = Solver(problem(oracle)).solve(X0, np.zeros(oracle.parameters), np.zeros((N, 1)))
+    theta = theta_of(oracle)
+    nominal = Solver(problem(oracle)).solve(X0, theta, np.zeros((N, 1)))
     blind = followed(X0, Policy(nominal.u, np.zeros((1, 4)), np.zeros((N, 4)), 0.0), truth)
     assert max(map(outside, blind)) > 0.02
-    policy = BackupPlanner(problem(oracle), 0.0).policy(X0, np.zeros(oracle.parameters), nominal.u)
+    policy = BackupPlanner(problem(oracle), 0.0).policy(X0, theta, nominal.u)
     assert policy is not None
     states = followed(X0, policy, truth)
     assert max(map(outside, states)) < 1e-4
@@ -74,7 +80,7 @@ def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
 def test_the_margin_is_kept_once_it_has_grown() -> None:
     oracle = PerfectOracle(MODEL)
     x = np.array([-0.1, -0.4, 0.0, 0.0])
-    policy = BackupPlanner(problem(oracle), 0.05).policy(x, np.zeros(oracle.parameters), np.zeros((N, 1)))
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta_of(oracle), np.zeros((N, 1)))
     assert policy is not None
     assert max(map(outside, policy.states[RAMP + 4 :])) < -0.05 + 1e-4
 
@@ -85,7 +91,8 @@ def test_the_margin_is_kept_once_it_has_grown() -> None:
         (0.15, 0.02, 0.02, 0.02),  # leads back with all of it
         (0.15, 0.06, 0.01, 0.02),  # with all of it the flow falls to a third
         (0.145, 0.02, 0.001, 0.003),
-        (0.135, 0.06, 0.0, 0.0),  # too late, but nearer
+        (0.135, 0.06, 0.0, 0.0),  # too late, but cheaper
+        (0.13, 0.06, 0.0, 0.0),  # ends no nearer without one, but stays at the edge of X until then
     ],
 )
 def test_as_much_of_the_margin_is_kept_as_leads_back(
@@ -94,13 +101,16 @@ def test_as_much_of_the_margin_is_kept_as_leads_back(
     """From the paper's x0 and below the flow recovers only while the pressure is near its bound."""
     oracle = PerfectOracle(MODEL)
     x = np.array([flow - PLANT.x_e[0], *X0[1:]])
-    policy = BackupPlanner(problem(oracle), margin).policy(x, np.zeros(0), np.zeros((N, 1)))
+    policy = BackupPlanner(problem(oracle), margin).policy(x, theta_of(oracle), np.zeros((N, 1)))
     assert policy is not None
     assert least <= policy.margin <= most
     states = followed(x, policy, Truth(PLANT))
     if policy.margin > 0.0:
         assert max(map(outside, states)) < 1e-3 - policy.margin
         assert distance(states[-1]) < 0.95 * distance(x)
+    else:
+        # With all of it, by a tenth of the half-width and more.
+        assert max(map(outside, states)) < 0.01
 
 
 @pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-4), np.array([-0.1, -0.4, 0.0, 0.0])])
@@ -116,20 +126,18 @@ def test_a_margin_that_costs_nothing_is_kept(
         return least_distance(*arguments)
 
     monkeypatch.setattr("lbmpc.solver.constraint_rows.least_distance", counted)
-    theta = oracle.theta(oracle.initial_state(np.random.default_rng(1)))
-    policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta, np.zeros((N, 1)))
+    policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta_of(oracle), np.zeros((N, 1)))
     assert policy is not None
     assert policy.margin == 0.05
     assert len(solved) == STEPS
 
 
 def test_a_margin_is_not_given_up_for_nothing() -> None:
-    """A valve that hardly moves: no plan leads back, and none without a margin ends nearer."""
+    """A valve that hardly moves: no plan leads back, and none without a margin costs less."""
     stuck = replace(PLANT, u_min=PLANT.u_e - 1e-6, u_max=PLANT.u_e + 1e-6)
     model = build_model(stuck, MODEL.period)
-    policy = BackupPlanner(problem(PerfectOracle(model), model), 0.05).policy(
-        X0, np.zeros(0), np.zeros((N, 1))
-    )
+    oracle = PerfectOracle(model)
+    policy = BackupPlanner(problem(oracle, model), 0.05).policy(X0, theta_of(oracle), np.zeros((N, 1)))
     assert policy is not None
     assert distance(policy.states[-1]) > distance(X0)
     assert policy.margin == 0.05
@@ -176,7 +184,7 @@ def test_the_learned_states_are_what_the_rows_hold(architecture: str) -> None:
 def test_numbers_that_are_none_give_no_policy() -> None:
     oracle = oracle_named("dnn", MODEL)
     planner = BackupPlanner(problem(oracle), 0.01)
-    theta = oracle.theta(oracle.initial_state(np.random.default_rng(0)))
+    theta = theta_of(oracle)
     assert planner.policy(X0, theta, np.zeros((N, 1))) is not None
     assert planner.policy(X0 * np.nan, theta, np.zeros((N, 1))) is None
     assert planner.policy(X0, np.full_like(theta, np.inf), np.zeros((N, 1))) is None

@@ -429,6 +429,6 @@ def test_a_region_that_is_none_is_named():
     ],
 )
 def test_what_has_no_bound_is_named_with_its_state_and_a_remedy(rhs: Rhs, says: str) -> None:
-    model = build_model(replace(PENDULUM, rhs=rhs), 0.1)
+    model = build_model(replace(PENDULUM, rhs=rhs, parameters={}, equations=None), 0.1)
     with pytest.raises(DisturbanceError, match=says):
         bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))

@@ -26,6 +26,8 @@ def one_state(rhs: Rhs) -> Model:
         states=("level",),
         inputs=("flow",),
         units={"level": "m", "flow": "m/s", "t": "s"},
+        parameters={},
+        equations=None,
         rhs=rhs,
         x_e=np.zeros(1),
         x_min=np.array([-1.0]),

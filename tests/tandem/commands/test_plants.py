@@ -30,7 +30,7 @@ name = "own"
 title = "A plant that cannot be used"
 about = "It has no scale."
 steps = 10
-[base]
+[set]
 plant = { model = "integrator" }
 [[group]]
 name = "one"
@@ -161,4 +161,4 @@ def test_certified_sets_of_an_unbounded_plant_are_refused_with_the_reason(
     monkeypatch.setitem(PLANTS, "integrator", INTEGRATOR)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert main(["sets", "compute", *OPTIONS, "--kind", "given", "--out", str(tmp_path / "sets.json")]) == 3
-    assert "speed in [-inf, inf]; bounds must be finite" in capsys.readouterr().err
+    assert "not bounded: speed below, speed above" in capsys.readouterr().err

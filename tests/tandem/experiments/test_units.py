@@ -16,7 +16,8 @@ from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.rescaled import rescaled
 
 STEPS = 50
-ORACLES = ("linear", "l2nw", "dnn", "perfect")
+ORACLES = ("linear", "constant", "l2nw", "dnn", "dnn adaptation.law=kalman", "perfect")
+"""Names, with what else is set behind them."""
 COMPRESSOR = PLANTS["moore_greitzer"]
 TWO = (2.0**20, 2.0**-20, 2.0**7, 2.0**-11), (2.0**-17,)
 TEN = (1e6, 1e-6, 1e-3, 1e4), (1e5,)
@@ -39,7 +40,7 @@ class Loop:
 def run(plant: Plant, x: np.ndarray, u: np.ndarray, oracle: str, steps: int = STEPS) -> Loop:
     """The plant with its states times x and its inputs times u, and the configuration's W, Q and R with it."""
     settings = [
-        f"controller.oracle={oracle}",
+        *f"controller.oracle={oracle}".split(),
         f"controller.W={(W * x).tolist()}",
         f"controller.Q={(Q / x**2).tolist()}",
         f"controller.R={(R / u**2).tolist()}",
