@@ -89,7 +89,8 @@ def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) 
         along_window = np.hstack([jacobian[:, d:behind], jacobian[:, :d], jacobian[:, behind:]])
         per_unit = np.tile(description.input_scale, description.window) / oracle.output_scale[:, None]
         found = np.array([slope[p] for slope in slopes])
-        bound = 1e-12 * (1 + np.abs(found * per_unit).max())
+        # Slopes are sums that cancel: weights of size 10 cost them a digit.
+        bound = 1e-11 * (1 + np.abs(found * per_unit).max())
         assert (np.abs(along_window - found) * per_unit).max() < bound
 
     phi = phi_of(network, rows)
