@@ -17,6 +17,8 @@ PLANT_RUN, RUN, TRAINER_RUN = "plant-1", "controller-1", "trainer-1"
 MS = 1_000_000
 GAIN = np.array([[-1.5, 1.2, 0.1, -0.005]])
 Logged = tuple[Topic, m.Message, int]
+STEPS = 60
+"""Ticks of the log that tests share."""
 
 
 def synthetic(config: Config | None = None, steps: int = 100, seed: int = 0) -> tuple[Config, list[Logged]]:

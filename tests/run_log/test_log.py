@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, from_json, override
+from node_runtime.config.sections import Config, from_json
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
@@ -28,26 +28,9 @@ from run_log.run import gather
 from run_log.writing.durable_file import Sink
 from run_log.writing.save import save
 from run_log.writing.writer import LogWriter
-from tests.helpers.run_log_samples import Logged, synthetic, write
+from tests.helpers.run_log_samples import STEPS, Logged
 
-STEPS = 60
 PLANT = get_plant("moore_greitzer")
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    # Small chunks, so that a short log has many.
-    return override(Config(), ["log.chunk_bytes=8192", "controller.keyframe_every=20", "seed=7"])
-
-
-@pytest.fixture(scope="module")
-def messages(config: Config) -> list[Logged]:
-    return synthetic(config, STEPS)[1]
-
-
-@pytest.fixture(scope="module")
-def whole(config: Config, messages: list[Logged], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("log") / "run.mcap", config, messages)
 
 
 def payloads(messages: list[Logged]) -> dict[str, list[bytes]]:

@@ -27,26 +27,9 @@ from run_log.reporting.report import picture, report
 from run_log.reporting.summary import PredictionError, summarise
 from run_log.reporting.traces import traces
 from run_log.run import gather
-from tests.helpers.run_log_samples import Logged, synthetic, write
+from tests.helpers.run_log_samples import STEPS, Logged
 
-STEPS = 60
 PLANT = get_plant("moore_greitzer")
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    # Small chunks, so that a short log has many.
-    return override(Config(), ["log.chunk_bytes=8192", "controller.keyframe_every=20", "seed=7"])
-
-
-@pytest.fixture(scope="module")
-def messages(config: Config) -> list[Logged]:
-    return synthetic(config, STEPS)[1]
-
-
-@pytest.fixture(scope="module")
-def whole(config: Config, messages: list[Logged], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("log") / "run.mcap", config, messages)
 
 
 # -- figures ---------------------------------------------------------------------------------------------
