@@ -13,7 +13,8 @@ from pathlib import Path
 
 import threadpoolctl
 
-from node_runtime.config.sections import Config, to_json
+from node_runtime.config.loading import to_json
+from node_runtime.config.sections import Config
 from protocol.messages import RunInfo
 
 SCIENCE = ("tandem-control", "numpy", "scipy", "casadi", "daqp")

@@ -22,7 +22,8 @@ from rich.console import Console
 from benchmarks.document_block import Marks
 from controller_node.core import ControllerCore
 from lbmpc.plants import Plant, PlantError
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from tandem.experiments.simulation.faults import Faults

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults

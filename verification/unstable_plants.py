@@ -15,7 +15,7 @@ from rich.console import Console
 from lbmpc.model import LARGEST_GROWTH
 from lbmpc.model import build_model as nominal_model
 from lbmpc.plants import PLANTS, Plant
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from run_log.reporting.summary import summarise
 from tandem.experiments.simulation.lockstep import follow
 from tests.helpers.plants.pendulum import inverted

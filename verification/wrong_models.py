@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 
 from lbmpc.plants import PLANTS, get_plant
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from node_runtime.config.shipped import config_file
 from run_log.reporting.summary import summarise
 from run_log.run import Run

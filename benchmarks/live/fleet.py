@@ -29,7 +29,8 @@ from benchmarks.live.ports import free_port
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
 from node_runtime import provenance
 from node_runtime.bus.session import session_config
-from node_runtime.config.sections import Config, TrainerConfig, override, to_toml
+from node_runtime.config.loading import override, to_toml
+from node_runtime.config.sections import Config, TrainerConfig
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m

@@ -13,7 +13,7 @@ from benchmarks.solver.rivals import Rival
 from controller_node.core import ControllerCore
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
-from node_runtime.config.sections import override
+from node_runtime.config.loading import override
 from protocol import codec
 from protocol import messages as m
 

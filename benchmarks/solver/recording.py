@@ -15,7 +15,8 @@ from lbmpc.problem import Problem, build_problem
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
 from node_runtime.config.literals import OracleName
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 
 SEED = 0
 LAYERS = 2

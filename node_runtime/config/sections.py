@@ -1,4 +1,4 @@
-"""Configuration: typed, strict, one tree for all processes, read from TOML.
+"""The sections of the configuration: typed, strict, one tree for all processes. `loading` reads and checks it.
 
 A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file and
 the nearest right key or the allowed values. Defaults are the paper's experiment, with settled values for what
@@ -7,21 +7,13 @@ the paper leaves out.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
-import tomli_w
 
 from network_model.description import LAYERS, Width
-from network_model.operations import BOUNDED, Activation
-from network_model.registry import get_architecture
-from node_runtime.config import literals, strict
-from node_runtime.config.shipped import config_file
-from node_runtime.config.strict import ConfigError, Fail
-from protocol.codec import first_non_finite
+from network_model.operations import Activation
+from node_runtime.config import literals
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -305,184 +297,3 @@ class Config(Section, frozen=True):
     def fast(self) -> bool:
         """Whether the loops have a priority and so little time that their cores matter."""
         return self.realtime.priority > 0 and self.period < AWAKE_BELOW
-
-
-def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Read a TOML file, or the shipped configuration of that name, and apply `section.key=value` overrides on top.
-
-    None: all defaults.
-
-    Raises:
-        ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
-    """
-    if path is None:
-        return _overridden({}, overrides or [], "configuration")
-    return _overridden(strict.load_tree(config_file(path)), overrides or [], str(path))
-
-
-def override(config: Config, assignments: list[str]) -> Config:
-    """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
-    return _overridden(to_tree(config), assignments, "configuration")
-
-
-def _overridden(tree: dict[str, Any], assignments: list[str], where: str) -> Config:
-    origins = {strict.apply_override(tree, text): f"--set {text}" for text in assignments}
-    return from_tree(tree, where, origins)
-
-
-def from_tree(
-    tree: dict[str, Any], where: str = "configuration", origins: Mapping[str, str] | None = None
-) -> Config:
-    """Convert a plain tree to a `Config`. Raises `ConfigError`.
-
-    `~` at the beginning of a path is the home folder. where: the file, for messages; origins: for keys that come from
-    elsewhere (`trainer.batch`), from where.
-    """
-    return _at_home(_checked(tree, where, origins), strict.failing(where, origins))
-
-
-def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
-    """The tree as a `Config`, its paths as they were written."""
-    fail = strict.failing(where, origins)
-    config = strict.convert(tree, Config, fail)
-    _check_texts(tree, fail)
-    infinite = first_non_finite(config)
-    if infinite is not None:
-        fail(infinite, f"{infinite} is not a finite number")
-    if config.period > LONGEST_PERIOD:
-        fail("rate", f"rate = {config.rate}: a period of {config.period:g} s; at most {LONGEST_PERIOD:g} s")
-    activation = config.network.activation
-    if activation not in BOUNDED:
-        fail(
-            "network.activation",
-            f"network.activation = {activation!r} is unbounded, and the last layer must be bounded; "
-            f"one of {', '.join(BOUNDED)}",
-        )
-    _check_architecture(config.network, fail)
-    config = _with_horizon(config, tree, fail, origins or {})
-    delay = config.controller.input_delay_ms
-    if delay is not None and delay > 500.0 * config.period:
-        fail(
-            "controller.input_delay_ms",
-            f"controller.input_delay_ms = {delay:g} is more than half a period, {500.0 * config.period:g} ms at "
-            f"rate = {config.rate:g} Hz: so late a command cannot be predicted for",
-        )
-    if config.trainer.min_samples > config.trainer.capacity:
-        fail(
-            "trainer.min_samples",
-            f"trainer.min_samples = {config.trainer.min_samples} exceeds trainer.capacity = "
-            f"{config.trainer.capacity}: the first training would never come",
-        )
-    for i, place in enumerate(config.trainer.fleet):
-        if place.name in {earlier.name for earlier in config.trainer.fleet[:i]}:
-            fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is there twice")
-    return config
-
-
-def _with_horizon(config: Config, tree: dict[str, Any], fail: Fail, origins: Mapping[str, str]) -> Config:
-    """With `horizon_seconds` as steps. Of the two keys that say the same, one in `origins` comes after the file."""
-    controller = config.controller
-    seconds, named = controller.horizon_seconds, "controller.horizon_seconds"
-    if seconds is None:
-        return config
-    steps = max(1, round(seconds * config.rate))
-    if tree["controller"].get("horizon") is not None:
-        later = [key for key in ("controller.horizon", named) if key in origins]
-        if len(later) != 1:
-            fail(named, f"controller.horizon and {named} are both given; leave one of them out")
-        if later != [named]:
-            steps = controller.horizon
-    if steps > LONGEST_HORIZON:
-        fail(
-            named,
-            f"{named} = {seconds:g} is {steps} steps at rate = {config.rate:g} Hz; at most {LONGEST_HORIZON}",
-        )
-    settled = msgspec.structs.replace(controller, horizon=steps, horizon_seconds=None)
-    return msgspec.structs.replace(config, controller=settled)
-
-
-def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
-    """Every text must be UTF-8, for it travels and is logged; the log's own name may be any bytes."""
-    if isinstance(value, dict):
-        for name, below in value.items():
-            _check_texts(below, fail, f"{key}.{name}".lstrip("."))
-    elif isinstance(value, list):
-        for i, below in enumerate(value):
-            _check_texts(below, fail, f"{key}[{i}]")
-    elif isinstance(value, str) and value != (said := strict.readable(value)) and key != "log.path":
-        fail(key, f"{key} = '{said}' is not UTF-8, as a configuration is; choose another name")
-
-
-def _at_home(config: Config, fail: Fail) -> Config:
-    """With the home folder for the `~` that a shell would have replaced."""
-
-    def found(key: str, section: Section) -> Any:
-        *_, last = key.split(".")
-        path = getattr(section, last)
-        user = (path or "").partition("/")
-        if not user[0].startswith("~") or (not user[1] and path != "~"):
-            return section
-        there = os.path.expanduser(path)
-        if there.startswith("~"):
-            fail(key, f"{key} = {path!r}: no home folder of {user[0]} is known; write the folder out")
-        return msgspec.structs.replace(section, **{last: there})
-
-    controller = found("controller.sets", found("controller.checkpoint", config.controller))
-    bus = msgspec.structs.replace(config.bus, tls=found("bus.tls.keys", config.bus.tls))
-    fleet = [found(f"trainer.fleet[{i}].keys", place) for i, place in enumerate(config.trainer.fleet)]
-    trainer = msgspec.structs.replace(config.trainer, fleet=fleet)
-    log = found("log.path", config.log)
-    return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
-
-
-def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
-    try:
-        known = get_architecture(network.architecture).options
-    except ValueError as error:
-        fail("network.architecture", f"network.architecture: {error}")
-    for key in network.options:
-        if key not in known:
-            hint = strict.did_you_mean(key, known, f"it has {', '.join(known) or 'none'}")
-            option = f"network.options.{key}"
-            fail(option, f"{option}: {network.architecture} has no such option; {hint}")
-
-
-def from_json(text: str) -> Config:
-    """The inverse of `to_json`: a configuration as a log carries it. Raises `ConfigError`."""
-    try:
-        tree = msgspec.json.decode(text)
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
-    if not isinstance(tree, dict):
-        raise ConfigError("the log's configuration is not a table")
-    return _checked(tree, "the log's configuration")
-
-
-def to_json(config: Config) -> str:
-    return msgspec.json.encode(_readable(config)).decode()
-
-
-def to_tree(config: Config) -> dict[str, Any]:
-    """Plain dictionaries and lists, in the order of the declaration."""
-    return msgspec.to_builtins(config)
-
-
-def to_toml(config: Config) -> str:
-    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out.
-
-    A `log.path` that is not UTF-8, which TOML is, comes back as text that shows its bytes.
-    """
-    return tomli_w.dumps(_without_none(to_tree(_readable(config))))
-
-
-def _readable(config: Config) -> Config:
-    path = strict.readable(config.log.path)
-    if path == config.log.path:
-        return config
-    return msgspec.structs.replace(config, log=msgspec.structs.replace(config.log, path=path))
-
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_none(below) for key, below in value.items() if below is not None}
-    return [_without_none(item) for item in value] if isinstance(value, list) else value

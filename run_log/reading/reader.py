@@ -7,7 +7,8 @@ from pathlib import Path
 
 from mcap.records import Attachment, Channel, Header, Message, Metadata
 
-from node_runtime.config.sections import Config, from_json
+from node_runtime.config.loading import from_json
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from run_log.errors import LogError

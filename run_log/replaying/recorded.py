@@ -7,7 +7,8 @@ from typing import Any
 
 from controller_node.certified_sets import CertifiedSets
 from lbmpc.sets.certificate import CertificateError
-from node_runtime.config.sections import Config, from_json
+from node_runtime.config.loading import from_json
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import messages as m
 from protocol import topics

@@ -8,7 +8,8 @@ import msgspec
 
 from controller_node.certified_sets import CertifiedSets
 from controller_node.core import ControllerCore
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.provenance import versions
 from node_runtime.realtime.scheduling import one_blas_thread

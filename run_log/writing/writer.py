@@ -17,7 +17,8 @@ import msgspec
 from lbmpc.plants import Plant
 from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
-from node_runtime.config.sections import Config, to_json, to_toml
+from node_runtime.config.loading import to_json, to_toml
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import readable
 from protocol import codec, topics
 from protocol.codec import Head

@@ -76,7 +76,7 @@ class Configured(Command):
 
     def resolve(self) -> tuple[Config, dict[str, Any]]:
         """The configuration: file, then --set, then the command's options. And the tree as it was given."""
-        from node_runtime.config.sections import from_tree
+        from node_runtime.config.loading import from_tree
         from node_runtime.config.shipped import config_file
         from node_runtime.config.strict import ConfigError, apply_override, load_tree
 

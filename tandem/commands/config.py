@@ -17,7 +17,7 @@ class ConfigShow(Configured):
 
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
-        from node_runtime.config.sections import to_toml, to_tree
+        from node_runtime.config.loading import to_toml, to_tree
 
         if self.json:
             terminal.emit(to_tree(config))

@@ -63,7 +63,7 @@ class Run(Configured):
 
         from controller_node.build import build_model, build_plant
         from controller_node.guarantee import guarantee
-        from node_runtime.config.sections import to_toml
+        from node_runtime.config.loading import to_toml
         from tandem.live.files import claimed
         from tandem.live.monitor import Monitor
         from tandem.live.supervisor import Impatient, StartError, trains, wishes

@@ -62,7 +62,7 @@ class Simulate(Configured):
         from controller_node.build import build_model
         from controller_node.guarantee import guarantee
         from lbmpc.plants import PlantError
-        from node_runtime.config.sections import override
+        from node_runtime.config.loading import override
         from run_log.reporting.summary import summarise
         from run_log.writing.save import save
         from tandem import summary_table

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from protocol import messages as m
 from protocol import topics

@@ -27,7 +27,8 @@ from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from network_model.description import hash_layers
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, load, override
+from node_runtime.config.loading import load, override
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.router import open_router
 from protocol import codec, topics

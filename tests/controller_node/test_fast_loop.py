@@ -16,7 +16,8 @@ from network_model.description import hash_layers
 from node_runtime.bus.inbox import Received
 from node_runtime.bus.mailbox import Mailbox
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, from_json, override, to_json
+from node_runtime.config.loading import from_json, override, to_json
+from node_runtime.config.sections import Config
 from node_runtime.health import HealthPublisher
 from node_runtime.realtime.pacer import Slot
 from node_runtime.rejected import RejectedMessages

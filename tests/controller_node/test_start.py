@@ -18,7 +18,7 @@ def test_a_controller_loads_nothing_slow_that_it_does_not_need() -> None:
     code = (
         "import sys, tandem.cli, tandem.terminal, controller_node.node\n"
         "from controller_node.core import ControllerCore\n"
-        "from node_runtime.config.sections import Config, override\n"
+        "from node_runtime.config.loading import override; from node_runtime.config.sections import Config\n"
         "ControllerCore(override(Config(), ['controller.solver.compile=\"never\"']), 'controller-x')\n"
         f"sys.stdout.write(' '.join(name for name in {SLOW} if name in sys.modules))"
     )

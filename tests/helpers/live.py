@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterator
 from typing import get_args
 
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
-from node_runtime.config.sections import Config, override, to_json
+from node_runtime.config.loading import override, to_json
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from protocol import codec
 from protocol import messages as m
@@ -23,7 +24,7 @@ from protocol.topics import Lane, Topic, topic_of
 
 PROGRAM = (
     "import logging, sys; logging.basicConfig(format='%(message)s', level='INFO');"
-    "from node_runtime.config.sections import from_json; from {module} import main;"
+    "from node_runtime.config.loading import from_json; from {module} import main;"
     "sys.exit(main(from_json(sys.argv[1])))"
 )
 

@@ -25,7 +25,8 @@ from lbmpc.solver.solution import Status
 from network_model import architectures, registry
 from network_model.description import NetworkDescription, hash_layers
 from network_model.registry import get_architecture
-from node_runtime.config.sections import Config, load, override
+from node_runtime.config.loading import load, override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import topics
 from run_log.replaying.replay import replay

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import REPEATED_SIGNAL_S, new_run_id, run_process, stopped_by_signals

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from lbmpc.plants import Plant, PlantError, Truth, get_plant
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.router import open_router
 from plant_sim import node
 from plant_sim.simulator import PlantSim

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from tests.helpers.run_log_samples import STEPS, Logged, synthetic, write
 
 

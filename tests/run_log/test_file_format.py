@@ -9,7 +9,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from run_log.errors import LogError
 from run_log.file_format import FORMAT, IDENTITY, PROFILE, VERSIONS
 from run_log.reading.reader import read_run

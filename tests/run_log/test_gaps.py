@@ -11,7 +11,7 @@ import pytest
 from lbmpc.plants import get_plant
 from node_runtime.bus.session import PATIENT_LEASE_MS, lease_ms
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import override
+from node_runtime.config.loading import override
 from node_runtime.realtime import clock
 from node_runtime.router import open_router
 from protocol import codec, topics

@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, from_json
+from node_runtime.config.loading import from_json
+from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError, LogExistsError

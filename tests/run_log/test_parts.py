@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogExistsError

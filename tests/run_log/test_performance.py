@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lbmpc.plants.base import Plant
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from run_log.reporting.motion import Trajectory
 from run_log.reporting.performance import Performance, performance
 

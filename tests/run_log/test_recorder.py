@@ -14,7 +14,8 @@ import pytest
 import zenoh
 
 from node_runtime.bus.zenoh_bus import Bus, session_config
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.router import open_router
 from protocol import codec, topics

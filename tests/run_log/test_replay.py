@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from controller_node.core import ControllerCore
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m

@@ -17,7 +17,8 @@ import pytest
 
 from lbmpc import plants
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from protocol import topics
 from run_log.errors import LogError
 from run_log.reading.reader import read_run

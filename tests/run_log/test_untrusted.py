@@ -16,7 +16,8 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from protocol import codec, topics
 from run_log.errors import LogError
 from run_log.file_format import CONFIG, LIBRARY, PROFILE

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.config.sections import Config, to_tree
+from node_runtime.config.loading import to_tree
+from node_runtime.config.sections import Config
 from tandem.cli import main
 
 COMMANDS = (

@@ -23,7 +23,8 @@ from controller_node.outbox import Outbox
 from network_model.description import LAYERS, NetworkDescription, hash_layers, initial_hidden
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus, session_config
-from node_runtime.config.sections import BusConfig, Config, TrainerConfig, to_json
+from node_runtime.config.loading import to_json
+from node_runtime.config.sections import BusConfig, Config, TrainerConfig
 from node_runtime.health import HealthPublisher
 from node_runtime.provenance import run_info
 from node_runtime.realtime import clock

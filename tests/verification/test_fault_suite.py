@@ -20,7 +20,7 @@ from benchmarks.document_block import DocumentError
 from benchmarks.live import stalls
 from lbmpc.plants import get_plant
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import override, to_json
+from node_runtime.config.loading import override, to_json
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
@@ -358,7 +358,7 @@ LINGER_S = 10.0
 FAR = """
 import sys, threading
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import from_json
+from node_runtime.config.loading import from_json
 from protocol import topics
 with Bus(from_json(sys.argv[1]), "plant", "plant-far") as bus:
     kept = [bus.queue(topics.OUTPUT_WEIGHTS), bus.queue(topics.COMMAND)]

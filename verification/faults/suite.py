@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
 from run_log.errors import LogError

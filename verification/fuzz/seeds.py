@@ -5,7 +5,8 @@ from __future__ import annotations
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from node_runtime.bus.batches import Waiting, encode_batch
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.provenance import run_info
 from plant_sim.node import build
 from protocol import codec, topics

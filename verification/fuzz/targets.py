@@ -21,7 +21,8 @@ from lbmpc.sets.certificate import CertificateError, encode
 from network_model.description import NetworkDescription
 from node_runtime.bus.batches import unbatch
 from node_runtime.bus.mailbox import Delivery
-from node_runtime.config.sections import Config, from_json, from_tree, to_json, to_toml
+from node_runtime.config.loading import from_json, from_tree, to_json, to_toml
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics

@@ -10,7 +10,8 @@ import numpy as np
 
 from lbmpc.plants import Plant
 from node_runtime import provenance
-from node_runtime.config.sections import Config, to_toml
+from node_runtime.config.loading import to_toml
+from node_runtime.config.sections import Config
 from run_log.reporting.canvas import PictureError, drawing
 from run_log.reporting.performance import SETTLED
 from tandem.experiments.reporting import findings, pictures, style

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from lbmpc.plants import Plant
-from node_runtime.config.sections import Config, Count, Section, from_tree
+from node_runtime.config.loading import from_tree
+from node_runtime.config.sections import Config, Count, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
 from tandem.experiments.simulation.faults import Faults

@@ -18,7 +18,8 @@ from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.least_distance import Nearest, least_distance
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.replaying.replay import replay

@@ -13,7 +13,7 @@ from lbmpc.model import build_model
 from lbmpc.oracles import ConstantOracle, LinearOracle, Oracle
 from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.lockstep import follow
 from tests.helpers.plants.integrator import INTEGRATOR

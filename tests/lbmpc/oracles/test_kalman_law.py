@@ -18,7 +18,8 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import OracleState, Realise
 from lbmpc.oracles.dnn.adaptation_law import project_columns
 from lbmpc.oracles.dnn.kalman_law import Kalman, KalmanLaw, nearest_within
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from run_log.replaying.replay import replay
 from tandem.experiments.simulation.lockstep import follow

@@ -14,7 +14,8 @@ from lbmpc.oracles.base import HiddenSet, OracleState, Verdict
 from lbmpc.oracles.dnn.adoption import IN_USE, NEWEST
 from lbmpc.oracles.dnn.trial import TRIED, Finding, Trial, empty, had, newest, remember, tried
 from network_model.description import hash_layers
-from node_runtime.config.sections import Config, load, override
+from node_runtime.config.loading import load, override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import Summary, summarise

@@ -14,7 +14,7 @@ from lbmpc.plants import PLANTS, Plant
 from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Status
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.plants.pendulum import inverted

@@ -11,7 +11,8 @@ from node_runtime.bus.batches import UnbatchingMailbox
 from node_runtime.bus.bulk_queue import BulkQueue
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.rejected import RejectedMessages
 from node_runtime.router import open_router
 from protocol import codec, topics

@@ -15,7 +15,8 @@ import zenoh
 from node_runtime import router
 from node_runtime.bus.mailbox import Delivery, Mailbox
 from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted, session_config
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from node_runtime.router import open_router

@@ -11,17 +11,9 @@ import pytest
 from msgspec import inspect
 
 from lbmpc.plants import get_plant
+from node_runtime.config.loading import from_json, from_tree, load, override, to_json, to_toml, to_tree
 from node_runtime.config.plant import plant_of, true_plant_of
-from node_runtime.config.sections import (
-    Config,
-    from_json,
-    from_tree,
-    load,
-    override,
-    to_json,
-    to_toml,
-    to_tree,
-)
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from tests.helpers.paths import CONFIGS
 

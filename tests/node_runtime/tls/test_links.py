@@ -16,7 +16,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from node_runtime.bus.session import session_config
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages

@@ -12,7 +12,8 @@ from controller_node.build import build_backup, build_controller, build_model
 from lbmpc.controller.signals import Observation
 from lbmpc.plants import PLANTS, Plant
 from lbmpc.solver.constraint_rows import Rows
-from node_runtime.config.sections import Config, override
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
 from run_log.writing.save import save

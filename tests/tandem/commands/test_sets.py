@@ -30,7 +30,8 @@ from lbmpc.plants import PLANTS
 from lbmpc.sets import construct as construction
 from lbmpc.sets.certificate import CertificateError, model_of
 from lbmpc.sets.geometry.polytope import SetError
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import topics
 from run_log.errors import LogError

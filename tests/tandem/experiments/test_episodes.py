@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lbmpc.plants import get_plant
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from protocol import messages as m
 from protocol import topics
 from run_log.replaying.replay import replay

@@ -11,7 +11,8 @@ from lbmpc.model import build_model
 from lbmpc.oracles import DnnOracle, PerfectOracle
 from lbmpc.oracles.dnn.adaptation_law import refit
 from lbmpc.plants import PlantError, Truth, get_plant
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from run_log.replaying.replay import replay
 from run_log.run import Run

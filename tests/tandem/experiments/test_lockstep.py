@@ -8,7 +8,7 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from protocol import topics
 from run_log.reporting.summary import Summary, summarise
 from run_log.run import Run

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lbmpc.plants import PLANTS, Plant
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from run_log.run import Run
 from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.plants.pendulum import PENDULUM

@@ -11,7 +11,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from node_runtime.config.sections import Config, from_json, load, override, to_json, to_toml
+from node_runtime.config.loading import from_json, load, override, to_json, to_toml
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.tls import credentials
 from protocol.messages import Health

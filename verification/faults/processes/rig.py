@@ -17,7 +17,8 @@ import msgspec
 from benchmarks.live import stalls
 from benchmarks.live.ports import free_port
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
-from node_runtime.config.sections import Config, override, to_toml
+from node_runtime.config.loading import override, to_toml
+from node_runtime.config.sections import Config
 from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from node_runtime.config.sections import load
+from node_runtime.config.loading import load
 from node_runtime.realtime import clock
 from plant_sim import node
 from plant_sim.simulator import CommandVerdict, PlantSim

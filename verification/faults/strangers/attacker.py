@@ -24,7 +24,8 @@ import zenoh
 from network_model.description import hash_layers
 from node_runtime.bus.session import connect
 from node_runtime.bus.zenoh_bus import Bus, Mailbox
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m

@@ -22,7 +22,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509 import load_pem_x509_certificate
 
 from node_runtime.bus.session import session_config
-from node_runtime.config.sections import Config, load
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
 from node_runtime.tls import access_control, credentials
