@@ -21,7 +21,7 @@ from rich.console import Console
 
 from benchmarks.document_block import Marks
 from controller_node.core import ControllerCore
-from lbmpc.plants import Plant, PlantError
+from lbmpc.plants import Plant, PlantError, Truth
 from node_runtime.config.loading import load
 from node_runtime.config.sections import Config
 from plant_sim.simulator import PlantSim
@@ -87,7 +87,8 @@ def _silence(
 ) -> Silence:
     """The true plant from this tick's sample on, with its last command and nothing after it."""
     assert tick.state is not None
-    sim = PlantSim(plant, config.period, np.array(tick.state.x), config.plant.plan_patience, PLANT)
+    x0, patience = np.array(tick.state.x), config.plant.plan_patience
+    sim = PlantSim(plant, Truth(plant), config.period, x0, patience, PLANT)
     sim.sample(0.0)
     sim.command(msgspec.structs.replace(command, state_seq=0), delay)
     if backup is not None:
