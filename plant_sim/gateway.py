@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from lbmpc.plants import Plant, PlantError, get_plant
+from lbmpc.plants import Known, Plant, PlantError, get_plant
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.session import OpenInterrupted
 from node_runtime.bus.zenoh_bus import Bus
@@ -72,7 +72,7 @@ class Gateway:
         ConfigError: a configuration that is wrong or does not fit the plant.
     """
 
-    def __init__(self, known: Plant | None, config: Config | Path | str, *, simulated: bool = False):
+    def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
         self.config = config if isinstance(config, Config) else load(config)
         self.known = plant_of(self.config, get_plant if known is None else lambda _name: known)
         self._simulated = simulated

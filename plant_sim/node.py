@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 
-from lbmpc.plants import PlantError, Truth, get_plant
+from lbmpc.plants import PlantError, get_plant, true_motion
 from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import run_process
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 def motion_of(config: Config) -> Motion:
     """How the plant that the configuration names really moves. Raises `ConfigError`."""
     plant = true_plant_of(config, get_plant)
-    return Motion(Truth(plant), initial_state(config, plant), config.period)
+    return Motion(true_motion(plant), initial_state(config, plant), config.period)
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:

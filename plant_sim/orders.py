@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol.messages import Backup, Command, InputSource
 
 Measure = Callable[[], np.ndarray | None]
@@ -58,7 +58,7 @@ class Orders:
     acts while it has an entry, the plan's entry while it has one, and the plant's safe input for ever after.
     """
 
-    def __init__(self, plant: Plant, command: Command, arrived: float, patience: float):
+    def __init__(self, plant: Description, command: Command, arrived: float, patience: float):
         """`command` must have the plant's dimensions; what acts of it is clipped to [u_min, u_max]."""
         self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived
@@ -88,8 +88,8 @@ class Orders:
         return safe_drive(self._plant, measure, ends)
 
 
-def safe_drive(plant: Plant, measure: Measure, ends: float) -> Drive:
-    """The plant's safe input; of one that depends on the state, until `ends`, and without feedback where none is known."""
+def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
+    """The safe input; of one that depends on the state: until `ends`, and without its feedback where none is known."""
     if plant.safe_gain is None:
         return Drive(within(plant, plant.safe_input), "safe", math.inf)
     u = plant.safe_input
@@ -100,7 +100,7 @@ def safe_drive(plant: Plant, measure: Measure, ends: float) -> Drive:
     return Drive(within(plant, u), "safe", ends)
 
 
-def within(plant: Plant, u: list[float] | np.ndarray) -> np.ndarray:
+def within(plant: Description, u: list[float] | np.ndarray) -> np.ndarray:
     """The nearest input, (m,), in the actuator's range."""
     return np.minimum(np.maximum(u, plant.u_min), plant.u_max)
 

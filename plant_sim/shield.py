@@ -11,7 +11,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
 from protocol.messages import Backup, Command, InputSource, Piece, PlantState
 
@@ -49,7 +49,7 @@ class Shield:
     the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
-    def __init__(self, plant: Plant, period: float, patience: float, run_id: str, held: bool):
+    def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
         """patience: periods without a command before the plan goes on.
 
         held: the plant stands still until the first command that answers one of its samples; else the safe input acts.

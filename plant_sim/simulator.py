@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description, TrueMotion
 from plant_sim.shield import Shield, Verdict
 from protocol.messages import Backup, Command, PlantState
-
-
-class Truth(Protocol):
-    """How the plant really moves: `lbmpc.plants.Truth`, or whatever stands in its place."""
-
-    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """x(t + dt), (d,), from x(t) = x, (d,), under the constant input u, (m,). Raises `PlantError`."""
-        ...
 
 
 class Motion:
@@ -26,7 +17,7 @@ class Motion:
     It stands still at x0 until the first `write`. Times must not fall.
     """
 
-    def __init__(self, truth: Truth, x0: np.ndarray, period: float):
+    def __init__(self, truth: TrueMotion, x0: np.ndarray, period: float):
         """x0: (d,), plant units."""
         self._truth = truth
         self._x = np.array(x0, dtype=float)
@@ -36,7 +27,7 @@ class Motion:
         self._first: float | None = None
         self._ahead: tuple[float, np.ndarray] | None = None
 
-    def change(self, truth: Truth) -> None:
+    def change(self, truth: TrueMotion) -> None:
         """From the last call on the motion is another: an experiment with a plant that drifts."""
         self._truth, self._ahead = truth, None
 
@@ -88,13 +79,19 @@ class PlantSim:
     """
 
     def __init__(
-        self, plant: Plant, truth: Truth, period: float, x0: np.ndarray, plan_patience: float, run_id: str
+        self,
+        plant: Description,
+        truth: TrueMotion,
+        period: float,
+        x0: np.ndarray,
+        plan_patience: float,
+        run_id: str,
     ):
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on."""
         self._shield = Shield(plant, period, plan_patience, run_id, held=True)
         self._motion = Motion(truth, x0, period)
 
-    def change(self, truth: Truth) -> None:
+    def change(self, truth: TrueMotion) -> None:
         """From the last sample on the true motion is another."""
         self._motion.change(truth)
 

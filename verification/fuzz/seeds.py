@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
-from lbmpc.plants import Truth, get_plant
+from lbmpc.plants import get_plant, true_motion
 from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
@@ -36,7 +36,9 @@ def seeds() -> dict[str, list[bytes]]:
     settings = config()
     core = ControllerCore(settings, "controller-1")
     true = get_plant(settings.plant.model)
-    plant = PlantSim(true, Truth(true), settings.period, true.x0, settings.plant.plan_patience, "plant-1")
+    plant = PlantSim(
+        true, true_motion(true), settings.period, true.x0, settings.plant.plan_patience, "plant-1"
+    )
     outbox = Outbox("controller-1")
     out: dict[str, list[bytes]] = {topic.name: [] for topic in (*topics.ALL, *ANSWERS)}
 
