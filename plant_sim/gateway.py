@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 from lbmpc.plants import Known, Plant, PlantError, get_plant
+from lbmpc.plants.inspection import require_sound
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.session import OpenInterrupted
 from node_runtime.bus.zenoh_bus import Bus
@@ -74,7 +75,7 @@ class Gateway:
 
     def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
         self.config = config if isinstance(config, Config) else load(config)
-        self.known = plant_of(self.config, get_plant if known is None else lambda _name: known)
+        self.known = plant_of(self.config, get_plant if known is None else partial(_given, known))
         self._simulated = simulated
         self._serving: tuple[Shield, Guarded] | None = None
 
@@ -124,7 +125,7 @@ class Gateway:
             _left_at_once(),
             Bus(config, "plant", run_id, stopping) as bus,
         ):
-            loop = _Loop(shield, machine, bus)
+            loop = _Loop(shield, machine, bus, self._simulated)
             info = run_info(config, "plant", run_id, self.known.units)
             standing = "; ".join(filter(None, (note, core_note(place))))
             with HealthPublisher(bus, info, loop.figures, standing) as health, on_core(place):
@@ -132,6 +133,11 @@ class Gateway:
                     loop.run(health, stopping)
                 finally:
                     _leave_safe(shield, machine)
+
+
+def _given(known: Known | Plant, _name: str) -> Known | Plant:
+    require_sound(known)
+    return known
 
 
 def _leave_safe(shield: Shield, machine: Guarded) -> None:
@@ -153,8 +159,8 @@ def _left_at_once() -> Iterator[None]:
 class _Loop:
     """Samples on an absolute grid; between them, commands as they arrive and what else is due."""
 
-    def __init__(self, shield: Shield, machine: Guarded, bus: Bus):
-        self._shield, self._machine, self._bus = shield, machine, bus
+    def __init__(self, shield: Shield, machine: Guarded, bus: Bus, simulated: bool):
+        self._shield, self._machine, self._bus, self._simulated = shield, machine, bus, simulated
         self._period = bus.config.period
         plant = shield.plant
         self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=plant.d, inputs=plant.m)
@@ -194,11 +200,18 @@ class _Loop:
         while not stop.is_set():
             self._take_orders()
             now = clock.now()
-            self._shield.advance(min(now, time), self._machine)
+            self._act(min(now, time))
             if now >= time:
                 return True
             self._commands.wait_any(min(time - now, max(0.0, self._shield.due - now), LONGEST_WAIT_S))
         return False
+
+    def _act(self, t: float) -> None:
+        if self._simulated:
+            self._shield.advance(t, self._machine)
+        elif self._shield.due <= t:
+            # After a standstill only what acts now: a real machine needs no burst of what should have been.
+            self._shield.act(t, self._machine)
 
     def _sample(self, slot: Slot, lateness: float) -> None:
         counts = self._counts

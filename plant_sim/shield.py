@@ -45,8 +45,8 @@ class _Acting:
 class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
-    In a loop: `command` and `backup` take what arrives, `advance` lets it act, `sample` closes a period, `renew` opens
-    the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` closes a period, `renew`
+    opens the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
     def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
@@ -130,11 +130,15 @@ class Shield:
     # -- what acts ---------------------------------------------------------------------------------------
 
     def advance(self, t: float, machine: Machine) -> None:
-        """Let all act that has to by time t, in its order."""
+        """Let all act that has to by time t, each at its own time: for a plant whose time is an argument."""
         while (due := max(self.due, self._acted)) <= t:
-            while self._pending and self._pending[0].arrived <= due:
-                self._orders = self._pending.pop(0)
-            self._act(self._drive(due, partial(machine.read, due)), due, machine)
+            self.act(due, machine)
+
+    def act(self, t: float, machine: Machine) -> None:
+        """Let act what has to at time t: the newest command, or what is due since the last."""
+        while self._pending and self._pending[0].arrived <= t:
+            self._orders = self._pending.pop(0)
+        self._write(self._drive(t, partial(machine.read, t)), t, machine)
 
     def renew(self, t: float, x: np.ndarray | None, machine: Machine) -> None:
         """At every sample, with its x: what depends on the state follows it.
@@ -150,7 +154,7 @@ class Shield:
         same = acting.u is not None and np.array_equal(drive.u, acting.u)
         if written and same and drive.source == acting.source:
             return
-        self._act(drive, t, machine)
+        self._write(drive, t, machine)
         self._written = False
 
     def rest(self) -> np.ndarray | None:
@@ -164,7 +168,7 @@ class Shield:
         # Until the backup of the last command is here, that of the one before serves.
         return orders.drive(t, measure, self._standby.get(orders.seq) or self._standby.get(orders.seq - 1))
 
-    def _act(self, drive: Drive, due: float, machine: Machine) -> None:
+    def _write(self, drive: Drive, due: float, machine: Machine) -> None:
         since = machine.write(drive.u, due)
         self._acted, self._until = due, drive.until
         self._written = since is not None
