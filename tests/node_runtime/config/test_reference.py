@@ -169,6 +169,7 @@ def test_file_that_raises(here: Path, source: str, text: str):
     file = here / "bad.py"
     file.write_text(source)
     assert message("bad.py:TANKS").startswith(text.format(file=file))
+    assert message("bad.py:TANKS").startswith(text.format(file=file))
     # Nothing of it stays: the file put right is loaded.
     file.write_text(TANKS)
     assert load("bad.py:TANKS") == {"height": 3}
