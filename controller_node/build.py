@@ -18,7 +18,7 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Plant, PlantError, get_plant
+from lbmpc.plants import Description, Known, Plant, PlantError, get_plant
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -40,12 +40,12 @@ SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
 
-def build_plant(config: Config) -> Plant:
+def build_plant(config: Config) -> Known | Plant:
     """The plant named by the configuration, as the model knows it; its lengths fit. Raises `ConfigError`."""
     return plant_of(config, get_plant)
 
 
-def describe_network(config: Config, plant: Plant) -> NetworkDescription:
+def describe_network(config: Config, plant: Description) -> NetworkDescription:
     """The network of the configuration for this plant; its inputs and h are scaled by the half-widths.
 
     Raises:
@@ -81,8 +81,9 @@ def build_oracle(config: Config, model: Model) -> Oracle:
         return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
         try:
-            return PerfectOracle(model, true_plant_of(config, get_plant))
-        except PlantError as error:
+            true = true_plant_of(config, get_plant)
+            return PerfectOracle(model, true if isinstance(true, Plant) else None)
+        except (ModelError, PlantError) as error:
             raise ConfigError(f"controller.oracle = 'perfect': {error}") from error
     if config.controller.oracle == "l2nw":
         names = (*plant.states, *plant.inputs)
@@ -96,7 +97,7 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     return build_network_oracle(config, plant)
 
 
-def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
+def build_network_oracle(config: Config, plant: Description) -> DnnOracle:
     """The network oracle of the configuration, whichever oracle it names. Raises `ConfigError`."""
     try:
         description = describe_network(config, plant)

@@ -4,16 +4,32 @@ from __future__ import annotations
 
 import difflib
 
-from lbmpc.plants.base import Plant, PlantError, Truth
-from lbmpc.plants.inspection import PlantDefinitionError, require_sound
+from lbmpc.plants.description import Description, PlantDefinitionError, PlantError
+from lbmpc.plants.equations import Domain, Plant, Rhs
+from lbmpc.plants.inspection import require_sound
+from lbmpc.plants.known import Known
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from lbmpc.plants.truth import TrueMotion, Truth, true_motion
 
-PLANTS: dict[str, Plant] = {plant.name: plant for plant in (MOORE_GREITZER,)}
+PLANTS: dict[str, Known | Plant] = {plant.name: plant for plant in (MOORE_GREITZER,)}
 
-__all__ = ["PLANTS", "Plant", "PlantDefinitionError", "PlantError", "Truth", "get_plant"]
+__all__ = [
+    "PLANTS",
+    "Description",
+    "Domain",
+    "Known",
+    "Plant",
+    "PlantDefinitionError",
+    "PlantError",
+    "Rhs",
+    "TrueMotion",
+    "Truth",
+    "get_plant",
+    "true_motion",
+]
 
 
-def get_plant(name: str) -> Plant:
+def get_plant(name: str) -> Known | Plant:
     """The plant of that name, looked at.
 
     Raises:

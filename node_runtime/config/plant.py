@@ -14,7 +14,7 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
 
-class Plant(Protocol):
+class Described(Protocol):
     """What the checks need to know of a plant."""
 
     @property
@@ -25,6 +25,11 @@ class Plant(Protocol):
     def inputs(self) -> Sequence[str]: ...
     @property
     def x0(self) -> np.ndarray: ...
+
+
+class Plant(Described, Protocol):
+    """One whose parameters may be told to differ."""
+
     def varied(self, **changes: float) -> Self: ...
 
 
@@ -75,6 +80,6 @@ def _model_and_truth(config: Config, find: Callable[[str], P]) -> tuple[P, P]:
         raise ConfigError(f"plant.truth: {error.args[0]}") from error
 
 
-def initial_state(config: Config, plant: Plant) -> np.ndarray:
+def initial_state(config: Config, plant: Described) -> np.ndarray:
     """The configuration's x0, or the plant's own where it has none; (d,), plant units. Lengths as `plant_of` checks."""
     return np.array(plant.x0 if config.plant.x0 is None else config.plant.x0, dtype=float)

@@ -20,7 +20,7 @@ from tandem import terminal
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lbmpc.plants import Plant
+    from lbmpc.plants import Description
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
@@ -98,7 +98,7 @@ class Configured(Command):
         folder = None if file is None else file.parent
         return from_tree(tree, str(self.config or "configuration"), origins, folder), tree
 
-    def resolve_with_plant(self) -> tuple[Config, Plant]:
+    def resolve_with_plant(self) -> tuple[Config, Description]:
         """The configuration, and the plant that it names and fits."""
         from lbmpc.plants import get_plant
         from node_runtime.config.plant import plant_of

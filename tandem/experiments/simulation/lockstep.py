@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError, get_plant
+from lbmpc.plants import Plant, PlantError, get_plant, true_motion
 from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -105,7 +105,8 @@ class _LockStep:
 
     def _started_plant(self, run_id: str) -> PlantSim:
         x0 = initial_state(self.config, self.true)
-        return PlantSim(self.true, self.config.period, x0, self.config.plant.plan_patience, run_id)
+        patience = self.config.plant.plan_patience
+        return PlantSim(self.true, true_motion(self.true), self.config.period, x0, patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -169,7 +170,7 @@ class _LockStep:
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.true = self.changes.pop(0)[1]
-            self.plant.change(self.true)
+            self.plant.change(true_motion(self.true))
             truth = self.true.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
