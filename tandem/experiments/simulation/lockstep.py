@@ -19,7 +19,7 @@ import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
 from lbmpc.plants import Plant, PlantError, get_plant, true_motion
-from node_runtime.config.plant import initial_state, true_plant_of
+from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -90,7 +90,7 @@ class _LockStep:
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = true_plant_of(config, get_plant)
+        self.true = self.first = true_plant_of(config, get_plant)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
@@ -104,9 +104,9 @@ class _LockStep:
         self.log: list[tuple[Topic, m.Message, int]] = []
 
     def _started_plant(self, run_id: str) -> PlantSim:
-        x0 = initial_state(self.config, self.true)
-        patience = self.config.plant.plan_patience
-        return PlantSim(self.true, true_motion(self.true), self.config.period, x0, patience, run_id)
+        plant, patience = self.core.plant, self.config.plant.plan_patience
+        x0 = initial_state(self.config, plant)
+        return PlantSim(plant, true_motion(self.true), self.config.period, x0, patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
