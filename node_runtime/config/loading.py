@@ -13,6 +13,7 @@ import tomli_w
 from network_model.operations import BOUNDED
 from network_model.registry import get_architecture
 from node_runtime.config import strict
+from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import LONGEST_HORIZON, LONGEST_PERIOD, Config, NetworkConfig, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, Fail
@@ -148,6 +149,9 @@ def _at_home(config: Config, fail: Fail) -> Config:
 
 
 def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
+    """Of those that come with Tandem; a file is looked at by who uses it, and only there it has to be."""
+    if is_reference(network.architecture):
+        return
     try:
         known = get_architecture(network.architecture).options
     except ValueError as error:
