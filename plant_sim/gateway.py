@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 
 from lbmpc.plants import Known, Plant, PlantError, get_plant
-from lbmpc.plants.inspection import require_sound
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.session import OpenInterrupted
 from node_runtime.bus.zenoh_bus import Bus
@@ -75,7 +74,7 @@ class Gateway:
 
     def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
         self.config = config if isinstance(config, Config) else load(config)
-        self.known = plant_of(self.config, get_plant if known is None else partial(_given, known))
+        self.known = plant_of(self.config, get_plant, known)
         self._simulated = simulated
         self._serving: tuple[Shield, Guarded] | None = None
 
@@ -133,11 +132,6 @@ class Gateway:
                     loop.run(health, stopping)
                 finally:
                     _leave_safe(shield, machine)
-
-
-def _given(known: Known | Plant, _name: str) -> Known | Plant:
-    require_sound(known)
-    return known
 
 
 def _leave_safe(shield: Shield, machine: Guarded) -> None:

@@ -30,6 +30,11 @@ def require_sound(plant: Known | Plant) -> None:
     _refuse(plant, faults(plant))
 
 
+def require_names(plant: Known | Plant) -> None:
+    """Raise `PlantDefinitionError` with what is wrong with the names, without which nothing else can be said."""
+    _refuse(plant, _names(plant))
+
+
 def require_model(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with the faults of what a model is made of: names, numbers, bounds and equations."""
     _refuse(plant, _names(plant) or _faults_of_model(plant))

@@ -29,11 +29,37 @@ class TrueMotion(Protocol):
         ...
 
 
-def true_motion(plant: Known | Plant) -> TrueMotion:
-    """How this plant moves where nothing else is said to be true."""
+def true_motion(plant: Known | Plant | TrueMotion) -> TrueMotion:
+    """How this plant moves where nothing else is said to be true; of somebody's own motion that."""
+    if not isinstance(plant, Known | Plant):
+        return Own(plant)
     if isinstance(plant, Known):
         raise PlantError(f"{plant.name}: numbers alone do not move")
     return Truth(plant)
+
+
+class Own:
+    """Somebody's own motion: what it raises, or returns that is no state, ends the run with the cause."""
+
+    def __init__(self, motion: TrueMotion):
+        self._motion = motion
+        self._name = type(motion).__name__
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """As `TrueMotion.step`."""
+        if dt <= 0.0:
+            return np.array(x, dtype=float)
+        try:
+            after = np.array(self._motion.step(np.array(x), np.array(u), dt), dtype=float)
+        except Exception as error:
+            raise PlantError(f"{self._name}.step: {type(error).__name__}: {error}") from error
+        if after.shape != np.shape(x):
+            raise PlantError(
+                f"{self._name}.step: it returned {after.shape} numbers, the state has {np.shape(x)}"
+            )
+        if not isfinite(sum(after.tolist())):
+            raise PlantError(f"{self._name}.step: the state is not finite: {after.tolist()}")
+        return after
 
 
 class Truth:
