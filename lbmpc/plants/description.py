@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -67,6 +67,38 @@ class Description:
             object.__setattr__(self, name, as_array(getattr(self, name)))
         for name in TUPLES:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Self:
+        """With other bounds, or about another point.
+
+        Args:
+            bounds: lower and upper by the name of a state or input, None where there is none; others stay.
+            x_e, u_e: (d,) and (m,). Equations are linearised there; a pair of matrices is taken as it is, about there.
+
+        Raises:
+            KeyError: a bound of what is no state or input.
+        """
+        for name in bounds:
+            if name not in (*self.states, *self.inputs):
+                raise KeyError(name)
+        new: dict[str, Any] = {
+            name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None
+        }
+        for axis, names in (("x", self.states), ("u", self.inputs)):
+            low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))
+            # What has another shape is for whoever looks at the plant to name.
+            if bounds and low.shape == high.shape == (len(names),):
+                for name, (lower, upper) in bounds.items():
+                    if name in names:
+                        low[names.index(name)] = -np.inf if lower is None else lower
+                        high[names.index(name)] = np.inf if upper is None else upper
+                new |= {f"{axis}_min": low, f"{axis}_max": high}
+        return replace(self, **new) if new else self
 
     @property
     def d(self) -> int:

@@ -38,6 +38,11 @@ def require_sound(plant: Known | Plant) -> None:
     refuse(plant.name, faults(plant), _where(plant))
 
 
+def require_names(plant: Known | Plant) -> None:
+    """Raise `PlantDefinitionError` with what is wrong with the names, without which nothing else can be said."""
+    refuse(plant.name, name_faults(plant), _where(plant))
+
+
 def require_model(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with the faults of what a model is made of: names, numbers, bounds and equations."""
     refuse(plant.name, name_faults(plant) or _faults_of_model(plant), _where(plant))

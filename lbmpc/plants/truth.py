@@ -31,9 +31,11 @@ class TrueMotion(Protocol):
         ...
 
 
-def true_motion(plant: Known | Plant) -> TrueMotion:
-    """How this plant moves where nothing else is said to be true."""
-    return LinearTruth(plant) if isinstance(plant, Known) else Truth(plant)
+def true_motion(plant: Known | Plant | TrueMotion) -> TrueMotion:
+    """How this plant moves where nothing else is said to be true; of somebody's own motion that."""
+    if isinstance(plant, Known):
+        return LinearTruth(plant)
+    return Truth(plant) if isinstance(plant, Plant) else Own(plant)
 
 
 class LinearTruth:
@@ -58,6 +60,30 @@ class LinearTruth:
         if not np.isfinite(after).all():
             raise PlantError(f"{known.name}: the state is not finite: {after.tolist()}")
         return np.asarray(known.x_e + after)
+
+
+class Own:
+    """Somebody's own motion: what it raises, or returns that is no state, ends the run with the cause."""
+
+    def __init__(self, motion: TrueMotion):
+        self._motion = motion
+        self._name = type(motion).__name__
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """As `TrueMotion.step`."""
+        if dt <= 0.0:
+            return np.array(x, dtype=float)
+        try:
+            after = np.array(self._motion.step(np.array(x), np.array(u), dt), dtype=float)
+        except Exception as error:
+            raise PlantError(f"{self._name}.step: {type(error).__name__}: {error}") from error
+        if after.shape != np.shape(x):
+            raise PlantError(
+                f"{self._name}.step: it returned {after.shape} numbers, the state has {np.shape(x)}"
+            )
+        if not isfinite(sum(after.tolist())):
+            raise PlantError(f"{self._name}.step: the state is not finite: {after.tolist()}")
+        return after
 
 
 class Truth:

@@ -113,8 +113,12 @@ def recovery(results: list[CaseResult], plant: Description) -> list[Picture]:
         said = "no change"
         if drift is not None:
             own = plant.parameters if isinstance(plant, Plant) else {}
-            before = {**own, **same[0].case.config.plant.truth}
-            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" for n, v in drift.to.items())
+            truth = same[0].case.config.plant.truth
+            before = {**own, **(truth if isinstance(truth, dict) else {})}
+            values = ", ".join(
+                f"{n} = {before[n]:g} to {v:g}" if n in before else f"{n} to {v:g}"
+                for n, v in drift.to.items()
+            )
             when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
             said = f"{values} {when}"
             for ax in (above, below):
