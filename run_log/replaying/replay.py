@@ -9,12 +9,14 @@ import msgspec
 from controller_node.certified_sets import CertifiedSets
 from controller_node.core import ControllerCore
 from node_runtime.config.loading import override
+from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
+from node_runtime.config.strict import ConfigError, apply_override
 from node_runtime.provenance import versions
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import codec, topics
 from run_log.errors import LogError
+from run_log.named_plant import given_plant
 from run_log.replaying.comparison import Comparison, Difference
 from run_log.replaying.recorded import RecordedController, recorded_controllers
 from run_log.replaying.segments import replayable
@@ -120,12 +122,19 @@ def replay(
 def _core(run: Run, recorded: RecordedController, overrides: Sequence[str]) -> ControllerCore:
     config = override(recorded.config, list(overrides)) if overrides else recorded.config
     sets = _sets_for(run, recorded, config)
+    changed = {apply_override({}, text) for text in overrides}
+    hint = ""
     try:
-        return ControllerCore(config, recorded.run_id, sets)
+        given = given_plant(run, config, changed)
+        if given.equations is None and is_reference(config.plant.model):
+            hint = "; --plant FILE:NAME gives the replay the equations of its plant"
+        elif isinstance(config.plant.truth, str) and given.truth is None:
+            hint = "; --set plant.truth=FILE:NAME gives the replay its true plant"
+        return ControllerCore(config, recorded.run_id, sets, given)
     except ConfigError as error:
         if overrides:
-            raise
-        raise LogError(f"{run.path}: its configuration admits no controller: {error}") from error
+            raise ConfigError(f"{error}{hint}") from error
+        raise LogError(f"{run.path}: its configuration admits no controller: {error}{hint}") from error
 
 
 def _replay_tick(

@@ -25,14 +25,21 @@ class Replay(Command):
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Replay with another value than the log's configuration has."""
 
+    plant: Annotated[
+        str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
+    ] = None
+    """The plant file that the log was made with, where a replay needs equations: oracle perfect, certified sets."""
+
     def run(self) -> int:
         """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
         import msgspec
 
+        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.replaying.replay import ROUNDING, replay
 
         ran = read_run(self.file)
+        notes = [] if self.plant is None else name_plant(ran, self.plant)
         with terminal.progress_bar(self.console) as bar:
             task = bar.add_task("replaying", total=None)
             found = replay(
@@ -68,6 +75,7 @@ class Replay(Command):
             self.say(f"first at tick {first.tick}: {first.field} {values}")
         if not (found.equal or found.rounding) and found.largest_difference is not None:
             self.say(f"largest difference of an input: {found.largest_difference:.3g}")
+        found = msgspec.structs.replace(found, notes=[*notes, *found.notes])
         self.say(*(f"note: {note}" for note in found.notes), style="yellow")
         self.emit(msgspec.to_builtins(found))
         return 0 if found.equal and not found.lost_ticks else 1
