@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError, get_plant
+from lbmpc.plants import Plant, PlantError, get_plant, true_motion
 from node_runtime.config.architecture import register_architecture
 from node_runtime.config.plant import initial_state, true_plant_of
 from node_runtime.config.sections import Config
@@ -132,7 +132,7 @@ class LockStep:
         self.config, self.faults = config, faults
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = true_plant_of(config, get_plant)
+        self.true = self.first = true_plant_of(config, get_plant)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
@@ -151,8 +151,9 @@ class LockStep:
         self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
 
     def _started_plant(self, run_id: str) -> PlantSim:
-        x0 = initial_state(self.config, self.true)
-        return PlantSim(self.true, self.config.period, x0, self.config.plant.plan_patience, run_id)
+        plant, patience = self.core.plant, self.config.plant.plan_patience
+        x0 = initial_state(self.config, plant)
+        return PlantSim(plant, true_motion(self.true), self.config.period, x0, patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -219,7 +220,7 @@ class LockStep:
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.true = self.changes.pop(0)[1]
-            self.plant.change(self.true)
+            self.plant.change(true_motion(self.true))
             truth = self.true.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
