@@ -114,7 +114,9 @@ def test_a_state_that_is_none_changes_nothing() -> None:
     loop, other = (Loop(oracle="linear", config="compressor") for _ in range(2))
     loop.control(PLANT.x0)
     for bad in ([1.0, 2.0], [np.nan, 0, 0, 0], 3.0):
-        with pytest.raises(ValueError, match=r"is no state of moore_greitzer: 4 finite numbers \(z, y, r, rdot\)"):
+        with pytest.raises(
+            ValueError, match=r"is no state of moore_greitzer: 4 finite numbers \(z, y, r, rdot\)"
+        ):
             loop.control(bad)
     other.control(PLANT.x0)
     np.testing.assert_array_equal(loop.control(PLANT.x0 + 0.01), other.control(PLANT.x0 + 0.01))
