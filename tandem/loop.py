@@ -83,6 +83,7 @@ class Loop:
         **settings: Any,
     ):
         named = truth if isinstance(truth, str | Mapping) else None
+        moving = None if isinstance(truth, str | Mapping) else truth
         arguments = {
             "known": ("plant.model", known.name if isinstance(known, Description) else known),
             "truth": ("plant.truth", dict(named) if isinstance(named, Mapping) else named),
@@ -90,7 +91,7 @@ class Loop:
             "train": ("trainer.enabled", train),
         }
         self.config = _resolved(config, settings, arguments)
-        given = _given(self.config, known, None if named is not None else truth)
+        given = _given(self.config, known, moving)
         with one_blas_thread():
             self._lockstep = LockStep(self.config, given=given)
         self._lost: str | None = None

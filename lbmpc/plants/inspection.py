@@ -40,7 +40,7 @@ def require_sound(plant: Known | Plant) -> None:
 
 def require_names(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with what is wrong with the names, without which nothing else can be said."""
-    _refuse(plant, _names(plant))
+    refuse(plant.name, name_faults(plant), _where(plant))
 
 
 def require_model(plant: Known | Plant) -> None:

@@ -181,9 +181,8 @@ def _written_out(config: Config, fail: Fail, origins: Mapping[str, str], folder:
     plant = msgspec.structs.replace(config.plant, model=found("plant.model", config.plant.model))
     if isinstance(plant.truth, str):
         plant = msgspec.structs.replace(plant, truth=found("plant.truth", plant.truth))
-    network = msgspec.structs.replace(
-        config.network, architecture=found("network.architecture", config.network.architecture)
-    )
+    architecture = found("network.architecture", config.network.architecture)
+    network = msgspec.structs.replace(config.network, architecture=architecture)
     return msgspec.structs.replace(config, plant=plant, network=network)
 
 
