@@ -1,7 +1,7 @@
 """A gateway without any of Tandem's code: zenoh and msgpack are all it needs. docs/gateway.md is what it follows.
 
     tandem run --no-plant                          # in one terminal
-    python examples/gateway_without_tandem.py      # in another; the router's endpoint may be its argument
+    python examples/gateway_without_tandem.py      # in another; arguments: the router's endpoint, folder of keys
 
 `Compressor` is the machine, here a simulated one; `Gateway` has the rules, `main` the clock and the bus.
 """
@@ -148,9 +148,13 @@ class Gateway:
         self.since = t
 
 
-def main(endpoint="tcp/127.0.0.1:7447"):
+def main(endpoint="tcp/127.0.0.1:7447", keys=None):
     settings = {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}}
     settings["scouting"] = {"multicast": {"enabled": False}}
+    if keys is not None:
+        tls = {"root_ca_certificate": f"{keys}/authority.pem", "connect_private_key": f"{keys}/key.pem"}
+        tls |= {"connect_certificate": f"{keys}/certificate.pem", "enable_mtls": True}
+        settings["transport"] = {"link": {"tls": tls | {"verify_name_on_connect": True}}}
     commands = queue.Queue(256)
     with contextlib.suppress(OSError):  # without the right to it, samples are late when others want the core
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
@@ -160,8 +164,8 @@ def main(endpoint="tcp/127.0.0.1:7447"):
             commands.put((message.payload.to_bytes(), time.monotonic()))
 
     with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))) as session:
-        keys = ("controller/command", "@direct/controller/command")
-        subscribers = [session.declare_subscriber(f"tandem/{NAME}/{key}", heard) for key in keys]
+        both = ("controller/command", "@direct/controller/command")
+        subscribers = [session.declare_subscriber(f"tandem/{NAME}/{key}", heard) for key in both]
         quick = {"priority": zenoh.Priority.REAL_TIME, "express": True}
         gateway = Gateway(Compressor(), f"plant-{uuid.uuid4().hex[:12]}", time.monotonic() + PERIOD)
         while subscribers:
