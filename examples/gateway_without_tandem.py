@@ -19,7 +19,7 @@ from collections import Counter
 import msgpack
 import zenoh
 
-NAME, PERIOD = "jet1", 0.05  # the plant's name; seconds between samples
+KEY, PERIOD = "tandem/jet1", 0.05  # jet1 is the plant's name; seconds between samples
 PATIENCE, SILENCE = 1.25, 1.0  # periods that a command acts; seconds until another controller may take over
 LARGEST = 256 * 1024  # bytes of a command
 FIELDS = {"run_id": str, "seq": int, "state_run_id": str, "state_seq": int, "period": float, "plan": list}
@@ -148,46 +148,60 @@ class Gateway:
         self.since = t
 
 
-def main(endpoint="tcp/127.0.0.1:7447", keys=None):
-    settings = {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}}
-    settings["scouting"] = {"multicast": {"enabled": False}}
+def settings(endpoint, keys):
+    """Zenoh's; keys: the folder of a certificate, where the endpoint begins with tls/."""
+    tree = {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}}
+    tree["scouting"] = {"multicast": {"enabled": False}}
     if keys is not None:
         tls = {"root_ca_certificate": f"{keys}/authority.pem", "connect_private_key": f"{keys}/key.pem"}
         tls |= {"connect_certificate": f"{keys}/certificate.pem", "enable_mtls": True}
-        settings["transport"] = {"link": {"tls": tls | {"verify_name_on_connect": True}}}
+        tree["transport"] = {"link": {"tls": tls | {"verify_name_on_connect": True}}}
+    return zenoh.Config.from_json5(json.dumps(tree))
+
+
+def serve(session, gateway, commands):
+    """Sleep until a command comes or something is due, and do it."""
+    while True:
+        wait = min(gateway.due(), gateway.switch) - time.monotonic()
+        try:
+            received = commands.get(timeout=max(0.0, wait))
+        except queue.Empty:
+            received = None
+        now = time.monotonic()
+        # Samples that were slept through are missing. They are never made up for.
+        gateway.seq += max(0, math.ceil((now - gateway.due()) / PERIOD - 0.5))
+        if now >= gateway.due():
+            state = msgpack.packb(gateway.sample())
+            session.put(f"{KEY}/plant/state", state, priority=zenoh.Priority.REAL_TIME, express=True)
+            if gateway.seq % round(0.5 / PERIOD) == 0:
+                health = {"run_id": gateway.run_id, "seq": gateway.seq, "process": "plant", "note": ""}
+                health |= {"status": "running", "counters": dict(gateway.refused)}
+                session.put(f"{KEY}/plant/health", msgpack.packb(health))
+        if now >= gateway.switch:
+            gateway.act(now)
+        if received is not None:
+            gateway.receive(*received, now)
+
+
+def main(endpoint="tcp/127.0.0.1:7447", keys=None):
     commands = queue.Queue(256)
-    with contextlib.suppress(OSError):  # without the right to it, samples are late when others want the core
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
 
     def heard(message):
         if not commands.full():
             commands.put((message.payload.to_bytes(), time.monotonic()))
 
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))) as session:
-        both = ("controller/command", "@direct/controller/command")
-        subscribers = [session.declare_subscriber(f"tandem/{NAME}/{key}", heard) for key in both]
-        quick = {"priority": zenoh.Priority.REAL_TIME, "express": True}
-        gateway = Gateway(Compressor(), f"plant-{uuid.uuid4().hex[:12]}", time.monotonic() + PERIOD)
-        while subscribers:
-            wait = min(gateway.due(), gateway.switch) - time.monotonic()
-            try:
-                received = commands.get(timeout=max(0.0, wait))
-            except queue.Empty:
-                received = None
-            now = time.monotonic()
-            # Samples that were slept through are missing. They are never made up for.
-            gateway.seq += max(0, math.ceil((now - gateway.due()) / PERIOD - 0.5))
-            if now >= gateway.due():
-                state = gateway.sample()
-                session.put(f"tandem/{NAME}/plant/state", msgpack.packb(state), **quick)
-                if gateway.seq % round(0.5 / PERIOD) == 0:
-                    health = {"run_id": gateway.run_id, "seq": gateway.seq, "process": "plant", "note": ""}
-                    health |= {"status": "running", "counters": dict(gateway.refused)}
-                    session.put(f"tandem/{NAME}/plant/health", msgpack.packb(health))
-            if now >= gateway.switch:
-                gateway.act(now)
-            if received is not None:
-                gateway.receive(*received, now)
+    with contextlib.suppress(OSError):  # without the right to it, samples are late when others want the core
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    with zenoh.open(settings(endpoint, keys)) as session:
+        both = f"{KEY}/controller/command", f"{KEY}/@direct/controller/command"
+        subscribers = [session.declare_subscriber(key, heard) for key in both]
+        machine = Compressor()
+        gateway = Gateway(machine, f"plant-{uuid.uuid4().hex[:12]}", time.monotonic() + PERIOD)
+        try:
+            serve(session, gateway, commands)
+        finally:
+            machine.write(machine.safe(time.monotonic()), time.monotonic())
+            del subscribers
 
 
 if __name__ == "__main__":

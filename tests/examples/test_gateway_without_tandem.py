@@ -15,6 +15,7 @@ import pytest
 
 from lbmpc.plants import Plant, Truth, get_plant
 from node_runtime.bus.inbox import Follower
+from node_runtime.config.sections import Config
 from plant_sim.simulator import PlantSim
 from protocol import codec, topics
 from protocol import messages as m
@@ -30,7 +31,8 @@ TAME = replace(
     safe_gain=None,
 )
 """A plant of the compressor's size that bears any input."""
-PERIOD, PATIENCE, SILENCE = EXAMPLE["PERIOD"], EXAMPLE["PATIENCE"], EXAMPLE["SILENCE"]
+CONFIG = Config()
+PERIOD, PATIENCE, SILENCE = CONFIG.period, CONFIG.plant.plan_patience, CONFIG.bus.follow_silence
 RUN = "plant-a"
 
 
@@ -88,7 +90,7 @@ class Own:
     """Tandem's gateway in virtual time, with what its inbox does before it."""
 
     def __init__(self) -> None:
-        self.sim = PlantSim(TAME, PERIOD, TAME.x0, PATIENCE, RUN)
+        self.sim = PlantSim(TAME, Truth(TAME), PERIOD, TAME.x0, PATIENCE, RUN)
         self.follower = Follower(SILENCE)
 
     def command(self, payload: bytes, t: float) -> str:
@@ -144,13 +146,14 @@ def test_it_refuses_and_applies_what_tandems_own_gateway_does(seed: int) -> None
     rng = np.random.default_rng(seed)
     own, foreign = Own(), Foreign(Machine(TAME))
     verdicts, sources = set(), set()
-    seq, silent_until = 0, 0
+    seq, newest, silent_until = 0, 0, 0
     for k in range(400):
         t = k * PERIOD
         if k and rng.random() < 0.03:
             foreign.miss()
         else:
             ours, theirs = own.sample(t), foreign.sample(t)
+            newest = ours.seq
             sources.add(ours.source)
             assert (theirs.run_id, theirs.seq, theirs.source) == (ours.run_id, ours.seq, ours.source)
             assert (theirs.t, theirs.command_seq) == (pytest.approx(ours.t), ours.command_seq)
@@ -166,7 +169,7 @@ def test_it_refuses_and_applies_what_tandems_own_gateway_does(seed: int) -> None
             silent_until = k + int(rng.integers(1, 30))
         for at in sorted(rng.uniform(0.01, 0.99, rng.integers(0, 3))):
             seq += 1
-            payload, arrived = some_command(rng, seq, own.sim._seq), t + float(at) * PERIOD
+            payload, arrived = some_command(rng, seq, newest), t + float(at) * PERIOD
             verdict = own.command(payload, arrived)
             assert foreign.command(payload, arrived) == verdict
             verdicts.add(verdict)
