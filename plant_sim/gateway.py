@@ -103,8 +103,8 @@ class Gateway:
 
         Args:
             read: the state, (d,), plant units, as it is now.
-            write: lets an input, (m,), act from now on; always within the bounds. Called for every command, and also where
-                the input is the same: calls are less than two periods apart, for a watchdog of the machine's own.
+            write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where the
+                input is the same, and never less often than every two periods, for a watchdog of the machine's own.
             stop: outside the main thread, where no signal arrives, the only way to end it.
 
         Raises:
