@@ -1,15 +1,17 @@
 """A machine on the bus: two functions of its own, and around them all that a controller expects of a plant.
 
-import numpy as np
-from plant_sim import Gateway
+The whole of it, for a compressor:
 
-def read() -> np.ndarray:
-    return np.array([tank.level(), tank.temperature()])
+    import numpy as np
+    from plant_sim import Gateway
 
-def write(u: np.ndarray) -> None:
-    valve.open(u[0])
+    def read() -> np.ndarray:
+        return np.array([rig.flow(), rig.pressure(), rig.throttle(), rig.throttle_speed()])
 
-Gateway(None, "tandem.toml").serve(read, write)
+    def write(u: np.ndarray) -> None:
+        rig.set_throttle(u[0])
+
+    Gateway(None, "tandem.toml").serve(read, write)
 """
 
 from __future__ import annotations
@@ -103,8 +105,8 @@ class Gateway:
 
         Args:
             read: the state, (d,), plant units, as it is now.
-            write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where the
-                input is the same, and never less often than every two periods, for a watchdog of the machine's own.
+            write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where
+                the input is the same, and at least every two periods, for a watchdog of the machine's own.
             stop: outside the main thread, where no signal arrives, the only way to end it.
 
         Raises:
