@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 
-from lbmpc.plants import PlantError, get_plant, true_motion
+from lbmpc.plants import PlantError, get_plant, get_truth, true_motion
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.plant import initial_state, plant_of, true_plant_of
@@ -35,7 +35,7 @@ NOTES: dict[InputSource, str] = {
 
 def build(config: Config, run_id: str) -> PlantSim:
     """The plant that the configuration names, as it really moves. Raises `ConfigError`."""
-    plant, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    plant, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
     x0 = initial_state(config, plant)
     return PlantSim(plant, true_motion(truth), config.period, x0, config.plant.plan_patience, run_id)
 

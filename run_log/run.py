@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 import node_runtime.config.plant
-from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant
+from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant, get_truth
 from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config, PlantConfig
 from node_runtime.config.strict import ConfigError
@@ -210,8 +210,7 @@ def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
     try:
         equations = equations_of(run, run.config)
         if equations is None or isinstance(run.config.plant.truth, str):
-            # Where the log names another plant as the true one, whoever names a plant says what moved.
-            return None if run.named is None else equations
-        return node_runtime.config.plant.true_plant_of(run.config, get_plant, equations)
+            return None
+        return node_runtime.config.plant.true_plant_of(run.config, get_plant, get_truth, equations)
     except ConfigError as error:
         raise LogError(f"{run.path}: {error}") from error

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError, get_plant, true_motion
+from lbmpc.plants import Plant, PlantError, get_plant, get_truth, true_motion
 from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -130,7 +130,7 @@ class LockStep:
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = self.first_true = true_plant_of(config, get_plant)
+        self.true = self.first_true = true_plant_of(config, get_plant, get_truth)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
