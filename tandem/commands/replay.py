@@ -24,7 +24,9 @@ class Replay(Command):
     """Start at this tick, from the nearest keyframe before it."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Replay with another value than the log's configuration has."""
-
+    architecture: Annotated[str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: none)")] = None
+    """The file of the log's network, where its architecture is one of your own. A log's own word is never enough to
+    load code."""
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
     ] = None
@@ -34,10 +36,12 @@ class Replay(Command):
         """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
         import msgspec
 
+        from node_runtime.config.architecture import load_architecture
         from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.replaying.replay import ROUNDING, replay
 
+        own = None if self.architecture is None else load_architecture(self.architecture)
         ran = read_run(self.file)
         notes = [] if self.plant is None else name_plant(ran, self.plant)
         with terminal.progress_bar(self.console) as bar:
@@ -47,6 +51,7 @@ class Replay(Command):
                 self.from_tick,
                 self.set,
                 lambda done, total: bar.update(task, completed=done, total=total),
+                own,
             )
         if found.equal:
             text = (

@@ -12,7 +12,7 @@ from tandem.cli import main
 from tests.helpers.paths import INSTALLED, ROOT
 
 PACKAGES = (*INSTALLED, "benchmarks", "verification", "tests")
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")])
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)
 PATH = re.compile(rf"(?<![\w/.<-])((?:{NAME}|configs|docs|docker)/[\w./-]*\w/?)(?![\w*<])")
@@ -23,7 +23,7 @@ RUN = re.compile(r"python -m ([\w.]+)")
 MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
 TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+ ?){1,2})([^`\n|]*)", re.MULTILINE)
 # What a page may name that is made when something runs, or is an example of the reader's own.
-MADE = ("network_model/architectures/gru.py", "tandem/jet")
+MADE = ("tandem/jet",)
 OWN = {"gru.py", "tanks.py", "true.py"}
 
 

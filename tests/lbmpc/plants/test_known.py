@@ -179,6 +179,10 @@ WITHOUT_MOTION = {
         [[0.9, 0.5, 0.0], [0.0, 1e-9, 1.0], [0.0, 1e-9, 1e-9]],
         [[0.0], [0.0], [1.0]],
     ),
+    "one with a motion of rounding": (
+        [[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, -1e-6, 0.0]],
+        [[0.0], [0.0], [1.0]],
+    ),
     "a sign that alternates": ([[-0.4, 0.1], [0.0, 0.8]], [[1.0], [1.0]]),
 }
 
@@ -303,6 +307,8 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         else:
             assert its == ours
             assert type(its) is type(ours)
+    # A real pole stays real: its exponential is another function.
+    assert [type(pole) for pole in again.poles or ()] == [type(pole) for pole in known.poles or ()]
     for name in ("A", "B", "K", "P"):
         period = known.period or 0.05
         np.testing.assert_array_equal(
