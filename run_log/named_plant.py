@@ -88,7 +88,7 @@ def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
         known = plant_of(config, get_plant)
         equations = known if isinstance(known, Plant) else None
     else:
-        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run))
+        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run, config))
         equations = equations_of(run, config)
     truth, of_the_log = config.plant.truth, not changed & {"plant", "plant.truth"}
     if config.controller.oracle != "perfect" or equations is None:
