@@ -154,6 +154,18 @@ def test_a_simulator_that_fails_ends_the_run_with_its_cause() -> None:
     assert result.u.shape == (8, 1)
 
 
+def test_a_plant_that_was_lost_can_be_started_again() -> None:
+    simulator = Simulator(fails_after=3)
+    loop = Loop(truth=simulator, **QUICK)
+    assert loop.run(10).lost is not None
+    simulator.left = 100
+    loop.start_again()
+    result = loop.run(5)
+    assert result.lost is None
+    assert result.u.shape == (9, 1)
+    assert replay(result.run).equal
+
+
 def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
     cart = Known.from_matrices(
         [[0.0, 1.0], [0.0, 0.0]],

@@ -209,9 +209,9 @@ class LockStep:
         run.plant, run.truth, run.files = self.core.plant, self.first_true, files_of(self.config)
         return run
 
-    def start_again(self) -> None:
-        """Another episode: the plant is at x0 again. Raises `PlantError` as `so_far` does."""
-        self.log += self._end()
+    def start_again(self, lost: bool = False) -> None:
+        """Another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
+        self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
 
