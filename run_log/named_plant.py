@@ -12,9 +12,7 @@ from lbmpc.plants import Known, Plant, get_plant
 from node_runtime.config.plant import load_plant, plant_of, true_plant_of
 from node_runtime.config.reference import absolute, is_reference, sha256_of
 from node_runtime.config.sections import Config
-from run_log.run import Run, equations_of, recorded_plant
-
-PLANT_KEYS, TRUTH_KEYS = ("plant", "plant.model"), ("plant", "plant.truth")
+from run_log.run import Run, as_logged, equations_of, recorded_plant
 
 
 def name_plant(run: Run, reference: str) -> list[str]:
@@ -55,16 +53,16 @@ def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
         ConfigError: the plant does not fit the configuration.
         LogError: the log does not say which plant it was, and nobody else does.
     """
-    if changed & set(PLANT_KEYS):
+    if changed & {"plant", "plant.model"}:
         known = plant_of(config, get_plant)
         equations = known if isinstance(known, Plant) else None
     else:
-        known = plant_of(config, get_plant, recorded_plant(run))
-        equations = equations_of(run)
-    truth, theirs = config.plant.truth, any(f"{key}.".startswith("plant.truth.") for key in changed)
+        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run))
+        equations = equations_of(run, config)
+    truth, of_the_log = config.plant.truth, not changed & {"plant", "plant.truth"}
     if config.controller.oracle != "perfect" or equations is None:
         return GivenPlant(known, equations)
-    if isinstance(truth, str) and is_reference(truth) and not (theirs or "plant" in changed):
+    if isinstance(truth, str) and is_reference(truth) and of_the_log:
         return GivenPlant(known, equations)
     return GivenPlant(known, equations, true_plant_of(config, get_plant, equations))
 

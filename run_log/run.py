@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import msgspec
+
 import node_runtime.config.plant
 from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant
 from node_runtime.config.reference import is_reference
-from node_runtime.config.sections import Config
+from node_runtime.config.sections import Config, PlantConfig
 from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
@@ -152,6 +154,18 @@ def recorded_plant(run: Run) -> Known | Plant | None:
     return known
 
 
+def as_logged(run: Run, config: Config, changed: Collection[str] = ()) -> Config:
+    """`config` without what the log's numbers of the plant hold already, except for the keys that were changed."""
+    if run.plant is None or "plant" in changed:
+        return config
+    held = {
+        name: getattr(PlantConfig(), name)
+        for name in ("bounds", "x_e", "u_e")
+        if not any(f"{key}.".startswith(f"plant.{name}.") for key in changed)
+    }
+    return msgspec.structs.replace(config, plant=msgspec.structs.replace(config.plant, **held))
+
+
 def plant_of(run: Run) -> Known | Plant:
     """The plant that the run is about, as its log says; of a log that does not say it, the one of that name here.
 
@@ -162,18 +176,27 @@ def plant_of(run: Run) -> Known | Plant:
     """
     known = recorded_plant(run)
     try:
-        return node_runtime.config.plant.plant_of(run.config, get_plant, known)
+        return node_runtime.config.plant.plant_of(as_logged(run, run.config), get_plant, known)
     except ConfigError as error:
         end = "" if known is not None else " The log needs the plant that it was made with."
         raise LogError(f"{run.path}: {error}{end}") from error
 
 
-def equations_of(run: Run) -> Plant | None:
-    """Those that its plant was linearised from: of a plant that comes with Tandem, or that somebody has named."""
-    found: Known | Plant | None = run.named
-    if found is None and run.config.plant.model in PLANTS:
-        found = PLANTS[run.config.plant.model]
-    return found if isinstance(found, Plant) else None
+def equations_of(run: Run, config: Config) -> Plant | None:
+    """Those that its plant was linearised from: of a plant that comes with Tandem, or that somebody has named.
+
+    Args:
+        run: a log.
+        config: how they are configured.
+
+    Raises:
+        ConfigError: they do not fit the configuration.
+    """
+    found = PLANTS.get(config.plant.model) if run.named is None else run.named
+    if not isinstance(found, Plant):
+        return None
+    equations = node_runtime.config.plant.plant_of(config, get_plant, found)
+    return equations if isinstance(equations, Plant) else None
 
 
 def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
@@ -184,13 +207,11 @@ def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
     """
     if run.truth is not None:
         return run.truth
-    equations = equations_of(run)
-    if equations is None or (isinstance(run.config.plant.truth, str) and run.named is None):
-        return None
-    if isinstance(run.config.plant.truth, str):
-        # Whoever reads the log has said what moved.
-        return equations
     try:
+        equations = equations_of(run, run.config)
+        if equations is None or isinstance(run.config.plant.truth, str):
+            # Where the log names another plant as the true one, whoever names a plant says what moved.
+            return None if run.named is None else equations
         return node_runtime.config.plant.true_plant_of(run.config, get_plant, equations)
     except ConfigError as error:
         raise LogError(f"{run.path}: {error}") from error

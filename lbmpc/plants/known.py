@@ -60,6 +60,19 @@ class Known(Description):
         u_e = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
         return _at_rest(self, x_e, u_e, self.slope_x @ (x_e - self.x_e) + self.B @ (u_e - self.u_e))
 
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Known:
+        """As that of a description; about the rest nearest to (x_e, u_e). Raises `PlantDefinitionError` as well."""
+        bounded = super().changed(bounds)
+        if x_e is None and u_e is None:
+            return bounded
+        refuse(self.name, known_faults(bounded))
+        return bounded.resting_near(x_e, u_e)
+
     def to_builtins(self) -> dict[str, Any]:
         """What JSON can hold, and `from_builtins` makes the same plant of, bit for bit; infinities are words."""
         return written({one.name: getattr(self, one.name) for one in fields(self)})

@@ -87,7 +87,8 @@ def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P
         found = find(which, lambda plant: _as_configured(config, plant))
     except LookupError as error:
         raise ConfigError(f"plant.model = {named!r}: {error.args[0]}") from error
-    _with_parameters(config, found)
+    if plant is None:
+        _with_parameters(config, found)
     return found
 
 
