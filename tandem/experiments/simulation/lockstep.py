@@ -8,7 +8,6 @@ Each episode is a plant that was started again at x0; controller and trainer go 
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -219,8 +218,7 @@ class LockStep:
         """Where the last command has led the plant; of one that moves elsewhere that is not known."""
         if self.elsewhere:
             return []
-        # A sample of a copy: the plant's own next one must say what acted in the last period.
-        end = copy.copy(self.plant).sample(self.taken * self.config.period)
+        end = self.plant.look(self.taken * self.config.period)
         return [self._noted(topics.PLANT_STATE, end, self.taken)]
 
     def step(self, x: np.ndarray | None = None) -> tuple[m.PlantState, Outputs]:
