@@ -134,8 +134,12 @@ def load_plant(reference: str) -> Any:
 
 
 def files_of(config: Config) -> dict[str, str]:
-    """The sha256 of the files that the plant of `config` comes from, as far as they are here, by key."""
-    named = {"plant.model": config.plant.model, "plant.truth": config.plant.truth}
+    """The sha256 of somebody's own files that `config` names, as far as they are here, by key."""
+    named = {
+        "plant.model": config.plant.model,
+        "plant.truth": config.plant.truth,
+        "network.architecture": config.network.architecture,
+    }
     references = {key: text for key, text in named.items() if isinstance(text, str) and is_reference(text)}
     return {key: found for key, text in references.items() if (found := sha256_of(text)) is not None}
 
