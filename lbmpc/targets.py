@@ -38,7 +38,7 @@ REACHED = 1e-4
 SECOND = 1e-8
 """Weight of the cost beside that of the outputs: small enough to move them by less than anybody sees."""
 LEAST = 1e-6
-"""Of the largest weight: what a state or input counts that the cost does not see, so that there is one nearest rest."""
+"""Of the largest weight: what a state or input counts at least, so that there is one nearest rest."""
 PENALTY = 1e6
 """Of the rows, so that there is a solution of the QP where no rest is inside."""
 
@@ -79,7 +79,7 @@ class TargetSelector:
         self._scale = np.concatenate([plant.x_scale, plant.u_scale])
         self._r = np.asarray(r, dtype=float) / plant.x_scale[self._outputs]
         weights = np.concatenate([np.diag(model.Q), np.diag(model.R)]) * self._scale**2
-        weights = weights / weights.max() + LEAST
+        weights = np.maximum(weights / weights.max(), LEAST)
         if self._outputs:
             weights *= SECOND
             weights[self._outputs] += 1.0

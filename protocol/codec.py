@@ -183,12 +183,6 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
             for name, rows, length in (("gain", message.gain, d), ("inputs", message.inputs, m_inputs)):
                 for i, row in enumerate(rows):
                     expect(f"{name}[{i}]", row, length)
-        case m.TickResult():
-            for name, values, length in (
-                ("target_x", message.target_x, d),
-                ("target_u", message.target_u, m_inputs),
-            ):
-                expect(name, values or None, length)
         case m.Samples():
             for sample in message.samples:
                 expect("x", sample.x, d)
