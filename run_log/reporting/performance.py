@@ -22,7 +22,8 @@ FARTHEST = 1e100
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names.
+    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names; they are the
+    outputs of the reference where it has any, and "equilibrium" is then where they should be.
 
     Of several episodes: the mean of J and of the deviation, the sum of the violations, of all else the worst.
     """
@@ -61,8 +62,8 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: D
         config: the weights and the rate.
         truth: the plant whose motion this is, where its equations differ from `plant`'s.
     """
-    names = [plant.states[i] for i in plant.performance]
-    own = list(plant.performance)
+    names = config.reference.outputs or [plant.states[i] for i in plant.performance]
+    own = [plant.states.index(name) for name in names]
     dx, du = (
         np.clip(off, -FARTHEST, FARTHEST)
         for off in (motion.x - goal(plant, config), np.nan_to_num(motion.applied[1:] - plant.u_e))
