@@ -261,7 +261,7 @@ def test_numbers_rest_elsewhere_too() -> None:
     np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
 
 
-@pytest.mark.parametrize("plant", [TWO_TANKS, TWO_TANKS.known()], ids=["equations", "numbers"])
+@pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
 def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
     there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
     assert there.u_max.tolist() == [25.0]
