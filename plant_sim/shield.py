@@ -46,8 +46,7 @@ class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
     In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
-    begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one. A
-    shallow copy goes its own way.
+    begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
     def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
@@ -101,7 +100,7 @@ class Shield:
         if command.state_seq < self._epoch or age > (1.0 + self._patience) * self._period:
             return "stale"
         at = max(t, self._t, self._acted, self._pending[-1].arrived if self._pending else -math.inf)
-        self._pending = [*self._pending, Orders(self.plant, command, at, self._patience)]
+        self._pending.append(Orders(self.plant, command, at, self._patience))
         return "ok"
 
     def backup(self, backup: Backup) -> Verdict:
@@ -115,7 +114,7 @@ class Shield:
         known = [order for order in (self._orders, *self._pending) if order is not None]
         for order in known:
             if (order.run_id, order.seq) == (backup.run_id, backup.seq) and order is not self._before_jump:
-                self._standby = {**self._standby, backup.seq: Standby(backup, order.arrived)}
+                self._standby[backup.seq] = Standby(backup, order.arrived)
                 return "ok"
         return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
 
@@ -138,7 +137,7 @@ class Shield:
     def act(self, t: float, machine: Machine) -> None:
         """Let act what has to at time t: the newest command, or what is due since the last."""
         while self._pending and self._pending[0].arrived <= t:
-            self._orders, *self._pending = self._pending
+            self._orders = self._pending.pop(0)
         self._write(self._drive(t, partial(machine.read, t)), t, machine)
 
     def renew(self, t: float, x: np.ndarray | None, machine: Machine) -> None:
@@ -174,8 +173,9 @@ class Shield:
         self._acted, self._until = due, drive.until
         self._written = since is not None
         u = None if since is None else drive.u
-        begin = max(due if since is None else since, self._tape[-1].since)
-        self._tape = [*self._tape, _Acting(begin, u, drive.source)]
+        self._tape.append(
+            _Acting(max(due if since is None else since, self._tape[-1].since), u, drive.source)
+        )
 
     # -- what a sample says ------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from copy import copy
 
 import numpy as np
 
@@ -97,12 +96,6 @@ class PlantSim:
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on."""
         self._shield = Shield(plant, period, plan_patience, run_id, held=True)
         self._motion = Motion(truth, x0, period)
-
-    def __copy__(self) -> PlantSim:
-        """The same plant at the same moment, which then goes its own way."""
-        twin = object.__new__(type(self))
-        twin._shield, twin._motion = copy(self._shield), copy(self._motion)
-        return twin
 
     def change(self, truth: TrueMotion) -> None:
         """From the last sample on the true motion is another."""
