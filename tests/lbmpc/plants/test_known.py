@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lbmpc.model import ModelError, build_model
-from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, Truth, get_plant, true_motion
+from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, PlantError, Truth, get_plant, true_motion
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
@@ -221,6 +221,18 @@ def test_numbers_move_as_their_model_says(known: Known) -> None:
     np.testing.assert_allclose(after, model.step(x, u), atol=1e-13)
     halfway = truth.step(truth.step(x + x_e, u + u_e, 0.06), u + u_e, 0.04) - x_e
     np.testing.assert_allclose(halfway, after, atol=1e-12)
+
+
+def test_without_a_motion_within_a_period_numbers_are_a_truth_of_whole_periods() -> None:
+    a, b = WITHOUT_MOTION["a dead time"]
+    known = numbers(a, b, period=0.1)
+    truth, x, u = true_motion(known), np.array([0.3, -0.5]), np.array([-0.7])
+    np.testing.assert_allclose(truth.step(x, u, 0.1), known.A @ x + known.B @ u)
+    np.testing.assert_allclose(
+        truth.step(x, u, 0.3), truth.step(truth.step(truth.step(x, u, 0.1), u, 0.1), u, 0.1)
+    )
+    with pytest.raises(PlantError, match=r"no motion between two samples.*plant\.truth"):
+        truth.step(x, u, 0.04)
 
 
 # -- rest -------------------------------------------------------------------------------------
