@@ -255,6 +255,16 @@ def test_the_state_gives_way_where_no_input_holds_an_offset() -> None:
     np.testing.assert_allclose(known.x_e, [0.1, -0.3], atol=1e-14)
 
 
+def test_what_the_plant_is_for_moves_last() -> None:
+    """An actuator that is a period late: it holds the offset, where the first state could give way as well."""
+    a, b = [[1.05, 0.1], [0.0, 0.0]], [[0.0], [1.0]]
+    held = numbers(a, b, period=0.1, offset=[0.01, 0.0], performance=(0,))
+    np.testing.assert_allclose([*held.x_e, *held.u_e], [0.0, -0.1, -0.1], atol=1e-14)
+    shared = numbers(a, b, period=0.1, offset=[0.01, 0.0])
+    assert np.linalg.norm(shared.x_e / [1.0, 2.0]) < np.linalg.norm(held.x_e / [1.0, 2.0])
+    np.testing.assert_allclose(0.05 * shared.x_e[0] + 0.1 * shared.x_e[1], -0.01, atol=1e-14)
+
+
 def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
     known = sampled(offset=[0.01, 0.02])
     there = known.A @ -known.x_e + known.B @ -known.u_e + known.x_e + [0.01, 0.02]
