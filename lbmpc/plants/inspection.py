@@ -46,6 +46,14 @@ def has_form(plant: Known | Plant) -> bool:
     return not found
 
 
+def require_equations(plant: Known | Plant) -> None:
+    """Raise `PlantDefinitionError` where the names or the equations cannot be used; it may rest nowhere."""
+    found = name_faults(plant) or (
+        tuple(_equations(plant)) if isinstance(plant, Plant) else known_faults(plant)
+    )
+    refuse(plant.name, found, _where(plant))
+
+
 def require_model(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with the faults of what a model is made of: names, numbers, bounds and equations."""
     refuse(plant.name, name_faults(plant) or _faults_of_model(plant), _where(plant))
