@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from lbmpc.plants.description import Description, PlantDefinitionError, PlantError
 from lbmpc.plants.equations import Domain, Plant, Rhs
-from lbmpc.plants.inspection import require_equations, require_names, require_sound
+from lbmpc.plants.inspection import has_form, require_equations, require_sound
 from lbmpc.plants.known import Known
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from lbmpc.plants.truth import TrueMotion, Truth, true_motion
@@ -38,14 +38,13 @@ def get_plant(
 
     Args:
         which: its name, or somebody's own.
-        change: what is to be otherwise; the plant is looked at as it is then. Its names are right before.
+        change: what is to be otherwise; the plant is looked at as it is then. It has a form before, `has_form`.
 
     Raises:
         LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with what is wrong with it.
     """
     plant = _named(which)
-    require_names(plant)
-    if change is not None:
+    if change is not None and has_form(plant):
         plant = change(plant)
     require_sound(plant)
     return plant
