@@ -13,6 +13,7 @@ import pytest
 
 from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
+from run_log.replaying.replay import replay
 from tandem.cli import main
 from tests.helpers.plants.tanks import OPTIONS, TRUE, write_tanks
 
@@ -69,6 +70,14 @@ def as_json(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> d
 
 def test_replay_with_the_file_is_equal_byte_for_byte(made: Path, capsys: pytest.CaptureFixture[str]):
     assert as_json(capsys, "replay", str(made / "run.mcap"))["equal"]
+
+
+def test_a_controller_that_knew_another_plant_than_the_recorder_is_named(made: Path):
+    run = read_run(made / "run.mcap")
+    assert replay(run).notes == []
+    assert run.plant is not None
+    run.plant = run.plant.changed({"pump": (0.0, 0.11)})
+    assert any("knew another plant than the recorder" in note for note in replay(run).notes)
 
 
 def test_a_log_says_what_was_known_and_which_file_it_was(made: Path):
