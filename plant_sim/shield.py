@@ -46,7 +46,8 @@ class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
     In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` closes a period and
-    `renew` opens the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    `renew` opens the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a
+    real one.
     """
 
     def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
