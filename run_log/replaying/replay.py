@@ -250,8 +250,8 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
             notes.append(f"{r.run_id}: goes on from the memory of {before}, out of a checkpoint")
         if run.plant is not None and r.known and r.known != sha256_of_known(run.plant):
             notes.append(
-                f"{r.run_id}: knew another plant than the recorder, whose numbers these are: its file changed between their "
-                "starts"
+                f"{r.run_id}: knew another plant than the recorder, whose numbers these are: its file changed between "
+                "the starts"
             )
         if not r.complete:
             notes.append(
