@@ -11,10 +11,15 @@ from typing import Any
 
 import pytest
 
+from controller_node.build import build_plant
 from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
 from run_log.replaying.replay import replay
 from tandem.cli import main
+from tandem.experiments.experiment import settings
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.study.declaration import load, resolve
+from tandem.experiments.study.plan import Job
 from tests.helpers.plants.tanks import OPTIONS, TRUE, write_tanks
 
 STEPS = ("--steps", "30")
@@ -232,6 +237,38 @@ def test_mistakes_are_named_before_anything_begins(
     for command in (["simulate", *STEPS], ["config", "show"], ["plant"], ["record"]):
         assert main([*command, *OPTIONS, "--set", setting]) == 2
         assert text.format(here=here) in said(capsys)
+
+
+EXPERIMENT = """
+name = "tanks"
+title = "Tanks"
+steps = 10
+set = { plant = { model = "tanks.py:TANKS" }, rate = 1, controller = { horizon = 10, oracle = "linear" } }
+[[group]]
+name = "all"
+title = "All"
+[[case]]
+name = "linear"
+group = "all"
+set.controller.solver.compile = "never"
+"""
+
+
+def test_an_experiment_finds_the_plant_file_beside_itself_in_all_its_processes(
+    here: Path, capsys: pytest.CaptureFixture[str]
+):
+    (here / "study").mkdir()
+    file = write_tanks(here / "study")
+    (here / "study" / "tanks.toml").write_text(EXPERIMENT)
+    found = as_json(capsys, "experiment", "study/tanks.toml", "--out", "out", "--jobs", "1")
+    (row,) = found["rows"]
+    assert row["J"] > 0.0
+    declared, where = load(here / "study" / "tanks.toml"), "study/tanks.toml"
+    (case,) = resolve(declared, build_plant(settings(declared, where)), where)
+    job = Job(config=case.config, steps=10, episodes=1, faults=Faults())
+    before = job.key
+    file.write_text(file.read_text() + "# changed\n")
+    assert job.key != before
 
 
 # -- what moves in the plant's place --------------------------------------------------------------------------
