@@ -19,7 +19,7 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -44,7 +44,7 @@ SHORTEST_WATCH = 8
 
 @dataclass(frozen=True)
 class GivenPlant:
-    """What stands for the plant that a configuration names: of a log, whose configuration never loads anything."""
+    """What stands for the plant that a configuration names, as it is configured: of a log, which loads nothing."""
 
     known: Known | Plant
     """What the controller knew."""
@@ -95,7 +95,7 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
     if config.controller.oracle == "constant":
         return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
-        truth = true_plant_of(config, get_plant) if given is None else given.truth
+        truth = true_plant_of(config, get_plant, get_truth) if given is None else given.truth
         if not isinstance(truth, Plant):
             raise ConfigError(
                 "controller.oracle = 'perfect': it needs the equations of the true plant, and there are none"
@@ -176,13 +176,12 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        plant = plant_of(config, get_plant, None if given is None else given.known)
+        plant = build_plant(config) if given is None else given.known
         model = nominal_model(plant, config.period, Q, R, settings.terminal)
         require_horizon(model, settings.horizon)
         if given is None or given.equations is None:
             return model
-        equations = plant_of(config, get_plant, given.equations)
-        return replace(model, equations=equations if isinstance(equations, Plant) else None)
+        return replace(model, equations=given.equations)
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
 

@@ -53,14 +53,14 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     sample, as a share of its half-width; empty without outputs."""
 
 
-def performance(motion: Trajectory, plant: Description, config: Config, truth: Description) -> Performance:
+def performance(motion: Trajectory, plant: Description, config: Config, truth: object) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
     Args:
         motion: the samples.
         plant: its equilibrium, bounds and half-widths.
         config: the weights and the rate.
-        truth: the plant whose motion this is, where its equations differ from `plant`'s.
+        truth: the plant whose motion this is, as of `excess`.
     """
     names = config.reference.outputs or [plant.states[i] for i in plant.performance]
     own = [plant.states.index(name) for name in names]
@@ -88,7 +88,7 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: D
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
-        excess_between_samples=excess(motion, truth),
+        excess_between_samples=excess(motion, plant, truth),
         offset=_offset(motion, dx, plant, config),
     )
 

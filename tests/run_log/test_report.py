@@ -20,6 +20,7 @@ from lbmpc.plants import get_plant
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from protocol import topics
+from protocol.messages import InputSource
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
@@ -75,10 +76,16 @@ def moved(messages: list[Logged], **changes: Any) -> list[Logged]:
     ]
 
 
-def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, messages: list[Logged]) -> None:
+@pytest.mark.parametrize("waits", ["hold", "safe"])
+def test_summary_counts_after_the_hold_and_ignores_strangers(
+    config: Config, messages: list[Logged], waits: InputSource
+) -> None:
     plain = summarise(gather(config, messages))
     first = next(message for topic, message, _ in messages if topic is topics.PLANT_STATE)
-    held = [(topics.PLANT_STATE, msgspec.structs.replace(first, seq=i, t=90.0 + i), i) for i in range(5)]
+    held = [
+        (topics.PLANT_STATE, msgspec.structs.replace(first, seq=i, t=90.0 + i, source=waits), i)
+        for i in range(5)
+    ]
     later = moved(messages, seq=lambda s: s.seq + 5)
     liar = (
         topics.PLANT_STATE,
@@ -168,7 +175,7 @@ def test_a_second_without_a_tick_has_no_prediction_error(
 
 
 def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
-    files, failed = report(whole, tmp_path / "new" / "folder")
+    files, failed = report(read_run(whole), tmp_path / "new" / "folder")
     assert failed == []
     parts = ["", "-states", "-input", "-error", "-model_error", "-timing", "-weights"]
     assert [file.name for file in files] == [f"run{part}.png" for part in parts]
@@ -246,7 +253,7 @@ def test_a_picture_replaces_files_alone(whole: Path, tmp_path: Path, make: Calla
     (tmp_path / "elsewhere").write_text("somebody else's")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
-    (why,) = report(whole, tmp_path).failed
+    (why,) = report(read_run(whole), tmp_path).failed
     assert re.search(r"run\.png: cannot be written: it is a (pipe|link|folder)", str(why))
     assert (tmp_path / "run.png").lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_text() == "somebody else's"
