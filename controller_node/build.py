@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -18,7 +19,7 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Plant, PlantError, get_plant
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -40,12 +41,24 @@ SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
 
-def build_plant(config: Config) -> Plant:
+@dataclass(frozen=True)
+class GivenPlant:
+    """What stands for the plant that a configuration names: of a log, whose configuration never loads anything."""
+
+    known: Known | Plant
+    """What the controller knew."""
+    equations: Plant | None = None
+    """Those that `known` was linearised from, where whoever reads the log has them."""
+    truth: Known | Plant | TrueMotion | None = None
+    """How it really moved, likewise."""
+
+
+def build_plant(config: Config) -> Known | Plant:
     """The plant named by the configuration, as the model knows it; its lengths fit. Raises `ConfigError`."""
     return plant_of(config, get_plant)
 
 
-def describe_network(config: Config, plant: Plant) -> NetworkDescription:
+def describe_network(config: Config, plant: Description) -> NetworkDescription:
     """The network of the configuration for this plant; its inputs and h are scaled by the half-widths.
 
     Raises:
@@ -72,7 +85,7 @@ def describe_network(config: Config, plant: Plant) -> NetworkDescription:
     return description
 
 
-def build_oracle(config: Config, model: Model) -> Oracle:
+def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) -> Oracle:
     """The oracle named by the configuration. Raises `ConfigError`."""
     plant = model.plant
     if config.controller.oracle == "linear":
@@ -80,8 +93,13 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     if config.controller.oracle == "constant":
         return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
+        truth = true_plant_of(config, get_plant) if given is None else given.truth
+        if not isinstance(truth, Plant):
+            raise ConfigError(
+                "controller.oracle = 'perfect': it needs the equations of the true plant, and there are none"
+            )
         try:
-            return PerfectOracle(model, true_plant_of(config, get_plant))
+            return PerfectOracle(model, truth)
         except PlantError as error:
             raise ConfigError(f"controller.oracle = 'perfect': {error}") from error
     if config.controller.oracle == "l2nw":
@@ -96,7 +114,7 @@ def build_oracle(config: Config, model: Model) -> Oracle:
     return build_network_oracle(config, plant)
 
 
-def build_network_oracle(config: Config, plant: Plant) -> DnnOracle:
+def build_network_oracle(config: Config, plant: Description) -> DnnOracle:
     """The network oracle of the configuration, whichever oracle it names. Raises `ConfigError`."""
     try:
         description = describe_network(config, plant)
@@ -150,15 +168,19 @@ def describe_trial(config: Config) -> Trial | None:
     )
 
 
-def build_model(config: Config) -> Model:
+def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     """The nominal model of the configuration's plant at its rate. Raises `ConfigError`, for its horizon too."""
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        model = nominal_model(build_plant(config), config.period, Q, R, settings.terminal)
+        plant = plant_of(config, get_plant, None if given is None else given.known)
+        model = nominal_model(plant, config.period, Q, R, settings.terminal)
         require_horizon(model, settings.horizon)
-        return model
+        if given is None or given.equations is None:
+            return model
+        equations = plant_of(config, get_plant, given.equations)
+        return replace(model, equations=equations if isinstance(equations, Plant) else None)
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
 
@@ -188,7 +210,11 @@ class TimedSolver(Solver):
 
 
 def build_controller(
-    config: Config, model: Model, realise: Realise | None = None, certificate: Certificate | None = None
+    config: Config,
+    model: Model,
+    realise: Realise | None = None,
+    certificate: Certificate | None = None,
+    given: GivenPlant | None = None,
 ) -> tuple[Controller, TimedSolver]:
     """A controller and the solver that it uses.
 
@@ -197,6 +223,7 @@ def build_controller(
         model: the nominal model of that configuration.
         realise: may compile the solver's functions.
         certificate: the sets of the tightening `invariant`.
+        given: as for `build_model`.
 
     Raises:
         ConfigError: the configuration admits no controller, or the sets are of another model.
@@ -205,7 +232,7 @@ def build_controller(
     try:
         problem = build_problem(
             model,
-            build_oracle(config, model),
+            build_oracle(config, model, given),
             settings.horizon,
             settings.tightening,
             given_disturbance(config),
@@ -218,7 +245,10 @@ def build_controller(
     solver = TimedSolver(problem, chosen.max_iterations, chosen.tolerance, realise)
     problem.oracle.compile(realise)
     seconds = 1e-3 * (settings.input_delay_ms or 0.0)
-    controller = Controller(problem, solver, real_time=chosen.mode == "real_time", input_delay=seconds)
+    try:
+        controller = Controller(problem, solver, real_time=chosen.mode == "real_time", input_delay=seconds)
+    except ModelError as error:
+        raise ConfigError(f"controller: {error}") from error
     _warm_up(controller, solver, config.seed)
     return controller, solver
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 
-from controller_node.build import build_backup, build_controller, build_model
+from controller_node.build import GivenPlant, build_backup, build_controller, build_model
 from controller_node.certified_sets import CertifiedSets, find_sets
 from controller_node.codegen.compiler import Compiler
 from controller_node.memory import Memory
@@ -26,21 +26,28 @@ class ControllerCore:
         config: the resolved configuration.
         run_id: stamped on every message; a replay gives the recorded one.
         sets: the certified sets of the tightening `invariant`; None: found by the configuration.
+        given: the plant; None: the one that the configuration names.
 
     Raises:
         ConfigError: the configuration admits no controller, and why.
     """
 
-    def __init__(self, config: Config, run_id: str, sets: CertifiedSets | None = None):
+    def __init__(
+        self,
+        config: Config,
+        run_id: str,
+        sets: CertifiedSets | None = None,
+        given: GivenPlant | None = None,
+    ):
         self.config, self.run_id = config, run_id
-        model = build_model(config)
+        model = build_model(config, given)
         self.plant = model.plant
         self.sets = None
         if config.controller.tightening == "invariant":
             self.sets = find_sets(config, model) if sets is None else sets
         compiler = Compiler() if config.controller.solver.compile == "auto" else None
         certificate = self.sets.certificate if self.sets else None
-        self.controller, self._solver = build_controller(config, model, compiler, certificate)
+        self.controller, self._solver = build_controller(config, model, compiler, certificate, given)
         self._realise = compiler
         self._backup: BackupPlanner | None = None
         self.kernels = compiler.note if compiler else "virtual machine, as configured"

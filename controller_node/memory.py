@@ -102,7 +102,9 @@ class Memory:
             "oracle": self._config.controller.oracle,
         }
         truth = self._config.plant.truth
-        if truth:
+        if isinstance(truth, str):
+            words["truth"] = truth
+        elif truth:
             words["truth"] = ", ".join(f"{name} {value!r}" for name, value in sorted(truth.items()))
         if what is not None:
             layers = "-".join(map(str, what.hidden))

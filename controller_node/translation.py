@@ -14,7 +14,7 @@ import numpy as np
 from lbmpc.controller.backup_policy import Policy
 from lbmpc.controller.signals import Observation, StepResult
 from lbmpc.oracles.base import HiddenSet, LearnedNetwork
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol import messages as m
 from protocol.codec import encode
 
@@ -42,7 +42,7 @@ class Translation:
 
     run_id: str
     """Stamped on every message."""
-    plant: Plant
+    plant: Description
     period: float
     """Seconds."""
 

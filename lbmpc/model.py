@@ -14,8 +14,10 @@ import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.plants.base import Plant
-from lbmpc.plants.inspection import PlantDefinitionError, require_model
+from lbmpc.plants.description import Description, PlantDefinitionError
+from lbmpc.plants.equations import Plant
+from lbmpc.plants.inspection import require_model
+from lbmpc.plants.known import Known
 from lbmpc.pole_placement import place
 from lbmpc.terminal_cost import TOLERANCE, TerminalCost, shortfall, terminal_cost
 
@@ -43,7 +45,7 @@ class Model:
     Shapes: A (d, d), B (d, m), K (m, d), P (d, d), Q (d, d), R (m, m).
     """
 
-    plant: Plant
+    plant: Known
     period: float
     a: np.ndarray
     """Continuous-time Jacobian in x, (d, d)."""
@@ -59,6 +61,16 @@ class Model:
     """Feedback of the tubes and of the fallback."""
     P: np.ndarray
     """Weight of the last state, as `lbmpc.terminal_cost` says."""
+    equations: Plant | None = None
+    """What `plant` is the linearisation of; None where nothing but numbers is known."""
+
+    def require_equations(self, wanted_by: str) -> Plant:
+        """Raises `ModelError`: the plant is numbers alone."""
+        if self.equations is None:
+            raise ModelError(
+                f"{wanted_by} needs the equations of {self.plant.name}, and of this plant there are numbers alone"
+            )
+        return self.equations
 
     @property
     def d(self) -> int:
@@ -147,13 +159,7 @@ class Model:
         return Bound(ca.Function("held", [x, u, part], [after], ["x", "u", "share"], ["after"]))
 
 
-def linearise(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Continuous-time Jacobians of the plant's own equations at (x_e, u_e): (d, d) and (d, m)."""
-    _rest, a, b = plant.linearised()
-    return a, b
-
-
-def balanced(plant: Plant) -> np.ndarray:
+def balanced(plant: Description) -> np.ndarray:
     """Units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
 
     A state in pascals beside one in metres would otherwise cost digits. Powers of two: going there and back is exact.
@@ -177,7 +183,7 @@ def _block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def build_model(
-    plant: Plant,
+    plant: Known | Plant,
     period: float,
     Q: np.ndarray | None = None,
     R: np.ndarray | None = None,
@@ -188,7 +194,7 @@ def build_model(
     K places the plant's own closed-loop poles, mapped by exp(p T), or is the LQR gain when it names none.
 
     Args:
-        plant: what is linearised.
+        plant: numbers, or equations that are linearised.
         period: T in seconds.
         Q, R: diagonals of the weights as densities, per second, (d,) and (m,); ones by default. A stage weighs T times
             as much, so that the cost of a motion does not depend on how often it is sampled.
@@ -202,20 +208,21 @@ def build_model(
         require_model(plant)
     except PlantDefinitionError as error:
         raise ModelError(str(error)) from error
-    a_c, b_c = linearise(plant)
-    units = balanced(plant)
+    known = plant if isinstance(plant, Known) else plant.known()
+    a_c, b_c = known.A, known.B
+    units = balanced(known)
     A, B = discretise(a_c, b_c, period, units)
     q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)
     x, u = units[: plant.d], units[plant.d :]
     a, b = A * x / x[:, None], B * u / x[:, None]
     k, p = _gain_and_terminal_weight(plant, period, terminal, a, b, np.diag(q * x**2), np.diag(r * u**2), x)
-    return Model(
-        plant, period, a_c, b_c, A, B, np.diag(q), np.diag(r), k * u[:, None] / x, p / np.outer(x, x)
-    )
+    gain, terminal_weight = k * u[:, None] / x, p / np.outer(x, x)
+    equations = plant if isinstance(plant, Plant) else None
+    return Model(known, period, a_c, b_c, A, B, np.diag(q), np.diag(r), gain, terminal_weight, equations)
 
 
 def _gain_and_terminal_weight(
-    plant: Plant,
+    plant: Description,
     period: float,
     terminal: TerminalCost,
     a: np.ndarray,
@@ -243,7 +250,7 @@ def _gain_and_terminal_weight(
 
 
 def _terminal_weight(
-    plant: Plant,
+    plant: Description,
     period: float,
     kind: TerminalCost,
     a: np.ndarray,

@@ -6,10 +6,10 @@ import logging
 import os
 import threading
 
-from lbmpc.plants import PlantError, get_plant
+from lbmpc.plants import PlantError, get_plant, true_motion
 from node_runtime.bus.inbox import Inbox
 from node_runtime.bus.zenoh_bus import Bus
-from node_runtime.config.plant import initial_state, true_plant_of
+from node_runtime.config.plant import initial_state, plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
@@ -35,8 +35,9 @@ NOTES: dict[InputSource, str] = {
 
 def build(config: Config, run_id: str) -> PlantSim:
     """The plant that the configuration names, as it really moves. Raises `ConfigError`."""
-    plant = true_plant_of(config, get_plant)
-    return PlantSim(plant, config.period, initial_state(config, plant), config.plant.plan_patience, run_id)
+    plant, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    x0 = initial_state(config, plant)
+    return PlantSim(plant, true_motion(truth), config.period, x0, config.plant.plan_patience, run_id)
 
 
 class PlantNode:

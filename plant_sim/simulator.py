@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.plants import Plant, Truth
+from lbmpc.plants import Description, TrueMotion
 from plant_sim.watchdog import Orders, Standby
 from protocol.messages import Backup, Command, InputSource, Piece, PlantState
 
@@ -34,13 +34,21 @@ class PlantSim:
     late as long as its arrival time is right. The same calls give the same numbers.
     """
 
-    def __init__(self, plant: Plant, period: float, x0: np.ndarray, plan_patience: float, run_id: str):
+    def __init__(
+        self,
+        plant: Description,
+        truth: TrueMotion,
+        period: float,
+        x0: np.ndarray,
+        plan_patience: float,
+        run_id: str,
+    ):
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on."""
         self.plant = plant
         self.period = period
         self.run_id = run_id
         self._patience = plan_patience
-        self._truth = Truth(plant)
+        self._truth = truth
         self._x = np.array(x0, dtype=float)
         self._first: float | None = None
         self._t = -math.inf
@@ -55,9 +63,9 @@ class PlantSim:
         """False while held at x0."""
         return self._orders is not None
 
-    def change(self, plant: Plant) -> None:
-        """From the last sample on the true motion is that of `plant`: an experiment with a plant that drifts."""
-        self._truth = Truth(plant)
+    def change(self, truth: TrueMotion) -> None:
+        """From the last sample on this is the true motion: an experiment with a plant that drifts."""
+        self._truth = truth
         self._memo = {}
 
     def command(self, command: Command, t: float) -> CommandVerdict:

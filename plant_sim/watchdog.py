@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol.messages import Backup, Command, InputSource
 
 
@@ -52,7 +52,7 @@ class Orders:
     acts while it has an entry, the plan's entry while it has one, and the plant's safe input for ever after.
     """
 
-    def __init__(self, plant: Plant, command: Command, arrived: float, patience: float):
+    def __init__(self, plant: Description, command: Command, arrived: float, patience: float):
         """`command` must have the plant's dimensions; what acts of it is clipped to [u_min, u_max]."""
         self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from lbmpc.plants import Plant, PlantDefinitionError, get_plant
+from lbmpc.plants import Known, Plant, PlantDefinitionError, get_plant
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
@@ -126,7 +126,7 @@ def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], pat
     return run
 
 
-def plant_of(run: Run) -> Plant:
+def plant_of(run: Run) -> Known | Plant:
     """The plant that the run is about. Raises `LogError` when this Tandem does not have it, or cannot use it."""
     try:
         return get_plant(run.config.plant.model)
@@ -138,7 +138,7 @@ def plant_of(run: Run) -> Plant:
         raise LogError(f"{run.path}: {error}") from error
 
 
-def true_plant_of(run: Run) -> Plant:
+def true_plant_of(run: Run) -> Known | Plant:
     """The plant as it really moved: `plant_of` with the parameters of `plant.truth`.
 
     Raises:

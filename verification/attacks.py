@@ -14,7 +14,7 @@ from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import messages as m
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
-from tandem.experiments.simulation.lockstep import CONTROLLER, _LockStep
+from tandem.experiments.simulation.lockstep import CONTROLLER, LockStep, drive
 from trainer_node.node import ADOPTION_PATIENCE
 
 Layers = list[np.ndarray]
@@ -48,10 +48,10 @@ def follow_attacked(config: Config, steps: int, forge: Forge, every: int = 1, in
         instead: only in place of the real trainer's sets, which never arrive.
     """
     with one_blas_thread():
-        return _Attacked(config, forge, every, instead).run(steps, None).run
+        return drive(_Attacked(config, forge, every, instead), steps).run
 
 
-class _Attacked(_LockStep):
+class _Attacked(LockStep):
     def __init__(self, config: Config, forge: Forge, every: int, instead: bool):
         super().__init__(config, Faults())
         self.forge, self.every, self.instead = forge, every, instead

@@ -22,7 +22,7 @@ from lbmpc.controller.step import Controller
 from lbmpc.model import Model, Pieces
 from lbmpc.oracles import LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import OracleState
-from lbmpc.plants.base import dop853
+from lbmpc.plants.truth import dop853
 from lbmpc.problem import build_problem
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.guard import Guard
@@ -147,7 +147,7 @@ class ClosedLoop:
 
 def _flow(model: Model) -> ca.Function:
     """(x, u, seconds), deviations -> the true plant's state, (d,), for up to a period; as `one_period`."""
-    plant, f = model.plant, model.plant.function()
+    plant, f = model.plant, model.require_equations("this check").function()
     x, u, seconds = ca.SX.sym("x", model.d), ca.SX.sym("u", model.m), ca.SX.sym("seconds")
     norm = float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period
     steps = max(1, math.ceil(norm / STEP_NORM))

@@ -20,8 +20,9 @@ import tyro
 from rich.console import Console
 
 from benchmarks.document_block import Marks
+from controller_node.build import build_plant
 from controller_node.core import ControllerCore
-from lbmpc.plants import Plant, PlantError
+from lbmpc.plants import Description, PlantError, true_motion
 from node_runtime.config.loading import load
 from node_runtime.config.sections import Config
 from plant_sim.simulator import PlantSim
@@ -62,8 +63,8 @@ def measure(seeds: range) -> dict[str, list[Silence]]:
 
 
 def _followed(
-    plant: Plant, backups: dict[float, m.Backup | None]
-) -> Iterator[tuple[str, Plant, m.Backup | None]]:
+    plant: Description, backups: dict[float, m.Backup | None]
+) -> Iterator[tuple[str, Description, m.Backup | None]]:
     yield "plan, then constant input", replace(plant, safe_gain=None), None
     yield "plan, then feedback", plant, None
     for margin, backup in backups.items():
@@ -83,11 +84,17 @@ def _said(core: ControllerCore, tick: m.Tick) -> tuple[m.Command, m.Backup | Non
 
 
 def _silence(
-    config: Config, plant: Plant, tick: m.Tick, command: m.Command, delay: float, backup: m.Backup | None
+    config: Config,
+    plant: Description,
+    tick: m.Tick,
+    command: m.Command,
+    delay: float,
+    backup: m.Backup | None,
 ) -> Silence:
     """The true plant from this tick's sample on, with its last command and nothing after it."""
     assert tick.state is not None
-    sim = PlantSim(plant, config.period, np.array(tick.state.x), config.plant.plan_patience, PLANT)
+    truth = true_motion(build_plant(config))
+    sim = PlantSim(plant, truth, config.period, np.array(tick.state.x), config.plant.plan_patience, PLANT)
     sim.sample(0.0)
     sim.command(msgspec.structs.replace(command, state_seq=0), delay)
     if backup is not None:

@@ -78,7 +78,7 @@ def record(ticks: int, realise: Realise | None = None) -> Recording:
     config = configure("dnn", RECORDED_HORIZON, RECORDED_WIDTH)
     model = build_model(config)
     controller, _ = build_controller(config, model, realise)
-    plant, truth = model.plant, Truth(model.plant)
+    plant, truth = model.plant, Truth(model.require_equations("a recording"))
     state, x, applied = controller.initial_state(SEED), plant.x0 - plant.x_e, None
     made = Recording(model, [], [], [])
     for tick in range(ticks):

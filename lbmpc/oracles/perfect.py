@@ -17,7 +17,9 @@ import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, OracleState
-from lbmpc.plants.base import Plant, PlantError, dop853
+from lbmpc.plants.description import PlantError
+from lbmpc.plants.equations import Plant
+from lbmpc.plants.truth import dop853
 
 STEP_NORM = 0.4
 """At most so much of |a| dt, a the linearisation, in one integration step: h is then right to 1e-9."""
@@ -33,9 +35,10 @@ class PerfectOracle(Oracle):
 
     Args:
         model: the nominal model, whose A and B h is the rest of.
-        truth: the true plant; None: the model's own.
+        truth: the true plant; None: the equations that the model is linearised from.
 
     Raises:
+        ModelError: there is no truth, and the model is made of numbers alone.
         PlantError: the true plant is too fast to be followed over a period.
     """
 
@@ -43,7 +46,7 @@ class PerfectOracle(Oracle):
 
     def __init__(self, model: Model, truth: Plant | None = None):
         self.d, self.m = model.d, model.m
-        self._truth = model.plant if truth is None else truth
+        self._truth = model.require_equations("the oracle perfect") if truth is None else truth
         self._names = list(self._truth.parameters)
         self.parameters = len(self._names)
         self._value, self._slopes = _functions(model, self._truth)
@@ -77,7 +80,7 @@ def _functions(model: Model, truth: Plant) -> tuple[ca.Function, ca.Function]:
     plant, d = model.plant, model.d
     xu, parameters = ca.SX.sym("xu", d + model.m), ca.SX.sym("parameters", len(truth.parameters))
     low = np.full(d, -np.inf)
-    positive = [domain.state for domain in plant.positive]
+    positive = [domain.state for domain in truth.positive]
     low[positive] = LEAST * plant.x_scale[positive]
     start = ca.fmax(xu[:d] + plant.x_e, low)
     u = xu[d:] + plant.u_e

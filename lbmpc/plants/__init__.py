@@ -3,26 +3,52 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 
-from lbmpc.plants.base import Plant, PlantError, Truth
-from lbmpc.plants.inspection import PlantDefinitionError, require_sound
+from lbmpc.plants.description import Description, PlantDefinitionError, PlantError
+from lbmpc.plants.equations import Domain, Plant, Rhs
+from lbmpc.plants.inspection import require_names, require_sound
+from lbmpc.plants.known import Known
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from lbmpc.plants.truth import TrueMotion, Truth, true_motion
 
-PLANTS: dict[str, Plant] = {plant.name: plant for plant in (MOORE_GREITZER,)}
+PLANTS: dict[str, Known | Plant] = {plant.name: plant for plant in (MOORE_GREITZER,)}
 
-__all__ = ["PLANTS", "Plant", "PlantDefinitionError", "PlantError", "Truth", "get_plant"]
+__all__ = [
+    "PLANTS",
+    "Description",
+    "Domain",
+    "Known",
+    "Plant",
+    "PlantDefinitionError",
+    "PlantError",
+    "Rhs",
+    "TrueMotion",
+    "Truth",
+    "get_plant",
+    "true_motion",
+]
 
 
-def get_plant(name: str) -> Plant:
-    """The plant of that name, looked at.
+def get_plant(
+    which: str | Known | Plant, change: Callable[[Known | Plant], Known | Plant] | None = None
+) -> Known | Plant:
+    """A plant, looked at.
+
+    Args:
+        which: its name, or somebody's own.
+        change: what is to be otherwise; the plant is looked at as it is then. Its names are right before.
 
     Raises:
         LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with what is wrong with it.
     """
     try:
-        plant = PLANTS[name]
+        plant = PLANTS[which] if isinstance(which, str) else which
     except KeyError:
-        near = difflib.get_close_matches(name, PLANTS, n=1, cutoff=0.0)
-        raise KeyError(f"no plant is called {name!r}; did you mean {near[0]!r}?") from None
+        near = difflib.get_close_matches(str(which), PLANTS, n=1, cutoff=0.0)
+        raise KeyError(f"no plant is called {which!r}; did you mean {near[0]!r}?") from None
+    require_names(plant)
+    if change is not None:
+        plant = change(plant)
     require_sound(plant)
     return plant

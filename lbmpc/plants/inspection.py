@@ -12,7 +12,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import INPUT_VECTORS, STATE_VECTORS, Domain, Plant
+from lbmpc.plants.description import INPUT_VECTORS, STATE_VECTORS, Description, PlantDefinitionError
+from lbmpc.plants.equations import Domain, Plant
+from lbmpc.plants.known import Known
 
 REST = 1e-5
 """How far x_e and u_e may be from rest, as a share of the half-widths of X and U."""
@@ -23,44 +25,47 @@ TIME = "t"
 """The name of time in a plant's units."""
 
 
-class PlantDefinitionError(LookupError):
-    """A plant is there and cannot be used; the text names every fault, its field and the remedy."""
-
-
-def require_sound(plant: Plant) -> None:
+def require_sound(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with all faults of this plant, if it has any."""
     _refuse(plant, faults(plant))
 
 
-def require_model(plant: Plant) -> None:
+def require_names(plant: Known | Plant) -> None:
+    """Raise `PlantDefinitionError` with what is wrong with the names, without which nothing else can be said."""
+    _refuse(plant, _names(plant))
+
+
+def require_model(plant: Known | Plant) -> None:
     """Raise `PlantDefinitionError` with the faults of what a model is made of: names, numbers, bounds and equations."""
     _refuse(plant, _names(plant) or _faults_of_model(plant))
 
 
-def faults(plant: Plant) -> tuple[str, ...]:
+def faults(plant: Known | Plant) -> tuple[str, ...]:
     """Every fault of the description, one sentence each; empty where the plant can be used."""
     # Lengths and indices mean nothing without states and inputs.
     return _names(plant) or (*_faults_of_model(plant), *_choices(plant))
 
 
-def _refuse(plant: Plant, found: tuple[str, ...]) -> None:
+def _refuse(plant: Known | Plant, found: tuple[str, ...]) -> None:
     if not found:
         return
-    code = getattr(plant.rhs, "__code__", None)
+    code = getattr(plant.rhs, "__code__", None) if isinstance(plant, Plant) else None
     where = "" if code is None else f" (its equations: {code.co_filename}, line {code.co_firstlineno})"
     listed = f" {found[0]}" if len(found) == 1 else "".join(f"\n  - {fault}" for fault in found)
     raise PlantDefinitionError(f"the plant {plant.name!r} cannot be used{where}:{listed}")
 
 
 @lru_cache(maxsize=16)
-def _faults_of_model(plant: Plant) -> tuple[str, ...]:
+def _faults_of_model(plant: Known | Plant) -> tuple[str, ...]:
     """Remembered: a plant never changes, it is looked at wherever it is looked up, and derivatives take a while."""
     numbers = list(_numbers(plant))
+    if isinstance(plant, Known):
+        return tuple(numbers or [*_bounds(plant), *_poles(plant)])
     found = [*(numbers or [*_bounds(plant), *_domains(plant), *_poles(plant)]), *_equations(plant)]
     return tuple(found or list(_rest(plant)) or _parameters(plant))
 
 
-def _names(plant: Plant) -> tuple[str, ...]:
+def _names(plant: Description) -> tuple[str, ...]:
     found = [] if isinstance(plant.name, str) and plant.name else [f"name is {plant.name!r}: give it a name"]
     for field in ("states", "inputs"):
         names: Any = getattr(plant, field)
@@ -82,7 +87,7 @@ def _names(plant: Plant) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _numbers(plant: Plant) -> Iterator[str]:
+def _numbers(plant: Description) -> Iterator[str]:
     """Shapes, and what must be finite."""
     for fields, names in ((STATE_VECTORS, plant.states), (INPUT_VECTORS, plant.inputs)):
         for field in fields:
@@ -104,7 +109,7 @@ def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:
             yield f"{field} of {names[i]} is {value[i]:g}: give a finite number"
 
 
-def _bounds(plant: Plant) -> Iterator[str]:
+def _bounds(plant: Description) -> Iterator[str]:
     known = (*plant.states, *plant.inputs)
     scale: Any = plant.scale
     if not isinstance(scale, Mapping):
@@ -153,7 +158,7 @@ def _domains(plant: Plant) -> Iterator[str]:
                 yield f"{field} of {plant.states[domain.state]} is {value:g}: {domain.name} must be positive there"
 
 
-def _poles(plant: Plant) -> Iterator[str]:
+def _poles(plant: Description) -> Iterator[str]:
     if plant.poles is None:
         return
     try:
@@ -168,7 +173,7 @@ def _poles(plant: Plant) -> Iterator[str]:
         yield f"poles is {plant.poles!r}: complex poles come in conjugate pairs"
 
 
-def _choices(plant: Plant) -> Iterator[str]:
+def _choices(plant: Description) -> Iterator[str]:
     """What refers to states and inputs by index or by name."""
     known = (*plant.states, *plant.inputs)
     performance: Any = plant.performance
@@ -294,7 +299,7 @@ def _is_index(value: Any, length: int) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) < length
 
 
-def _indices(plant: Plant) -> str:
+def _indices(plant: Description) -> str:
     last = plant.d - 1
     return f"a state's index is from 0 ({plant.states[0]}) to {last} ({plant.states[last]})"
 

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import Domain, Plant, Rhs
+from lbmpc.plants.equations import Domain, Plant, Rhs
 
 ZETA, OMEGA_N = 1 / np.sqrt(2.0), 10 * np.sqrt(10.0)
 PARAMETERS = {"beta": 1.0, "z_c": 0.0, "slope": 1.5}

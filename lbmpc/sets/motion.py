@@ -25,7 +25,7 @@ class Motion:
     """The state up to one period ahead, in deviation coordinates."""
 
     def __init__(self, model: Model):
-        plant = model.plant
+        plant = model.require_equations("the prediction over the delay")
         norm = float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period
         steps = min(max(1, math.ceil(norm / STEP_NORM)), MOST_STEPS)
         x, u, seconds = ca.MX.sym("x", model.d), ca.MX.sym("u", model.m), ca.MX.sym("seconds")

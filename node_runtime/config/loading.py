@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,14 @@ import tomli_w
 from network_model.operations import BOUNDED
 from network_model.registry import get_architecture
 from node_runtime.config import strict
+from node_runtime.config.reference import absolute, is_reference
 from node_runtime.config.sections import LONGEST_HORIZON, LONGEST_PERIOD, Config, NetworkConfig, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, Fail
 from protocol.codec import first_non_finite
+
+INFINITE = -math.inf, math.inf
+"""Bounds that are none, lower and upper."""
 
 
 def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:
@@ -29,7 +34,8 @@ def load(path: str | Path | None = None, overrides: list[str] | None = None) -> 
     """
     if path is None:
         return _overridden({}, overrides or [], "configuration")
-    return _overridden(strict.load_tree(config_file(path)), overrides or [], str(path))
+    file = config_file(path)
+    return _overridden(strict.load_tree(file), overrides or [], str(path), file.parent)
 
 
 def override(config: Config, assignments: list[str]) -> Config:
@@ -37,26 +43,38 @@ def override(config: Config, assignments: list[str]) -> Config:
     return _overridden(to_tree(config), assignments, "configuration")
 
 
-def _overridden(tree: dict[str, Any], assignments: list[str], where: str) -> Config:
+def _overridden(
+    tree: dict[str, Any], assignments: list[str], where: str, folder: Path | None = None
+) -> Config:
     origins = {strict.apply_override(tree, text): f"--set {text}" for text in assignments}
-    return from_tree(tree, where, origins)
+    return from_tree(tree, where, origins, folder)
 
 
 def from_tree(
-    tree: dict[str, Any], where: str = "configuration", origins: Mapping[str, str] | None = None
+    tree: dict[str, Any],
+    where: str = "configuration",
+    origins: Mapping[str, str] | None = None,
+    folder: Path | None = None,
 ) -> Config:
     """Convert a plain tree to a `Config`. Raises `ConfigError`.
 
-    `~` at the beginning of a path is the home folder. where: the file, for messages; origins: for keys that come from
-    elsewhere (`trainer.batch`), from where.
+    `~` at the beginning of a path is the home folder. A reference to a file is written out.
+
+    Args:
+        tree: tables as TOML gives them.
+        where: the file, for messages.
+        origins: for keys that come from elsewhere (`trainer.batch`), from where; there a reference is relative to the
+            current folder.
+        folder: where the other references are relative to; None: they stay as they are.
     """
-    return _at_home(_checked(tree, where, origins), strict.failing(where, origins))
+    fail = strict.failing(where, origins)
+    return _written_out(_at_home(_checked(tree, where, origins), fail), fail, origins or {}, folder)
 
 
 def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
     """The tree as a `Config`, its paths as they were written."""
     fail = strict.failing(where, origins)
-    config = strict.convert(tree, Config, fail)
+    config = strict.convert(_with_open_bounds(tree), Config, fail)
     _check_texts(tree, fail)
     infinite = first_non_finite(config)
     if infinite is not None:
@@ -147,6 +165,40 @@ def _at_home(config: Config, fail: Fail) -> Config:
     return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
 
 
+def _written_out(config: Config, fail: Fail, origins: Mapping[str, str], folder: Path | None) -> Config:
+    """With whole paths in the references, so that every process of a run finds the same file from anywhere."""
+
+    def found(key: str, reference: str) -> str:
+        given = any(f"{key}.".startswith(f"{name}.") for name in origins)
+        base = Path.cwd() if given else folder
+        if not is_reference(reference) or base is None:
+            return reference
+        try:
+            return absolute(reference, base)
+        except ConfigError as error:
+            fail(key, f"{key} = {error}")
+
+    plant = msgspec.structs.replace(config.plant, model=found("plant.model", config.plant.model))
+    if isinstance(plant.truth, str):
+        plant = msgspec.structs.replace(plant, truth=found("plant.truth", plant.truth))
+    return msgspec.structs.replace(config, plant=plant)
+
+
+def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
+    """With None for the infinite ends of `plant.bounds`: JSON has no infinity, and no other key may be one."""
+    plant = tree.get("plant")
+    bounds = plant.get("bounds") if isinstance(plant, dict) else None
+    if not isinstance(bounds, dict):
+        return tree
+
+    def ends(pair: Any) -> Any:
+        if not isinstance(pair, list | tuple) or len(pair) != 2:
+            return pair
+        return [None if end == infinite else end for end, infinite in zip(pair, INFINITE, strict=True)]
+
+    return {**tree, "plant": {**plant, "bounds": {name: ends(pair) for name, pair in bounds.items()}}}
+
+
 def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
     try:
         known = get_architecture(network.architecture).options
@@ -184,7 +236,12 @@ def to_toml(config: Config) -> str:
 
     A `log.path` that is not UTF-8, which TOML is, comes back as text that shows its bytes.
     """
-    return tomli_w.dumps(_without_none(to_tree(_readable(config))))
+    tree = to_tree(_readable(config))
+    tree["plant"]["bounds"] = {
+        name: [infinite if end is None else end for end, infinite in zip(pair, INFINITE, strict=True)]
+        for name, pair in config.plant.bounds.items()
+    }
+    return tomli_w.dumps(_without_none(tree))
 
 
 def _readable(config: Config) -> Config:

@@ -1,20 +1,21 @@
 """The plant that a configuration names: it exists, and every vector of the configuration has its lengths.
 
-Whoever asks hands over the function that finds a plant by name; nothing of the science is imported here.
+Whoever asks hands over the function that finds a plant; nothing of the science is imported here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Protocol, Self, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
+from node_runtime.config.reference import is_reference, load, loaded
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
+from node_runtime.config.strict import ConfigError, did_you_mean
 
 
-class Plant(Protocol):
+class Described(Protocol):
     """What the checks need to know of a plant."""
 
     @property
@@ -25,37 +26,121 @@ class Plant(Protocol):
     def inputs(self) -> Sequence[str]: ...
     @property
     def x0(self) -> np.ndarray: ...
+
+
+class Plant(Described, Protocol):
+    """One that can be told to differ."""
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Self: ...
     def varied(self, **changes: float) -> Self: ...
 
 
+class Motion(Protocol):
+    """What moves in the plant's place: an object of the user's own."""
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray: ...
+
+
 P = TypeVar("P", bound=Plant)
+Find = Callable[[Any, Callable[[P], P]], P]
+"""`lbmpc.plants.get_plant`: of a name or a plant, and what is changed before it is looked at, the plant. It raises
+`LookupError` with a text for a plant that is unknown or cannot be used."""
 
 
-def plant_of(config: Config, find: Callable[[str], P]) -> P:
+def plant_of(config: Config, find: Find[P], plant: P | None = None) -> P:
     """The plant that `config` names, as its model knows it, with every length and name in `config` checked against it.
 
     Args:
-        find: `lbmpc.plants.get_plant`; raises LookupError with a text for a plant that is unknown or cannot be used.
+        find: `lbmpc.plants.get_plant`.
+        plant: taken in the place of the one that `config` names; nothing is loaded then. Of a log.
 
     Raises:
         ConfigError: a plant that is unknown or cannot be used, an unknown variable or parameter, or a vector of the
             wrong length; names the key and the rule.
     """
-    return _model_and_truth(config, find)[0]
-
-
-def true_plant_of(config: Config, find: Callable[[str], P]) -> P:
-    """The plant as it really moves: `plant_of` with the parameters of `plant.truth`. Raises as `plant_of` does."""
-    return _model_and_truth(config, find)[1]
-
-
-def _model_and_truth(config: Config, find: Callable[[str], P]) -> tuple[P, P]:
+    named = config.plant.model
     try:
-        plant = find(config.plant.model)
+        which = plant if plant is not None else load_plant(named) if is_reference(named) else named
+    except ConfigError as error:
+        raise ConfigError(f"plant.model: {error}") from error
+    try:
+        found = find(which, lambda plant: _as_configured(config, plant))
     except LookupError as error:
-        raise ConfigError(f"plant.model = {config.plant.model!r}: {error.args[0]}") from error
+        raise ConfigError(f"plant.model = {named!r}: {error.args[0]}") from error
+    _with_parameters(config, found)
+    return found
+
+
+def true_plant_of(config: Config, find: Find[P], plant: P | None = None) -> P | Motion:
+    """The plant as it really moves: `plant_of` with the parameters of `plant.truth`, or what that names.
+
+    Raises:
+        ConfigError: as `plant_of`; `plant.truth` names nothing that moves, or a plant with other states or inputs.
+    """
+    model, truth = plant_of(config, find, plant), config.plant.truth
+    if not isinstance(truth, str):
+        return _with_parameters(config, model)
+    try:
+        found = load(truth, _moves, "plant or object with step") if is_reference(truth) else truth
+        if hasattr(found, "step"):
+            return found
+        true = find(found, lambda plant: plant)
+    except ConfigError as error:
+        raise ConfigError(f"plant.truth: {error}") from error
+    except LookupError as error:
+        raise ConfigError(f"plant.truth = {truth!r}: {error.args[0]}") from error
+    for what, ours, theirs in (
+        ("states", model.states, true.states),
+        ("inputs", model.inputs, true.inputs),
+    ):
+        if tuple(ours) != tuple(theirs):
+            raise ConfigError(
+                f"plant.truth = {truth!r}: its {what} are {', '.join(theirs)}, and those of the model "
+                f"{', '.join(ours)}; the same names in the same order are needed"
+            )
+    return true
+
+
+def load_plant(reference: str) -> Any:
+    """The plant that "tanks.py:TANKS" names, as it is there. Raises `ConfigError`."""
+    return load(reference, _is_plant, "plant")
+
+
+def files_of(config: Config) -> dict[str, str]:
+    """The sha256 of the files that the plant of `config` comes from, by key. Raises `ConfigError`."""
+    named = {"plant.model": (config.plant.model, _is_plant), "plant.truth": (config.plant.truth, _moves)}
+    return {
+        key: loaded(text, fits, "plant").sha256
+        for key, (text, fits) in named.items()
+        if isinstance(text, str) and is_reference(text)
+    }
+
+
+def initial_state(config: Config, plant: Described) -> np.ndarray:
+    """The configuration's x0, or the plant's own where it has none; (d,), plant units. Lengths as `plant_of` checks."""
+    return np.array(plant.x0 if config.plant.x0 is None else config.plant.x0, dtype=float)
+
+
+def _is_plant(value: Any) -> bool:
+    return not isinstance(value, type) and all(hasattr(value, name) for name in ("states", "inputs", "x_e"))
+
+
+def _moves(value: Any) -> bool:
+    return _is_plant(value) or (not isinstance(value, type) and callable(getattr(value, "step", None)))
+
+
+def _as_configured(config: Config, plant: P) -> P:
+    """With the bounds and the equilibrium of the configuration."""
+    known = (*plant.states, *plant.inputs)
     for key, values, what, names in (
         ("plant.x0", config.plant.x0, "states", plant.states),
+        ("plant.x_e", config.plant.x_e, "states", plant.states),
+        ("plant.u_e", config.plant.u_e, "inputs", plant.inputs),
         ("controller.W", config.controller.W, "states", plant.states),
         ("controller.Q", config.controller.Q, "states", plant.states),
         ("controller.R", config.controller.R, "inputs", plant.inputs),
@@ -63,18 +148,21 @@ def _model_and_truth(config: Config, find: Callable[[str], P]) -> tuple[P, P]:
         if values is not None and len(values) != len(names):
             rule = f"{plant.name} has {len(names)} {what} ({', '.join(names)})"
             raise ConfigError(f"{key} has {len(values)} entries; {rule}")
-    known = (*plant.states, *plant.inputs)
     for name in config.l2nw.variables or []:
         if name not in known:
             raise ConfigError(f"l2nw.variables: {name!r} is not one of {plant.name}'s {', '.join(known)}")
     if config.l2nw.variables is not None and not config.l2nw.variables:
         raise ConfigError(f"l2nw.variables is empty; the kernel needs at least one of {', '.join(known)}")
+    for name in config.plant.bounds:
+        if name not in known:
+            hint = did_you_mean(name, known, f"it has {', '.join(known)}")
+            raise ConfigError(f"plant.bounds: {plant.name} has no state or input {name!r}; {hint}")
+    return plant.changed(config.plant.bounds, config.plant.x_e, config.plant.u_e)
+
+
+def _with_parameters(config: Config, plant: P) -> P:
+    truth = config.plant.truth
     try:
-        return plant, plant.varied(**config.plant.truth) if config.plant.truth else plant
+        return plant.varied(**truth) if isinstance(truth, dict) and truth else plant
     except (LookupError, ArithmeticError) as error:
         raise ConfigError(f"plant.truth: {error.args[0]}") from error
-
-
-def initial_state(config: Config, plant: Plant) -> np.ndarray:
-    """The configuration's x0, or the plant's own where it has none; (d,), plant units. Lengths as `plant_of` checks."""
-    return np.array(plant.x0 if config.plant.x0 is None else config.plant.x0, dtype=float)

@@ -41,12 +41,24 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """A table of the configuration file."""
 
 
+Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
+"""Lower and upper; None: there is none. In TOML that is -inf or inf."""
+
+
 class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
+    """A plant that comes with Tandem, or a reference to one's own: "tanks.py:TANKS", "mypackage:PLANT"."""
     x0: list[float] | None = None
     """Initial state in the plant's own units; None: the plant's own (the paper's) x0."""
-    truth: dict[str, float] = msgspec.field(default_factory=dict)
-    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong."""
+    x_e: list[float] | None = None
+    """State about which the model is linear; None: the plant's own. Equations are linearised there."""
+    u_e: list[float] | None = None
+    """Input that goes with it."""
+    bounds: dict[str, Bounds] = msgspec.field(default_factory=dict)
+    """Of X and U, by the name of a state or input, where they are not the plant's own."""
+    truth: dict[str, float] | str = msgspec.field(default_factory=dict)
+    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong. Or a reference
+    to what moves in the plant's place: other equations, or an object with `step`."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
 

@@ -139,7 +139,8 @@ def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
     found = _PLACE.match(text)
     if not found or not found["key"]:
         return "", text
-    key = found["key"]
+    # msgspec does not say which entry of a table it was.
+    key = found["key"].partition("[...]")[0]
     value: Any = tree
     wanted = _type_info(kind)
     for index, name in _STEP.findall(key):
@@ -178,7 +179,14 @@ def _allowed(kind: inspect.Type) -> str:
         case inspect.StructType():
             return f"a table with {', '.join(field.name for field in kind.fields)}"
         case inspect.ListType():
-            return f"a list, each entry {_allowed(_without_none(kind.item_type))}"
+            length = (
+                f" of {kind.min_length}" if kind.min_length and kind.min_length == kind.max_length else ""
+            )
+            return f"a list{length}, each entry {_allowed(_without_none(kind.item_type))}"
+        case inspect.DictType():
+            return f"a table, each entry {_allowed(_without_none(kind.value_type))}"
+        case inspect.UnionType(types=types):
+            return " or ".join(_allowed(option) for option in types)
     return f"a {type(kind).__name__.removesuffix('Type').lower()}"
 
 

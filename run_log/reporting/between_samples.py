@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants import Plant, PlantError, Truth
-from lbmpc.plants.base import dop853
+from lbmpc.plants import Description, Plant, PlantError, Truth
+from lbmpc.plants.truth import dop853
 from run_log.reporting.motion import Pieces, Trajectory
 
 POINTS = 8
@@ -17,7 +17,7 @@ AT_ONCE = 4096
 """Periods in memory together."""
 
 
-def excess(motion: Trajectory, truth: Plant) -> float | None:
+def excess(motion: Trajectory, truth: Description) -> float | None:
     """Largest distance from X, as a share of the state's half-width; 0 where X is kept, samples included.
 
     From every sample the equations are integrated under what was applied, which takes about 0.15 ms for each.
@@ -28,10 +28,10 @@ def excess(motion: Trajectory, truth: Plant) -> float | None:
 
     Returns:
         None where that is not known: the equations do not lead from a sample to the next (a real plant, one that
-        changed, measured states), cannot be integrated, or no input was reported.
+        changed, measured states), there are none, they cannot be integrated, or no input was reported.
     """
     known = [k for k in range(1, len(motion.pieces)) if motion.pieces[k]]
-    if not known:
+    if not known or not isinstance(truth, Plant):
         return None
     found, steps = _beyond(motion.x, truth), _dop853(truth)
     for first in range(0, len(known), AT_ONCE):
@@ -51,7 +51,7 @@ def excess(motion: Trajectory, truth: Plant) -> float | None:
     return found if found > SAME else 0.0
 
 
-def _beyond(x: np.ndarray, plant: Plant) -> float:
+def _beyond(x: np.ndarray, plant: Description) -> float:
     """Of x, (..., d), in half-widths."""
     with np.errstate(over="ignore"):
         return max(0.0, float((np.maximum(x - plant.x_max, plant.x_min - x) / plant.x_scale).max()))

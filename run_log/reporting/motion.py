@@ -7,7 +7,7 @@ from itertools import accumulate, pairwise
 import msgspec
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol.messages import PlantState
 from run_log.errors import LogError
 from run_log.run import Run
@@ -49,7 +49,7 @@ class Trajectory(msgspec.Struct, frozen=True):
         return [self.part(first, behind - 1) for first, behind in pairwise((*self.starts, len(self.step)))]
 
 
-def trajectory(run: Run, plant: Plant) -> Trajectory:
+def trajectory(run: Run, plant: Description) -> Trajectory:
     """The true motion, without the hold before it, and without the hold at each later start of the plant.
 
     States of strangers (plants that no tick of the log answers) are left out.
@@ -72,7 +72,7 @@ def trajectory(run: Run, plant: Plant) -> Trajectory:
     return motion(moved or [states[-1:]], plant, run.config.period)
 
 
-def motion(episodes: list[list[PlantState]], plant: Plant, period: float) -> Trajectory:
+def motion(episodes: list[list[PlantState]], plant: Description, period: float) -> Trajectory:
     """The trajectory of these samples, each with the plant's number of states; none of the lists is empty."""
     states = [s for one in episodes for s in one]
     nothing = [np.nan] * plant.m

@@ -8,7 +8,7 @@ from statistics import fmean
 import msgspec
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime.config.sections import Config
 from run_log.reporting.between_samples import excess
 from run_log.reporting.motion import Trajectory
@@ -48,7 +48,7 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     where the equations of the truth do not lead from sample to sample."""
 
 
-def performance(motion: Trajectory, plant: Plant, config: Config, truth: Plant) -> Performance:
+def performance(motion: Trajectory, plant: Description, config: Config, truth: Description) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
     Args:
@@ -104,7 +104,7 @@ def of_episodes(every: Sequence[Performance]) -> Performance:
     )
 
 
-def outside(motion: Trajectory, plant: Plant) -> np.ndarray:
+def outside(motion: Trajectory, plant: Description) -> np.ndarray:
     """(n,) whether the true state or the applied input is outside X or U by more than 1e-6 of a half-width."""
     x, u = motion.x, motion.applied
     x_room, u_room = TOLERANCE * plant.x_scale, TOLERANCE * plant.u_scale

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from run_log.reporting.performance import TOLERANCE
 from run_log.reporting.traces import Traces
 
@@ -69,7 +69,7 @@ def _figure(title: str, draws: list[Draw], height: float = 2.0) -> Figure:
     return figure
 
 
-def _label(plant: Plant, name: str, what: str = "") -> str:
+def _label(plant: Description, name: str, what: str = "") -> str:
     unit = plant.units.get(name, "")
     return f"{what}{name} ({'–' if unit in ('', '1') else unit})"
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol import topics
 from run_log.errors import LogError
 from run_log.reporting.motion import Trajectory, trajectory
@@ -17,7 +17,7 @@ from run_log.run import Run, plant_of
 class Traces:
     """One run, ready to draw. n ticks, d states, m inputs; NaN where a tick has no such figure."""
 
-    plant: Plant
+    plant: Description
     period: float
     motion: Trajectory
     t: np.ndarray

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from run_log.errors import LogError, LogExistsError
@@ -59,7 +59,7 @@ class PartedLog:
         LogExistsError: something is at `log.path` already.
     """
 
-    def __init__(self, config: Config, plant: Plant, *, now: float, start_ns: int):
+    def __init__(self, config: Config, plant: Description, *, now: float, start_ns: int):
         self._config, self._plant = config, plant
         self._first = Path(config.log.path)
         self._numbers = count(2)

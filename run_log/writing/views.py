@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import inspect
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from protocol import messages as m
 from protocol import topics
 from protocol.codec import BadMessage
@@ -116,7 +116,7 @@ SHOWN: dict[type[m.Message], Shown] = {
 class View:
     """How one topic is shown for one plant."""
 
-    def __init__(self, topic: Topic, plant: Plant):
+    def __init__(self, topic: Topic, plant: Description):
         self.topic = topic
         shown = SHOWN[topic.type]
         own = {field.name: field.type for field in msgspec.structs.fields(topic.type)}
@@ -166,7 +166,7 @@ class View:
         return {"type": JSON_TYPES[type(kind)]}
 
 
-def views(plant: Plant) -> dict[str, View]:
+def views(plant: Description) -> dict[str, View]:
     """The views of all topics that have one, by topic name."""
     return {topic.name: View(topic, plant) for topic in topics.ALL if topic.type in SHOWN}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
 from node_runtime.config.loading import to_json, to_toml
@@ -56,7 +56,7 @@ class LogWriter:
         self,
         path: str | Path,
         config: Config,
-        plant: Plant,
+        plant: Description,
         *,
         start_ns: int = 0,
         versions: dict[str, str] | None = None,
@@ -196,7 +196,7 @@ class LogWriter:
         self.last_bad = str(error)
 
 
-def _attachments(config: Config, plant: Plant, versions: dict[str, str]) -> list[tuple[str, str, str]]:
+def _attachments(config: Config, plant: Description, versions: dict[str, str]) -> list[tuple[str, str, str]]:
     _, schemas = msgspec.json.schema_components([topic.type for topic in topics.ALL])
     channels = {RAW + topic.name: topic.type.__name__ for topic in topics.ALL}
     as_json = "application/json"

@@ -20,7 +20,7 @@ from tandem import terminal
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lbmpc.plants import Plant
+    from lbmpc.plants import Description
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
@@ -80,7 +80,8 @@ class Configured(Command):
         from node_runtime.config.shipped import config_file
         from node_runtime.config.strict import ConfigError, apply_override, load_tree
 
-        tree = {} if self.config is None else load_tree(config_file(self.config))
+        file = None if self.config is None else config_file(self.config)
+        tree = {} if file is None else load_tree(file)
         origins = {apply_override(tree, text): f"--set {text}" for text in self.set}
         for option, key in self.KEYS:
             value = getattr(self, option)
@@ -94,9 +95,10 @@ class Configured(Command):
                     raise ConfigError(f"{self.config}: {name} is a table: write [{name}] and its keys below")
             table[last] = str(value) if isinstance(value, Path) else value
             origins[key] = f"--{option}"
-        return from_tree(tree, str(self.config or "configuration"), origins), tree
+        folder = None if file is None else file.parent
+        return from_tree(tree, str(self.config or "configuration"), origins, folder), tree
 
-    def resolve_with_plant(self) -> tuple[Config, Plant]:
+    def resolve_with_plant(self) -> tuple[Config, Description]:
         """The configuration, and the plant that it names and fits."""
         from lbmpc.plants import get_plant
         from node_runtime.config.plant import plant_of

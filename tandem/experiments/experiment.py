@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import write_whole
@@ -38,7 +38,7 @@ class Finished(NamedTuple):
 def run(
     declared: Declaration,
     where: str,
-    plant: Plant,
+    plant: Description,
     out: Path,
     processes: int,
     command: str,

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime.bus.inbox import Follower
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.config.sections import Config
@@ -72,7 +72,7 @@ class Snapshot:
     """All that the live view shows at one moment. The monitor counts in one, and gives copies."""
 
     config: Config
-    plant: Plant
+    plant: Description
     seconds: float
     phase: str = ""
     """What is being waited for, e.g. "the trainer"; empty while the run goes on."""
@@ -119,7 +119,7 @@ class Snapshot:
 class Monitor:
     """Feed it deliveries (`feed`) and ask for a `snapshot`. Never raises for what arrives."""
 
-    def __init__(self, config: Config, plant: Plant, seconds: float):
+    def __init__(self, config: Config, plant: Description, seconds: float):
         self.config, self.plant, self.seconds = config, plant, seconds
         self.bad = RejectedMessages()
         self.phase = ""

@@ -24,6 +24,7 @@ MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
 TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+ ?){1,2})([^`\n|]*)", re.MULTILINE)
 # What a page may name that is made when something runs, or is an example of the reader's own.
 MADE = ("network_model/architectures/gru.py", "tandem/jet")
+OWN = {"gru.py", "tanks.py", "true.py"}
 
 
 def code(text: str) -> str:
@@ -71,7 +72,7 @@ def test_paths_and_links_of_a_page_exist(page: Path) -> None:
     missing = {path for path in named if not (ROOT / path).exists()}
     missing |= {link for link in LINK.findall(text) if not (page.parent / link).exists()}
     names = {path.name for path in SOURCES}
-    missing |= {name for name in FILE.findall(text) if name not in names and name != "gru.py"}
+    missing |= {name for name in FILE.findall(text) if name not in names | OWN}
     assert missing == set()
 
 

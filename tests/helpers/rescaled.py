@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbmpc.plants.base import Plant
+from lbmpc.plants.equations import Plant
 
 
 def rescaled(plant: Plant, x: Sequence[float], u: Sequence[float]) -> Plant:

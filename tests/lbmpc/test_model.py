@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
-from lbmpc.model import Model, ModelError, build_model, discretise, linearise
+from lbmpc.model import Model, ModelError, build_model, discretise
 from lbmpc.plants import Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
 from tests.helpers.plants.pendulum import PENDULUM
@@ -16,7 +16,7 @@ from tests.helpers.science import compressor
 
 
 def test_the_jacobian_is_that_of_the_equations_by_hand() -> None:
-    a, b = linearise(PLANT)
+    _rest, a, b = PLANT.linearised()
     z, y, r = PLANT.x_e[:3]
     w2, damping = 1000.0, 2 / np.sqrt(2) * 10 * np.sqrt(10)
     expected = [
@@ -43,7 +43,7 @@ def test_a_part_of_a_period_is_discretised_exactly(period: float) -> None:
 
 def test_discretisation_is_exact() -> None:
     model = compressor(0.05)
-    a, b = linearise(PLANT)
+    _rest, a, b = PLANT.linearised()
     x, u = np.array([0.1, -0.2, 0.3, 2.0]), np.array([0.4])
     fine = x.copy()
     steps = 2000

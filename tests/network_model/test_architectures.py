@@ -111,7 +111,7 @@ def test_the_past_matters_to_the_plan_as_the_prepared_step_says(name: str) -> No
 
 @pytest.mark.parametrize("name", ["rnn", "cnn"])
 def test_one_real_time_iteration_is_close_to_the_optimum_along_a_closed_loop(name: str) -> None:
-    plant, truth, oracle = MODEL.plant, Truth(MODEL.plant), oracle_of(name)
+    plant, truth, oracle = MODEL.plant, Truth(MODEL.equations), oracle_of(name)
     solver = Solver(build_problem(MODEL, oracle, 20))
     state = oracle.begin(oracle.initial_state(np.random.default_rng(0)), X0, np.zeros(M))
     x, differences = X0, []

@@ -65,7 +65,7 @@ def backup(
 
 
 def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
-    return PlantSim(PLANT, period, x0, 1.5, "plant-a")
+    return PlantSim(PLANT, Truth(PLANT), period, x0, 1.5, "plant-a")
 
 
 def test_the_process_has_the_true_plant() -> None:
@@ -206,7 +206,9 @@ def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
     """With a constant input it would leave for the surge that the equilibrium is unstable towards."""
 
     def after(plant: Plant) -> float:
-        sim = PlantSim(plant, period, PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0]), 1.5, "plant-a")
+        sim = PlantSim(
+            plant, Truth(plant), period, PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0]), 1.5, "plant-a"
+        )
         sim.sample(0.0)
         sim.command(command(0, U, period=period), 0.0)
         for k in range(1, round(10 / period)):

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from lbmpc.plants.base import Plant
+from lbmpc.plants.equations import Plant
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from run_log.reporting.motion import Trajectory

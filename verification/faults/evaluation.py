@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.live import stalls
-from lbmpc.plants import Plant, get_plant
+from lbmpc.plants import Description, get_plant
 from node_runtime.bus.mailbox import Delivery
 from node_runtime.config.strict import ConfigError
 from protocol import messages as m
@@ -96,7 +96,7 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
     )
 
 
-def _deepest(x: np.ndarray, applied: np.ndarray, plant: Plant) -> float:
+def _deepest(x: np.ndarray, applied: np.ndarray, plant: Description) -> float:
     state = np.maximum(plant.x_min - x, x - plant.x_max) / plant.x_scale
     given = np.maximum(plant.u_min - applied, applied - plant.u_max) / plant.u_scale
     return max(0.0, float(state.max()), float(np.nanmax(given, initial=0.0)))

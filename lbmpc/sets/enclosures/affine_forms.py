@@ -69,7 +69,7 @@ class Disturbance:
     def __init__(self, model: Model):
         self.model = model
         try:
-            self.flow = Flow.of_plant(model.plant, model.period)
+            self.flow = Flow.of_plant(model.require_equations("a bound of h"), model.period)
         except UnsupportedOperation as error:
             names = " and ".join(name_of(model.plant, leaf) for leaf in error.leaves)
             raise DisturbanceError(

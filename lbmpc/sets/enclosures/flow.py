@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import Plant
+from lbmpc.plants.description import Description
+from lbmpc.plants.equations import Plant
 from lbmpc.sets.enclosures.expression_graph import Graph, Node
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product
 from lbmpc.sets.enclosures.series import Tape
@@ -40,7 +41,7 @@ DOMAINS = {
 }
 
 
-def name_of(plant: Plant, leaf: Node) -> str:
+def name_of(plant: Description, leaf: Node) -> str:
     """What the plant calls a state or an input of its equations."""
     return (plant.states if leaf.operation == "state" else plant.inputs)[leaf.index]
 

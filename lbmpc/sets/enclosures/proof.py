@@ -58,8 +58,12 @@ class _Rows:
 
 def _of_certificate(model: Model, said: ModelOf) -> Model:
     """The model with the very numbers that a certificate has; they may differ in the last digit."""
-    plant = replace(model.plant, x_e=np.array(said.x_e), u_e=np.array(said.u_e))
-    return replace(model, plant=plant, period=said.period, A=np.array(said.A), B=np.array(said.B))
+    x_e, u_e = np.array(said.x_e), np.array(said.u_e)
+    plant = replace(model.plant, x_e=x_e, u_e=u_e)
+    equations = replace(model.require_equations("a proof"), x_e=x_e, u_e=u_e)
+    return replace(
+        model, plant=plant, equations=equations, period=said.period, A=np.array(said.A), B=np.array(said.B)
+    )
 
 
 def prove(

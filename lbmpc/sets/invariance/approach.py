@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.model import Model
-from lbmpc.plants.base import dop853
+from lbmpc.plants.truth import dop853
 from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.geometry.operations import Body
 
@@ -79,7 +79,7 @@ def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Traje
 
 def one_period(model: Model) -> ca.Function:
     """(x, u), deviations -> x after one period, (d,)."""
-    plant = model.plant
+    plant = model.require_equations("a way into the sets")
     f = plant.function()
     x, u = ca.SX.sym("x", model.d), ca.SX.sym("u", model.m)
     steps = max(1, math.ceil(float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period / STEP_NORM))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jinja2
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime import provenance
 from node_runtime.config.loading import to_toml
 from node_runtime.config.sections import Config
@@ -58,7 +58,7 @@ class Part(NamedTuple):
 def page(
     declared: Declaration,
     results: list[CaseResult],
-    plant: Plant,
+    plant: Description,
     base: Config,
     command: str,
     code: str,
@@ -97,7 +97,7 @@ def page(
     return Page(html, {name: png for part in parts for name, png in part.named_pictures()})
 
 
-def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
+def _part(group: Group, results: list[CaseResult], plant: Description) -> Part:
     survival = group.picture == "survival"
     try:
         with drawing(f"the picture of {group.name}"):
@@ -118,7 +118,7 @@ def _part(group: Group, results: list[CaseResult], plant: Plant) -> Part:
     )
 
 
-def _table(results: list[CaseResult], plant: Plant) -> Table:
+def _table(results: list[CaseResult], plant: Description) -> Table:
     """A row for each case: medians, worst cases."""
     regret = any(row.regret is not None for result in results for row in result.rows)
     several = any(result.case.episodes > 1 for result in results)
@@ -180,18 +180,18 @@ def _table(results: list[CaseResult], plant: Plant) -> Table:
     return Table(head, body, of_several * several + note)
 
 
-def _bands(plant: Plant) -> str:
+def _bands(plant: Description) -> str:
     """What settled means, in the plant's own words and units."""
     states = [(plant.states[i], SETTLED * plant.x_scale[i]) for i in plant.performance]
     within = [f"{name} within {band:g} {_unit(plant, name)}".rstrip() for name, band in states]
     return f"{' and '.join(within)} of the equilibrium ({SETTLED:.0%} of the half-width)"
 
 
-def _squares(plant: Plant) -> str:
+def _squares(plant: Description) -> str:
     return " + ".join(f"Δ{plant.states[i]}²" for i in plant.performance)
 
 
-def _unit(plant: Plant, name: str) -> str:
+def _unit(plant: Description, name: str) -> str:
     unit = plant.units.get(name, "")
     return "" if unit == "1" else unit
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import NullLocator
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from run_log.reporting.plots import BLUE, GREY, VERMILION
 from tandem.experiments.reporting.pictures_by_episode import episodes
 from tandem.experiments.reporting.pictures_over_time import lemma, recovery, trajectories
@@ -19,7 +19,7 @@ WIDE = 50.0
 """Percent of regret from which on the axis is logarithmic, but for its first percent on either side of 0."""
 
 
-def draw(kind: Kind, results: list[CaseResult], plant: Plant, reference: str | None) -> list[Picture]:
+def draw(kind: Kind, results: list[CaseResult], plant: Description, reference: str | None) -> list[Picture]:
     """The pictures of one group."""
     match kind:
         case "episodes":
@@ -97,7 +97,7 @@ def _wrapped(label: str) -> str:
     return label if cut < 0 else label[:cut] + "\n" + label[cut + 1 :]
 
 
-def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
+def states(results: list[CaseResult], plant: Description) -> list[Picture]:
     """Each initial state where it lies: kept, kept for some seeds, or not."""
     first, *more = [*plant.performance, *(i for i in range(plant.d) if i not in plant.performance)]
     second = more[0] if more else None
@@ -138,13 +138,13 @@ def states(results: list[CaseResult], plant: Plant) -> list[Picture]:
     return [Picture(made, caption, "initial states that are kept, by controller")]
 
 
-def _frame(plant: Plant, i: int) -> tuple[float | None, float | None]:
+def _frame(plant: Description, i: int) -> tuple[float | None, float | None]:
     """A state's bounds; None where the axis is free, because there is none."""
     low, high = (float(bound[i]) if np.isfinite(bound[i]) else None for bound in (plant.x_min, plant.x_max))
     return low, high
 
 
-def survival(results: list[CaseResult], plant: Plant) -> list[Picture]:
+def survival(results: list[CaseResult], plant: Description) -> list[Picture]:
     """Share of the runs that keep all true constraints, against what the cases vary."""
     made, (ax,) = figure(height=3.3)
     families = by_family(results)
@@ -187,7 +187,7 @@ def margins(members: list[CaseResult]) -> list[float]:
     return [value[_varying(values)] for value in values]
 
 
-def _what_varies(members: list[CaseResult], plant: Plant) -> str:
+def _what_varies(members: list[CaseResult], plant: Description) -> str:
     key, value = [("", 0.0), *members[0].case.varied.items()][-1]
     name = key.rpartition(".")[2]
     if not isinstance(value, list):

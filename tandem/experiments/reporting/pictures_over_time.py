@@ -6,21 +6,21 @@ import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description, Plant
 from run_log.reporting.plots import BLUE, GREY, VERMILION
 from tandem.experiments.reporting.style import Look, Picture, figure, full_name, legend_above, looks, named
 from tandem.experiments.study.results import CaseResult
 from tandem.experiments.study.work import Traces
 
 
-def trajectories(results: list[CaseResult], plant: Plant) -> list[Picture]:
+def trajectories(results: list[CaseResult], plant: Description) -> list[Picture]:
     """The paper's figures: the performance states and the solver's time, each over time."""
     drawn = [_state(results, plant, i) for i in range(len(plant.performance))]
     timed = [result for result in results if result.timing is not None]
     return [*drawn, _solver(timed)] if timed else drawn
 
 
-def _state(results: list[CaseResult], plant: Plant, i: int) -> Picture:
+def _state(results: list[CaseResult], plant: Description, i: int) -> Picture:
     made, (ax,) = figure(height=3.0)
     index = plant.performance[i]
     full = full_name(plant, index)
@@ -63,7 +63,7 @@ def _band(
     ax.fill_between(t, low, high, color=look["color"], alpha=alpha, linewidth=0)
 
 
-def _bounds(ax: Axes, plant: Plant, index: int) -> None:
+def _bounds(ax: Axes, plant: Description, index: int) -> None:
     low, high = ax.get_ylim()
     reach = 0.6 * (high - low)
     shown = [b for b in (plant.x_min[index], plant.x_max[index]) if low - reach < b < high + reach]
@@ -97,7 +97,7 @@ def _solver(results: list[CaseResult]) -> Picture:
     )
 
 
-def recovery(results: list[CaseResult], plant: Plant) -> list[Picture]:
+def recovery(results: list[CaseResult], plant: Description) -> list[Picture]:
     """The first performance state before and after the plant changes, one picture for each change."""
     by_fault: dict[bytes, list[CaseResult]] = {}
     for result in results:
@@ -112,8 +112,10 @@ def recovery(results: list[CaseResult], plant: Plant) -> list[Picture]:
         drift = same[0].case.faults.drift
         said = "no change"
         if drift is not None:
-            before = {**plant.parameters, **same[0].case.config.plant.truth}
-            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" for n, v in drift.to.items())
+            own = plant.parameters if isinstance(plant, Plant) else {}
+            truth = same[0].case.config.plant.truth
+            before = {**own, **(truth if isinstance(truth, dict) else {})}
+            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" if n in before else f"{n} to {v:g}" for n, v in drift.to.items())
             when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
             said = f"{values} {when}"
             for ax in (above, below):
@@ -137,7 +139,7 @@ def _errors(ax: Axes, result: CaseResult, look: Look) -> None:
         ax.plot(t, np.where(values > 0, values, np.nan), **{**look, "marker": ""}, linewidth=1.1)
 
 
-def lemma(results: list[CaseResult], plant: Plant) -> list[Picture]:
+def lemma(results: list[CaseResult], plant: Description) -> list[Picture]:
     """Accumulated squared error of the first run of each case, beside its bounds."""
     shown = [(r, r.records[0].lemma) for r in results if r.records[0].lemma is not None]
     made, axes = figure(rows=len(shown), height=2.4)

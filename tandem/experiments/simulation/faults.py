@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Known, Plant, TrueMotion
 from node_runtime.config.sections import NonNegative, Section
 
 RAMP_PIECES = 20
@@ -20,8 +20,10 @@ class Drift(Section, frozen=True):
     over: NonNegative = 0.0
     """Seconds that it takes; 0: a step."""
 
-    def plants(self, plant: Plant) -> list[tuple[float, Plant]]:
+    def plants(self, plant: Known | Plant | TrueMotion) -> list[tuple[float, Plant]]:
         """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
+        if not isinstance(plant, Plant):
+            raise KeyError("the true plant has no equations, and so there is nothing that drifts")
         pieces = RAMP_PIECES if self.over > 0 else 1
         made = []
         for share in (np.arange(1, pieces + 1) / pieces).tolist():

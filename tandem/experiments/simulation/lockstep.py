@@ -8,6 +8,7 @@ Each episode is a plant that was started again at x0; controller and trainer go 
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -18,8 +19,8 @@ import msgspec
 import numpy as np
 
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError, get_plant
-from node_runtime.config.plant import initial_state, true_plant_of
+from lbmpc.plants import Plant, PlantError, get_plant, true_motion
+from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -83,14 +84,53 @@ def follow(
         ConfigError: the configuration admits no controller, or the faults do not fit the plant.
     """
     with one_blas_thread():
-        return _LockStep(config, faults).run(steps, progress, episodes)
+        return drive(LockStep(config, faults), steps, progress, episodes)
 
 
-class _LockStep:
+def drive(loop: LockStep, steps: int, progress: Progress | None = None, episodes: int = 1) -> Outcome:
+    """`steps` periods, `episodes` times; the arguments are those of `follow`."""
+    lost, ended = None, 0
+    try:
+        for step in range(steps * episodes):
+            if step and step % steps == 0:
+                loop.start_again()
+                ended += 1
+            loop.step()
+            if progress is not None:
+                progress(step + 1)
+        run = loop.so_far()
+        ended += 1
+    except PlantError as error:
+        where = min(loop.taken, steps * episodes - 1)
+        episode = f" in episode {where // steps + 1} of {episodes}" if episodes > 1 else ""
+        lost, run = f"at step {where % steps} of {steps}{episode}: {error}", loop.so_far(lost=True)
+    return Outcome(run, lost, ended)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one period came to."""
+
+    state: m.PlantState
+    """The plant's sample at its beginning, without noise."""
+    outputs: Outputs
+
+
+class LockStep:
+    """The whole loop, one period at a time.
+
+    Args:
+        config: the resolved configuration.
+        faults: what goes wrong.
+
+    Raises:
+        ConfigError: the configuration admits no controller, or the faults do not fit the plant.
+    """
+
     def __init__(self, config: Config, faults: Faults):
         self.config, self.faults = config, faults
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = true_plant_of(config, get_plant)
+        self.true = self.first = true_plant_of(config, get_plant)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
@@ -101,11 +141,17 @@ class _LockStep:
         self.draws = np.random.default_rng([config.seed, 0x4015E])
         self.trainer = self._trainer() if config.trainer.enabled else None
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
+        self.taken, self.episode = 0, 1
         self.log: list[tuple[Topic, m.Message, int]] = []
+        self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
+        if (sets := self.core.certified_sets()) is not None:
+            self._note(topics.SETS, sets, 0)
+        self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
 
     def _started_plant(self, run_id: str) -> PlantSim:
-        x0 = initial_state(self.config, self.true)
-        return PlantSim(self.true, self.config.period, x0, self.config.plant.plan_patience, run_id)
+        plant, patience = self.core.plant, self.config.plant.plan_patience
+        x0 = initial_state(self.config, plant)
+        return PlantSim(plant, true_motion(self.true), self.config.period, x0, patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -134,42 +180,45 @@ class _LockStep:
             self.core.controller.oracle.description, self.config.trainer, self.config.seed, TRAINER, hidden
         )
 
-    def run(self, steps: int, progress: Progress | None, episodes: int = 1) -> Outcome:
-        self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
-        if (sets := self.core.certified_sets()) is not None:
-            self._note(topics.SETS, sets, 0)
-        self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
-        lost, seq, ended = None, -1, 0
-        try:
-            for seq in range(steps * episodes):
-                if seq and seq % steps == 0:
-                    self._end_episode(seq)
-                    ended += 1
-                    self.plant = self._started_plant(f"{PLANT}-{seq // steps + 1}")
-                self._step(seq)
-                if progress is not None:
-                    progress(seq + 1)
-            self._end_episode(steps * episodes)
-            ended += 1
-        except PlantError as error:
-            episode = f" in episode {seq // steps + 1} of {episodes}" if episodes > 1 else ""
-            lost = f"at step {seq % steps} of {steps}{episode}: {error}"
-        if seq >= 0 and (seq + 1) % self.config.controller.keyframe_every:
-            self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
-        return Outcome(gather(self.config, self.log), lost, ended)
+    def so_far(self, lost: bool = False) -> Run:
+        """What a recorder would have seen until now. Nothing changes: the loop can go on.
 
-    def _end_episode(self, seq: int) -> None:
-        """Where the last command of the plant has led it."""
-        self._note(topics.PLANT_STATE, self.plant.sample(seq * self.config.period), seq)
+        lost: without where the last command has led the plant.
 
-    def _step(self, seq: int) -> None:
-        started = time.perf_counter()
+        Raises:
+            PlantError: the true motion cannot be followed to the end of the last period.
+        """
+        last, log = self.taken - 1, list(self.log)
+        if not lost:
+            log.append(self._where_it_is())
+        if last >= 0 and self.taken % self.config.controller.keyframe_every:
+            log.append(self._noted(topics.KEYFRAME, self.core.memory.keyframe(last), last))
+        return gather(self.config, log)
+
+    def start_again(self) -> None:
+        """Another episode: the plant is at x0 again. Raises `PlantError` as `so_far` does."""
+        self.log.append(self._where_it_is())
+        self.episode += 1
+        self.plant = self._started_plant(f"{PLANT}-{self.episode}")
+
+    def _where_it_is(self) -> tuple[Topic, m.Message, int]:
+        # A sample of a copy: the plant's own next one must say what acted in the last period.
+        end = copy.copy(self.plant).sample(self.taken * self.config.period)
+        return self._noted(topics.PLANT_STATE, end, self.taken)
+
+    def step(self) -> Step:
+        """The next period, up to the command that acts in it.
+
+        Raises:
+            PlantError: the true plant left every state from which its equations can be followed.
+        """
+        started, seq = time.perf_counter(), self.taken
         t = seq * self.config.period
         true = self.plant.sample(t)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.true = self.changes.pop(0)[1]
-            self.plant.change(self.true)
+            self.plant.change(true_motion(self.true))
             truth = self.true.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
@@ -208,6 +257,8 @@ class _LockStep:
         self._learn(seq, outputs)
         if (seq + 1) % self.config.controller.keyframe_every == 0:
             self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
+        self.taken += 1
+        return Step(true, outputs)
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
         """The newest hidden weights that are here by now."""
@@ -246,4 +297,7 @@ class _LockStep:
         return msgspec.structs.replace(true, x=noisy.tolist())
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
-        self.log.append((topic, message, round(seq * self.config.period * 1e9)))
+        self.log.append(self._noted(topic, message, seq))
+
+    def _noted(self, topic: Topic, message: m.Message, seq: int) -> tuple[Topic, m.Message, int]:
+        return topic, message, round(seq * self.config.period * 1e9)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime.config.loading import from_tree
 from node_runtime.config.sections import Config, Count, Section
 from node_runtime.config.shipped import config_file
@@ -156,7 +156,7 @@ def load(path: Path) -> Declaration:
     return declared
 
 
-def resolve(declared: Declaration, plant: Plant, where: str, quick: bool = False) -> list[Resolved]:
+def resolve(declared: Declaration, plant: Description, where: str, quick: bool = False) -> list[Resolved]:
     """Every case with its configuration. Raises `ConfigError`, as `load` does."""
     resolved = [
         one
@@ -190,7 +190,9 @@ def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str) -> 
     return from_tree(_merged(tree, changes), where, dict.fromkeys(_keys(changes), where))
 
 
-def _resolve(declared: Declaration, case: Case, plant: Plant, where: str, quick: bool) -> list[Resolved]:
+def _resolve(
+    declared: Declaration, case: Case, plant: Description, where: str, quick: bool
+) -> list[Resolved]:
     group = next(group for group in declared.group if group.name == case.group)
     levels = (declared, group, case)
     named = _said(levels, "seeds", 1)
@@ -240,7 +242,7 @@ def _said(levels: Sequence[Runs], key: str, otherwise: Any) -> Any:
     return next((value for value in reversed(said) if value is not None), otherwise)
 
 
-def _x0s(declared: Declaration, name: str, plant: Plant, where: str) -> list[list[float] | None]:
+def _x0s(declared: Declaration, name: str, plant: Description, where: str) -> list[list[float] | None]:
     if name == "default":
         return [None]
     starts, key = declared.x0s[name], f"x0s.{name}"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from lbmpc.plants import Plant
+from lbmpc.plants import Description
 from node_runtime import provenance
 from run_log.reporting.performance import of_episodes
 from run_log.reporting.summary import Spread
@@ -120,7 +120,7 @@ def _value(row: Row, name: str) -> float:
 
 
 def collect(
-    plans: list[RowPlan], records: dict[str, Record], timings: dict[str, Timing], plant: Plant
+    plans: list[RowPlan], records: dict[str, Record], timings: dict[str, Timing], plant: Description
 ) -> list[CaseResult]:
     """In the order of the file."""
     cases: dict[str, CaseResult] = {}
@@ -133,7 +133,7 @@ def collect(
     return list(cases.values())
 
 
-def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Plant) -> Row:
+def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Description) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
     found, floors = _figures(record), _figures(floor)
@@ -186,7 +186,13 @@ def spread(timing: Timing) -> Spread:
 
 
 def summary(
-    declared: Declaration, rows: list[Row], plant: Plant, command: str, code: str, processes: int, quick: bool
+    declared: Declaration,
+    rows: list[Row],
+    plant: Description,
+    command: str,
+    code: str,
+    processes: int,
+    quick: bool,
 ) -> dict[str, Any]:
     """What `summary.json` holds."""
     return {

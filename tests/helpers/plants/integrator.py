@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from lbmpc.plants.base import Plant, Rhs
+from lbmpc.plants.equations import Plant, Rhs
 
 PARAMETERS = {"friction": 0.3}
 

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.model import Model, build_model
-from lbmpc.plants.base import Plant, Rhs
+from lbmpc.plants.equations import Plant, Rhs
 
 GRAVITY = 9.81
 PARAMETERS = {"stiffness": 4.0, "gain": 1.0}

@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import Plant, Rhs
+from lbmpc.plants.equations import Plant, Rhs
 
 GRAVITY = 9.81
 PARAMETERS = {"mass": 0.486, "inertia": 0.00383, "arm": 0.25, "drag": 0.1, "wind": 0.0, "efficiency": 1.0}

@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.base import Domain, Plant, Rhs
+from lbmpc.plants.equations import Domain, Plant, Rhs
 
 GRAVITY = 981.0
 PARAMETERS = {"area_1": 28.0, "area_2": 32.0, "outlet_1": 0.071, "outlet_2": 0.057, "leak": 0.0}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lbmpc.plants.base import Plant, Rhs
+from lbmpc.plants.equations import Plant, Rhs
 
 SETTINGS = ["rate=20", "controller.horizon_seconds=3"]
 

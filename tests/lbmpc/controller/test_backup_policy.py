@@ -29,7 +29,7 @@ from tests.helpers.science import compressor, describe, oracle_named
 
 N = 40
 MODEL = compressor()
-PLANT = MODEL.plant
+PLANT = MODEL.require_equations("these tests")
 X0 = PLANT.x0 - PLANT.x_e
 HALF = 0.5 * (PLANT.x_max - PLANT.x_min)
 

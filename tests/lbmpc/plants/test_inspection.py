@@ -11,7 +11,7 @@ import pytest
 
 from lbmpc.model import ModelError, build_model
 from lbmpc.plants import PLANTS, Plant, PlantDefinitionError, get_plant
-from lbmpc.plants.base import Domain
+from lbmpc.plants.equations import Domain
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from tests.helpers.plants.integrator import INTEGRATOR

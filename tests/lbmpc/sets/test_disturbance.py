@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from lbmpc.model import Model, build_model
-from lbmpc.plants.base import Plant, Rhs, Truth
+from lbmpc.plants.equations import Plant, Rhs
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from lbmpc.plants.truth import Truth
 from lbmpc.sets.enclosures.disturbance import (
     DisturbanceBound,
     DisturbanceError,
@@ -257,7 +258,7 @@ def draw(region: Region, n: int, seed: int) -> np.ndarray:
 
 def disturbance(model: Model, p: np.ndarray) -> np.ndarray:
     """h at points (n, d + m), (n, d), from the plant's own integrator."""
-    truth, d = Truth(model.plant), model.d
+    truth, d = Truth(model.equations), model.d
     x, u = p[:, :d], p[:, d:]
     after = np.array(
         [

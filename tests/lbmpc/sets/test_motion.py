@@ -7,7 +7,7 @@ import pytest
 
 from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
-from lbmpc.plants.base import Truth
+from lbmpc.plants.truth import Truth
 from lbmpc.sets.motion import Motion
 from tests.helpers.plants.pendulum import pendulum, two_inputs
 
@@ -16,7 +16,7 @@ COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
 
 @pytest.mark.parametrize("model", [COMPRESSOR, pendulum(), two_inputs()], ids=lambda one: one.plant.name)
 def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
-    plant, motion, truth, rng = model.plant, Motion(model), Truth(model.plant), np.random.default_rng(0)
+    plant, motion, truth, rng = model.plant, Motion(model), Truth(model.equations), np.random.default_rng(0)
     for _ in range(50):
         x, u = rng.uniform(plant.x_min, plant.x_max), rng.uniform(plant.u_min, plant.u_max)
         seconds = rng.uniform(0.0, 0.5 * model.period)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lbmpc.model import Model, build_model
-from lbmpc.plants.base import Rhs
+from lbmpc.plants.equations import Rhs
 from lbmpc.sets import check as checker
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.check import check

@@ -71,7 +71,7 @@ def test_the_penalty_is_exact_soft_equals_hard_where_hard_is_feasible() -> None:
     soft = build_problem(MODEL, LinearOracle(4, 1), 60, "first_step", SMALL)
     hard = dataclasses.replace(soft, soft=False)
     solve_soft, solve_hard = Solver(soft), Solver(hard)
-    x, v, truth = X0, np.zeros((60, 1)), Truth(MODEL.plant)
+    x, v, truth = X0, np.zeros((60, 1)), Truth(MODEL.equations)
     for _ in range(40):
         a, b = solve_soft.solve(x, np.zeros(0), v), solve_hard.solve(x, np.zeros(0), v)
         assert b.status is Status.CONVERGED

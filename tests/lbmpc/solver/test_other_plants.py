@@ -128,7 +128,7 @@ def test_ipopt_agrees_often_enough_to_be_a_judge() -> None:
 def closed_loop(name: str, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """(converged first input, real-time first input) along a closed loop that the converged one drives."""
     model = compressor()
-    plant, truth = model.plant, Truth(model.plant)
+    plant, truth = model.plant, Truth(model.equations)
     oracle = oracle_named(name, model)
     solver = Solver(build_problem(model, oracle, 30))
     state = oracle.initial_state(np.random.default_rng(0))

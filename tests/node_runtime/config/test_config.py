@@ -52,6 +52,7 @@ def test_commented_values_of_the_shipped_file_are_valid():
     assert shown.controller.W is not None
     plant = plant_of(shown, get_plant)
     assert shown.plant.x0 == plant.x0.tolist()
+    assert (shown.plant.x_e, shown.plant.u_e) == (plant.x_e.tolist(), plant.u_e.tolist())
     assert shown.controller.horizon == Config().controller.horizon
     assert plant.W.tolist() == shown.controller.W
     assert tuple(shown.l2nw.variables or ()) == plant.kernel
@@ -232,6 +233,9 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "Q",
         "R",
         "x0",
+        "x_e",
+        "u_e",
+        "bounds",
         "truth",
         "options",
         "output_scale",

@@ -1,0 +1,137 @@
+"""What everybody knows of a plant: names, units, constraints, where it rests, what is safe. No motion yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
+INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
+TUPLES = ("states", "inputs", "performance", "kernel", "poles")
+
+
+class PlantError(ArithmeticError):
+    """The plant's true motion cannot be followed any further; the text says why and where."""
+
+
+class PlantDefinitionError(LookupError):
+    """A plant is there and cannot be used; the text names every fault, its field and the remedy."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Description:
+    """A plant in its own units, with box constraints, about a point at which it rests.
+
+    Shapes: d states, m inputs; `x_*` are (d,), `u_*` are (m,), `W` is (d,). Lists are accepted for arrays and tuples.
+    Nothing is checked here: `lbmpc.plants.get_plant` and `lbmpc.model.build_model` refuse a plant that cannot be used.
+    """
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    units: Mapping[str, str]
+    """Unit of every state, input and of time, by name."""
+    x_e: np.ndarray
+    """Equilibrium about which the model is linear."""
+    u_e: np.ndarray
+    x_min: np.ndarray
+    """Bounds of X; infinite where there is none, and then `scale` has this state. As for `u_min` and `u_max`."""
+    x_max: np.ndarray
+    u_min: np.ndarray
+    u_max: np.ndarray
+    W: np.ndarray
+    """Half-widths of the disturbance box used for tightening by default, per second of sampling period."""
+    x0: np.ndarray
+    safe_input: np.ndarray
+    """What the plant's own hardware applies when nobody commands it, at x_e where there is a `safe_gain`."""
+    performance: tuple[int, ...]
+    """States that make up the reported cost; the first is the one whose overshoot is reported."""
+    kernel: tuple[str, ...]
+    """States and inputs that the L2NW kernel sees."""
+    safe_gain: np.ndarray | None = None
+    """(m, d): then that is safe_input + safe_gain (x - x_e), renewed every period; for a plant that no constant input
+    holds at x_e. None: safe_input."""
+    poles: tuple[complex, ...] | None = None
+    """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
+    scale: Mapping[str, float] = field(default_factory=dict)
+    """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """What states and inputs are called in a person's words, by name."""
+
+    def __post_init__(self) -> None:
+        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
+            object.__setattr__(self, name, as_array(getattr(self, name)))
+        for name in TUPLES:
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Self:
+        """With other bounds, or about another point.
+
+        Args:
+            bounds: lower and upper by the name of a state or input, None where there is none; others stay.
+            x_e, u_e: (d,) and (m,). Equations are linearised there; a pair of matrices is taken as it is, about there.
+
+        Raises:
+            KeyError: a bound of what is no state or input.
+        """
+        for name in bounds:
+            if name not in (*self.states, *self.inputs):
+                raise KeyError(name)
+        new: dict[str, Any] = {name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None}
+        for axis, names in (("x", self.states), ("u", self.inputs)):
+            low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))
+            # What has another shape is for whoever looks at the plant to name.
+            if bounds and low.shape == high.shape == (len(names),):
+                for name, (lower, upper) in bounds.items():
+                    if name in names:
+                        low[names.index(name)] = -np.inf if lower is None else lower
+                        high[names.index(name)] = np.inf if upper is None else upper
+                new |= {f"{axis}_min": low, f"{axis}_max": high}
+        return replace(self, **new) if new else self
+
+    @property
+    def d(self) -> int:
+        return len(self.states)
+
+    @property
+    def m(self) -> int:
+        return len(self.inputs)
+
+    @cached_property
+    def x_scale(self) -> np.ndarray:
+        """What counts as 1 in each state, (d,): X's half-width where it is finite, else what `scale` says."""
+        return self._half_widths(self.states, self.x_min, self.x_max)
+
+    @cached_property
+    def u_scale(self) -> np.ndarray:
+        """What counts as 1 in each input, (m,), as for `x_scale`."""
+        return self._half_widths(self.inputs, self.u_min, self.u_max)
+
+    def _half_widths(self, names: tuple[str, ...], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            half = 0.5 * (high - low)
+        for i in np.flatnonzero(~np.isfinite(half)):
+            half[i] = self.scale[names[i]]
+        return half
+
+
+def as_array(value: Any) -> Any:
+    """Numbers as an array; what are none stays as it is, for whoever looks at the plant to name."""
+    try:
+        return None if value is None else np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return value
+
+
+def as_tuple(value: Any) -> Any:
+    """A list as a tuple; all else stays as it is."""
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,96 @@
+"""A plant by its equations, dx/dt = f(x, u): what simulates it, and what its numbers are taken from.
+
+Bring your own plant as one file: give `rhs` in CasADi operations and fill in a `Plant`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.plants.description import Description, PlantError, as_tuple
+from lbmpc.plants.known import Known
+
+Rhs = Callable[[Any, Any], list[Any]]
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A state that must stay positive for the equations to mean anything."""
+
+    state: int
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plant(Description):
+    """A continuous-time plant dx/dt = f(x, u)."""
+
+    rhs: Rhs
+    """f(x, u) written with CasADi operations; x and u are indexable."""
+    positive: tuple[Domain, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """What the equations are built with, by name; empty where they cannot be varied."""
+    equations: Callable[..., Rhs] | None = None
+    """`rhs` from `parameters`, given by name: numbers, or CasADi symbols."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "positive", as_tuple(self.positive))
+
+    def known(self) -> Known:
+        """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""
+        shared = {one.name: getattr(self, one.name) for one in fields(Description)}
+        _rest, a, b = self.linearised()
+        return Known(**shared, A=a, B=b)
+
+    def varied(self, **changes: float) -> Plant:
+        """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
+
+        Raises:
+            KeyError: there is no such parameter; names the nearest, or those there are.
+            PlantError: with these parameters dx/dt is not finite at (x_e, u_e).
+        """
+        for name in changes:
+            if self.equations is None or name not in self.parameters:
+                near = difflib.get_close_matches(name, self.parameters, n=1)
+                known = ", ".join(self.parameters) or "none that can be varied"
+                hint = f"did you mean {near[0]!r}?" if near else f"it has {known}"
+                raise KeyError(f"{self.name} has no parameter {name!r}; {hint}")
+        if self.equations is None:
+            return self
+        parameters = {**self.parameters, **changes}
+        varied = replace(self, parameters=parameters, rhs=self.equations(**parameters))
+        if not np.isfinite(np.array(varied.function()(self.x_e, self.u_e))).all():
+            given = ", ".join(f"{name} = {value:g}" for name, value in changes.items())
+            raise PlantError(f"{self.name} with {given}: dx/dt is not finite at (x_e, u_e)")
+        return varied
+
+    def function(self) -> ca.Function:
+        """f as a CasADi function (x, u) -> dx/dt."""
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
+
+    def function_of_parameters(self) -> ca.Function:
+        """f as a CasADi function (x, u, p) -> dx/dt; p are the `parameters` in their order, (0,) where it has none."""
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        p = ca.SX.sym("p", len(self.parameters))
+        rhs = self.rhs
+        if self.equations is not None:
+            rhs = self.equations(**{name: p[i] for i, name in enumerate(self.parameters)})
+        return ca.Function("f", [x, u, p], [ca.vertcat(*rhs(x, u))], ["x", "u", "p"], ["dx"])
+
+    def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
+        f = self.function()
+        x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
+        dx = f(x, u)
+        jacobian = ca.Function("jacobian", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
+        residual, a, b = (np.array(value) for value in jacobian(self.x_e, self.u_e))
+        return residual[:, 0], a, b

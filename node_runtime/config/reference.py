@@ -1,0 +1,198 @@
+"""Objects that a configuration names outside the package: "tanks.py:TANKS" in a file, "mypackage.module:PLANT".
+
+Only a configuration may name code. What a log names is never loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from node_runtime.config.strict import ConfigError, did_you_mean
+
+PREFIX = "tandem_reference_"
+"""Of the names that files are loaded under, so that none takes the name of an installed module."""
+APPENDED = "__tandem_appended__"
+"""In such a module: the folder that came into `sys.path` for it."""
+LONGEST_TEXT = 300
+
+
+class Loaded(NamedTuple):
+    """An object, and where it came from."""
+
+    value: Any
+    file: str
+    """"": of a package that has no file."""
+    sha256: str
+    """Of the file's bytes when it was loaded, in hexadecimal."""
+
+
+def load(reference: str, fits: Callable[[Any], bool] | None = None, what: str = "object") -> Any:
+    """The object that `reference` names: "tanks.py:TANKS", "/abs/tanks.py:TANKS" or "mypackage.module:PLANT".
+
+    A file runs once in a process, as long as it stays the same, and its folder comes last in `sys.path`: it may import
+    its neighbours, and none of them replaces what is installed. A package must be installed; the current folder, and
+    the folders of files that were loaded, are not looked at.
+
+    Args:
+        fits: which objects may be meant. what: such an object in a word, for messages: "plant".
+
+    Raises:
+        ConfigError: nothing there, not of that kind, or its code raises; in a person's words.
+    """
+    return loaded(reference, fits, what).value
+
+
+def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str = "object") -> Loaded:
+    """`load`, with the file that the object came from."""
+    place, name = _parts(reference)
+    if place.endswith(".py"):
+        module, sha256 = _from_file(Path(os.path.expanduser(place)))
+    else:
+        module, sha256 = _from_package(place, name)
+    there = [key for key in vars(module) if not key.startswith("_")]
+    right = [key for key in there if fits is None or fits(getattr(module, key))]
+    few = ", ".join(right[:10]) + (", ..." if len(right) > 10 else "")
+    known = f"it has {few}" if right else f"it has no {what}"
+    if not name:
+        example = f"write {place}:{right[0] if right else 'NAME'}"
+        raise ConfigError(f"{reference}: which {what} of it? {example}; {known}")
+    if name not in there:
+        hint = did_you_mean(name, right, known)
+        raise ConfigError(f"{reference}: {place} has nothing called {name!r}; {hint}")
+    value = getattr(module, name)
+    if fits is not None and name not in right:
+        raise ConfigError(f"{reference}: {name} is no {what} but {_kind(value)}; {known}")
+    return Loaded(value, getattr(module, "__file__", None) or "", sha256)
+
+
+def is_reference(text: str) -> bool:
+    """Whether `text` names code outside the package; the names of what comes with Tandem have none of these signs."""
+    return any(sign in text for sign in ":/.")
+
+
+def absolute(reference: str, folder: Path) -> str:
+    """The reference of a file with its path written out, `folder` being where it is relative to; others as they are.
+
+    Raises:
+        ConfigError: `~user` without a home folder.
+    """
+    place, name = _parts(reference)
+    if not (place.endswith(".py") or "/" in place):
+        return reference
+    there = os.path.expanduser(place)
+    if there.startswith("~"):
+        raise ConfigError(
+            f"{reference}: no home folder of {place.partition('/')[0]} is known; write the folder out"
+        )
+    return os.path.abspath(folder / there) + (f":{name}" if name else "")
+
+
+def _parts(reference: str) -> tuple[str, str]:
+    """File or package, and the name in it; "" where there is none."""
+    place, colon, name = reference.rpartition(":")
+    return (place, name.strip()) if colon else (name, "")
+
+
+def _from_file(path: Path) -> tuple[ModuleType, str]:
+    path = Path(os.path.abspath(path))
+    try:
+        source = path.read_bytes()
+    except FileNotFoundError:
+        hint = did_you_mean(path.name, [file.name for file in path.parent.glob("*.py")], "")
+        raise ConfigError(f"{path}: no such file{hint and f'; {hint}'}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from error
+    sha256 = hashlib.sha256(source).hexdigest()
+    name = PREFIX + hashlib.sha256(os.fsencode(path) + b"\0" + source).hexdigest()[:16]
+    if name in sys.modules:
+        return sys.modules[name], sha256
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+        setattr(module, APPENDED, str(path.parent))
+    # Dataclasses look their module up while it runs.
+    sys.modules[name] = module
+    try:
+        exec(compile(source, str(path), "exec", dont_inherit=True), vars(module))
+    except BaseException as error:
+        del sys.modules[name]
+        if not isinstance(error, Exception | SystemExit):
+            raise
+        raise _told(error, str(path)) from error
+    return module, sha256
+
+
+def _from_package(package: str, name: str) -> tuple[ModuleType, str]:
+    if not all(part.isidentifier() for part in package.split(".")):
+        raise ConfigError(
+            f"{package}: neither a file that ends in .py nor the name of a package{_rather(package, name)}"
+        )
+    top = package.partition(".")[0]
+    with _installed_only():
+        found = next(filter(None, (finder.find_spec(top, None) for finder in sys.meta_path)), None)
+        if found is None:
+            raise ConfigError(f"{package}: no package called {top!r} is installed{_rather(package, name)}")
+        try:
+            module = importlib.import_module(package)
+        except (Exception, SystemExit) as error:
+            absent = error.name if isinstance(error, ModuleNotFoundError) else None
+            if absent is not None and f"{package}.".startswith(f"{absent}."):
+                inside, _, last = absent.rpartition(".")
+                raise ConfigError(f"{package}: {inside} has no module called {last!r}") from None
+            raise _told(error, found.origin or package) from error
+    file = Path(module.__file__ or "")
+    return module, hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+
+
+def _rather(place: str, name: str) -> str:
+    """What may have been meant by what is no package: the file beside it, as the end of a message."""
+    file = os.path.splitext(place)[0] + ".py"
+    if os.path.isfile(os.path.expanduser(file)):
+        return f"; did you mean '{file}:{name or 'NAME'}'?"
+    if os.path.isfile(os.path.expanduser(place)):
+        return "; the name of a file with code ends in .py"
+    return "; a file is written as tanks.py:TANKS"
+
+
+@contextmanager
+def _installed_only() -> Iterator[None]:
+    """Without the folder that `python -m` puts first in `sys.path`, and those that files were loaded from."""
+    before = list(sys.path)
+    hidden = {
+        vars(module).get(APPENDED) for name, module in list(sys.modules.items()) if name.startswith(PREFIX)
+    }
+    kept = [entry for entry in before if entry and entry not in hidden]
+    if not sys.flags.safe_path and before[:1] == kept[:1] == [os.getcwd()]:
+        del kept[0]
+    sys.path[:] = kept
+    try:
+        yield
+    finally:
+        sys.path[:] = [*before, *(entry for entry in sys.path if entry not in before)]
+
+
+def _told(error: BaseException, file: str) -> ConfigError:
+    """What somebody else's code raised, in one line, with the last line of theirs that led there."""
+    folder = os.path.dirname(file)
+    lines = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename:
+        lines.append((error.filename, error.lineno or 0))
+        said = f"not valid Python: {error.msg}"
+    else:
+        said = " ".join(traceback.format_exception_only(error)[0].split())
+    theirs = [f"{at}, line {line}" for at, line in lines if at.startswith(folder + os.sep)]
+    return ConfigError(f"{theirs[-1] if theirs else file}: {said[:LONGEST_TEXT]}")
+
+
+def _kind(value: object) -> str:
+    return f"the class {value.__name__}" if isinstance(value, type) else f"of type {type(value).__name__}"
