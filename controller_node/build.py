@@ -27,7 +27,7 @@ from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from network_model.description import NetworkDescription
-from network_model.registry import get_architecture
+from network_model.registry import get_architecture, name_of
 from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -66,7 +66,8 @@ def describe_network(config: Config, plant: Description) -> NetworkDescription:
             is larger than a message.
     """
     network = config.network
-    architecture = get_architecture(network.architecture)
+    name = name_of(network.architecture)
+    architecture = get_architecture(name)
     description = NetworkDescription(
         states=plant.d,
         inputs=plant.m,
@@ -75,7 +76,7 @@ def describe_network(config: Config, plant: Description) -> NetworkDescription:
         input_scale=[*plant.x_scale.tolist(), *plant.u_scale.tolist()],
         output_scale=(network.output_scale * config.period * plant.x_scale).tolist(),
         max_layer_norm=network.max_layer_norm,
-        architecture=network.architecture,
+        architecture=name,
         window=architecture.window if network.window is None else network.window,
         options={**architecture.options, **network.options},
     )

@@ -15,6 +15,7 @@ from controller_node.memory import Memory
 from controller_node.translation import Outputs, Translation
 from lbmpc.controller.backup_policy import BackupPlanner
 from node_runtime import provenance
+from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
 from protocol import messages as m
 
@@ -111,6 +112,9 @@ class ControllerCore:
         facts = self.arithmetic()
         if self.sets is not None:
             facts |= {"certified sets": self.sets.sha256}
+        network = self.controller.oracle.description
+        if network is not None and is_reference(network.architecture):
+            facts |= {"architecture": network.architecture}
         return provenance.run_info(
             self.config,
             "controller",

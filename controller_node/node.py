@@ -19,6 +19,7 @@ from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.architecture import register_architecture
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
@@ -343,6 +344,7 @@ def _live(config: Config, stopping: threading.Event) -> int:
     _check_phase(config)
     config = with_input_delay(config)
     place = core_for(config, "controller", os.sched_getaffinity(0))
+    register_architecture(config)
     core = ControllerCore(config, run_id)
     log.info("%s", guarantee(config, core.controller.model, core.sets))
     path = Path(config.controller.checkpoint) if config.controller.checkpoint else None

@@ -53,7 +53,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     max_layer_norm: Positive = 100.0
     """Largest Frobenius norm of a hidden layer that a controller accepts."""
     architecture: str = "mlp"
-    """A file of `network_model/architectures`."""
+    """A file of `network_model/architectures`, or the name of a stranger's, with the hash of its file's text."""
     window: Window = 1
     """k, the pairs (x, u) that the network sees: the present one and k - 1 before it."""
     options: dict[str, int] = {}

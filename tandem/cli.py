@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
+from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
@@ -51,6 +52,7 @@ AnyCommand = (
     | Annotated[Identify, subcommand("identify")]
     | Annotated[KeysCommand, subcommand("keys")]
     | Annotated[ConfigCommand, subcommand("config")]
+    | Annotated[ArchitectureCommand, subcommand("architecture")]
 )
 
 

@@ -8,6 +8,7 @@ import threading
 
 from node_runtime.bus.lanes import Lanes
 from node_runtime.bus.session import OpenInterrupted
+from node_runtime.config.architecture import register_architecture
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import stopped_by_signals
 from node_runtime.realtime.scheduling import quick_handover
@@ -22,14 +23,19 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
     """Train until told to stop.
 
     Args:
-        config: of this process; the networks' shapes come from the controllers.
+        config: of this process; the networks' shapes come from the controllers. An architecture of one's own has to be
+            named in it, for what a message names is never loaded.
         stop: ends it; signals do too.
         plants: names of the plants, as a pattern of fnmatch; None: all of `trainer.fleet`, or, where that is empty,
             the one plant of the configuration.
 
     Returns:
         0 when told to stop; 2 when this machine cannot train as configured, or the pattern leaves no plant.
+
+    Raises:
+        ConfigError: the file of the architecture is not there, or cannot be used.
     """
+    register_architecture(config)
     try:
         pick_device(config.trainer.device)
     except TrainerError as error:

@@ -86,7 +86,9 @@ class Description:
         for name in bounds:
             if name not in (*self.states, *self.inputs):
                 raise KeyError(name)
-        new: dict[str, Any] = {name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None}
+        new: dict[str, Any] = {
+            name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None
+        }
         for axis, names in (("x", self.states), ("u", self.inputs)):
             low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))
             # What has another shape is for whoever looks at the plant to name.

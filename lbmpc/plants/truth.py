@@ -54,7 +54,9 @@ class Own:
         except Exception as error:
             raise PlantError(f"{self._name}.step: {type(error).__name__}: {error}") from error
         if after.shape != np.shape(x):
-            raise PlantError(f"{self._name}.step: it returned {after.shape} numbers, the state has {np.shape(x)}")
+            raise PlantError(
+                f"{self._name}.step: it returned {after.shape} numbers, the state has {np.shape(x)}"
+            )
         if not isfinite(sum(after.tolist())):
             raise PlantError(f"{self._name}.step: the state is not finite: {after.tolist()}")
         return after

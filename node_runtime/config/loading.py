@@ -181,7 +181,9 @@ def _written_out(config: Config, fail: Fail, origins: Mapping[str, str], folder:
     plant = msgspec.structs.replace(config.plant, model=found("plant.model", config.plant.model))
     if isinstance(plant.truth, str):
         plant = msgspec.structs.replace(plant, truth=found("plant.truth", plant.truth))
-    return msgspec.structs.replace(config, plant=plant)
+    architecture = found("network.architecture", config.network.architecture)
+    network = msgspec.structs.replace(config.network, architecture=architecture)
+    return msgspec.structs.replace(config, plant=plant, network=network)
 
 
 def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
@@ -200,6 +202,9 @@ def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
+    """Of those that come with Tandem; a file is looked at by who uses it, and only there it has to be."""
+    if is_reference(network.architecture):
+        return
     try:
         known = get_architecture(network.architecture).options
     except ValueError as error:

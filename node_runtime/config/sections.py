@@ -120,7 +120,7 @@ class ControllerConfig(Section, frozen=True):
 
 class NetworkConfig(Section, frozen=True):
     architecture: str = "mlp"
-    """How the hidden layers act on the window: a file of `network_model/architectures`."""
+    """How the hidden layers act on the window: mlp, rnn, cnn, or a file of your own, "gru.py:GRU"."""
     window: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None
     """k, the pairs (x, u) that the network sees, the present one included; None: the architecture's own."""
     options: dict[str, int] = msgspec.field(default_factory=dict)

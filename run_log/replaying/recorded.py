@@ -30,6 +30,8 @@ class RecordedController:
     weights: dict[int, Entry[m.OutputWeights]]
     keyframes: dict[int, Entry[m.Keyframe]]
     sets: CertifiedSets | None
+    architecture: str
+    """Of the network: file, name in it and hash of its text; empty where it is none of a stranger's."""
     complete: bool
     """The log holds the run to its end; if not, its last tick may lack some of its messages."""
 
@@ -66,6 +68,7 @@ def _recorded(run: Run, run_id: str) -> RecordedController:
         weights=_by_tick(run, run_id, topics.OUTPUT_WEIGHTS),
         keyframes=_by_tick(run, run_id, topics.KEYFRAME),
         sets=_sets(run, run_id),
+        architecture=infos[0].versions.get("architecture", "") if infos else "",
         # A simulation has no health; a live run that ended says so.
         complete=not run.ends_within and (not said or "stopping" in said),
     )

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import msgspec
 
 from controller_node.certified_sets import CertifiedSets
 from controller_node.core import ControllerCore
+from network_model.registry import register
+from node_runtime.config.architecture import OwnArchitecture, register_architecture
 from node_runtime.config.loading import override
+from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.provenance import versions
@@ -58,14 +62,17 @@ def replay(
     from_tick: int | None = None,
     overrides: Sequence[str] = (),
     progress: Progress | None = None,
+    architecture: OwnArchitecture | None = None,
 ) -> ReplayResult:
-    """Replay every controller run of a log from the log alone.
+    """Replay every controller run of a log from the log alone, and from an architecture of one's own where it has one.
 
     Args:
         run: a log, as read.
         from_tick: begin at the nearest keyframe before this tick; None: at the first tick.
         overrides: `section.key=value`, to see what a change would have done.
         progress: called with (ticks done, ticks in all).
+        architecture: the file that the log's network was made with, as its user has it; nothing is loaded because a
+            log names it.
 
     Raises:
         LogError: there is nothing to begin with, messages are recorded twice or do not fit the plant; the log's
@@ -91,7 +98,7 @@ def replay(
     comparison, arithmetic = Comparison(), versions()
     for r, found in zip(recorded, segments, strict=True):
         with one_blas_thread():
-            core = _core(run, r, overrides)
+            core = _core(run, r, overrides, architecture)
             arithmetic |= core.arithmetic()
             for begin, end in found.ranges:
                 _restore(run, r, core, begin, comparison)
@@ -113,12 +120,18 @@ def replay(
         rounding=not equal and largest is not None and largest <= ROUNDING,
         elsewhere=True if differs else None if unsaid else False,
         lost_ticks=sum(found.lost for found in segments),
-        notes=_notes(run, recorded, overrides) + _where(differs, unsaid, equal) + gaps,
+        notes=_notes(run, recorded, overrides)
+        + _other_text(run, recorded, architecture)
+        + _where(differs, unsaid, equal)
+        + gaps,
     )
 
 
-def _core(run: Run, recorded: RecordedController, overrides: Sequence[str]) -> ControllerCore:
+def _core(
+    run: Run, recorded: RecordedController, overrides: Sequence[str], own: OwnArchitecture | None
+) -> ControllerCore:
     config = override(recorded.config, list(overrides)) if overrides else recorded.config
+    _know_architecture(run, recorded, config, own)
     sets = _sets_for(run, recorded, config)
     try:
         return ControllerCore(config, recorded.run_id, sets)
@@ -126,6 +139,38 @@ def _core(run: Run, recorded: RecordedController, overrides: Sequence[str]) -> C
         if overrides:
             raise
         raise LogError(f"{run.path}: its configuration admits no controller: {error}") from error
+
+
+def _know_architecture(
+    run: Run, recorded: RecordedController, config: Config, own: OwnArchitecture | None
+) -> None:
+    reference = config.network.architecture
+    if config.controller.oracle != "dnn":
+        return
+    if reference != recorded.config.network.architecture:
+        # Named by whoever replays.
+        register_architecture(config)
+    elif own is not None and not is_reference(reference):
+        raise LogError(
+            f"{run.path}: its network is Tandem's own {reference}; --set network.architecture shows what another "
+            "would have done"
+        )
+    elif own is not None:
+        # Under the name that it has in the log, so that a file of which a comment has changed replays to the byte.
+        register(reference, recorded.architecture or own.name, own.architecture)
+    elif is_reference(reference):
+        name = (recorded.architecture or Path(reference).name).partition("@")[0]
+        raise LogError(
+            f"{run.path}: its network is {name}, and no file is loaded because a log names it: add --architecture "
+            f"{name}, with the path to it"
+        )
+
+
+def _other_text(run: Run, recorded: list[RecordedController], own: OwnArchitecture | None) -> list[str]:
+    then = {r.architecture for r in recorded if r.architecture}
+    if own is None or then <= {own.name}:
+        return []
+    return [f"recorded with {', '.join(sorted(then))}, replayed with {own.name}: the file's text is another"]
 
 
 def _replay_tick(

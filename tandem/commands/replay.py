@@ -24,14 +24,19 @@ class Replay(Command):
     """Start at this tick, from the nearest keyframe before it."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Replay with another value than the log's configuration has."""
+    architecture: Annotated[str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: none)")] = None
+    """The file of the log's network, where its architecture is one of your own. A log's own word is never enough to
+    load code."""
 
     def run(self) -> int:
         """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
         import msgspec
 
+        from node_runtime.config.architecture import load_architecture
         from run_log.reading.reader import read_run
         from run_log.replaying.replay import ROUNDING, replay
 
+        own = None if self.architecture is None else load_architecture(self.architecture)
         ran = read_run(self.file)
         with terminal.progress_bar(self.console) as bar:
             task = bar.add_task("replaying", total=None)
@@ -40,6 +45,7 @@ class Replay(Command):
                 self.from_tick,
                 self.set,
                 lambda done, total: bar.update(task, completed=done, total=total),
+                own,
             )
         if found.equal:
             text = (

@@ -63,12 +63,14 @@ class Run(Configured):
 
         from controller_node.build import build_model, build_plant
         from controller_node.guarantee import guarantee
+        from node_runtime.config.architecture import register_architecture
         from node_runtime.config.loading import to_toml
         from tandem.live.files import claimed
         from tandem.live.monitor import Monitor
         from tandem.live.supervisor import Impatient, StartError, trains, wishes
 
         require("zstandard", "matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
+        register_architecture(config)
         plant = build_plant(config)
         said = guarantee(config, build_model(config))
         with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:

@@ -23,7 +23,7 @@ RUN = re.compile(r"python -m ([\w.]+)")
 MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
 TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+ ?){1,2})([^`\n|]*)", re.MULTILINE)
 # What a page may name that is made when something runs, or is an example of the reader's own.
-MADE = ("network_model/architectures/gru.py", "tandem/jet")
+MADE = ("tandem/jet",)
 OWN = {"gru.py", "tanks.py", "true.py"}
 
 

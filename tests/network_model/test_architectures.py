@@ -1,13 +1,8 @@
-"""Recurrent and convolutional hidden layers in the solver, in the configuration, in a whole run, in the docs."""
+"""Recurrent and convolutional hidden layers in the solver, in the configuration, in a whole run."""
 
 from __future__ import annotations
 
 import itertools
-import re
-import shutil
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -22,9 +17,7 @@ from lbmpc.plants import Truth
 from lbmpc.problem import build_problem
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Status
-from network_model import architectures, registry
 from network_model.description import NetworkDescription, hash_layers
-from network_model.registry import get_architecture
 from node_runtime.config.loading import load, override
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -33,9 +26,7 @@ from run_log.replaying.replay import replay
 from run_log.reporting.summary import summarise
 from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.ipopt_reference import ReferenceSolver
-from tests.helpers.paths import DOCS
 from tests.helpers.science import compressor, describe
-from tests.network_model.test_parity import check_parity
 from trainer_node.network import AutogradLoss, DenseLoss, Network, build_loss
 
 MODEL = compressor()
@@ -48,7 +39,6 @@ QUICK = [
     "trainer.steps=20",
     "controller.solver.compile=never",
 ]
-PAGE = DOCS / "architectures.md"
 
 
 def oracle_of(name: str, window: int | None = None, hidden: list[int] | None = None) -> DnnOracle:
@@ -264,31 +254,3 @@ def test_the_loop_learns(name: str) -> None:
     assert summary.fallback_ticks == 0
     assert summary.weights_adopted >= 5
     assert summary.weights_refused == 0
-
-
-# -- the page in docs ------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def gru(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The worked example of docs/architectures.md in a file of its own, as the page says."""
-    (block,) = re.findall(
-        r"```python\n(# network_model/architectures/gru\.py\n.*?)```", PAGE.read_text(), re.DOTALL
-    )
-    (tmp_path / "gru.py").write_text(block)
-    monkeypatch.setattr(architectures, "__path__", [*architectures.__path__, str(tmp_path)])
-    get_architecture.cache_clear()
-    yield "gru"
-    sys.modules.pop("network_model.architectures.gru", None)
-    get_architecture.cache_clear()
-    shutil.rmtree(tmp_path)
-
-
-def test_the_example_of_the_docs_is_the_same_network_on_both_sides_and_runs(gru: str) -> None:
-    assert gru in registry.architecture_names()
-    for window in (1, 4):
-        for seed in range(3):
-            check_parity(describe(MODEL, [7, 6], architecture=gru, window=window), seed)
-    run = simulate(override(Config(), [*QUICK, f"network.architecture={gru}"]), 40)
-    assert any(result.weights_outcome == "adopted" for result in run.results)
-    assert replay(run).equal

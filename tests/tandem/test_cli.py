@@ -19,6 +19,7 @@ COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
     "health",
     "config show",
+    "architecture check",
     *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {

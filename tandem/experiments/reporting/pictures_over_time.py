@@ -115,7 +115,10 @@ def recovery(results: list[CaseResult], plant: Description) -> list[Picture]:
             own = plant.parameters if isinstance(plant, Plant) else {}
             truth = same[0].case.config.plant.truth
             before = {**own, **(truth if isinstance(truth, dict) else {})}
-            values = ", ".join(f"{n} = {before[n]:g} to {v:g}" if n in before else f"{n} to {v:g}" for n, v in drift.to.items())
+            values = ", ".join(
+                f"{n} = {before[n]:g} to {v:g}" if n in before else f"{n} to {v:g}"
+                for n, v in drift.to.items()
+            )
             when = f"over {drift.over:g} s from {drift.at:g} s on" if drift.over else f"at {drift.at:g} s"
             said = f"{values} {when}"
             for ax in (above, below):
