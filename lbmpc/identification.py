@@ -25,8 +25,8 @@ SAMPLES_EACH = 10
 """Samples at least for each number of a row."""
 EXCITED = 1e-3
 """RMS motion at least, of a half-width, in every direction of (x, u)."""
-ABOVE_NOISE = 3.0
-"""What moves less than so many times its measuring noise has its effect underrated by a tenth and more."""
+ABOVE_NOISE = 5.0
+"""What moves less than so many times its measuring noise has its effect underrated by 1 / 25 and more."""
 KNOWN = 0.1
 """Half-widths to which one step from a half-width away must be known, as a standard error."""
 MARGIN = 1.25

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from rich.table import Column, Table
@@ -19,36 +19,57 @@ def plain(*columns: Column) -> Table:
     return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
 
 
-def matrix_table(
+def matrix_tables(
+    width: int,
     states: Sequence[str],
     columns: Sequence[str],
     values: np.ndarray,
     scales: tuple[np.ndarray, np.ndarray],
     errors: np.ndarray | None = None,
-) -> Table:
-    """x+ of each state, one a row, from each of `columns`.
+) -> Iterator[Table]:
+    """x+ of each state, one a row, from each of `columns`; as many tables beneath one another as `width` makes needed.
 
     Args:
-        values: (d, n); a number that is rounding, beside its half-widths, is a dot.
+        width: of the console, characters.
+        values: (d, n); a number that is rounding, in half-widths, is a dot.
         scales: half-widths of the rows, (d,), and of the columns, (n,).
         errors: standard errors, (d, n), below their numbers. A number that is not known from zero is dim.
     """
-    right = [Column(name, justify="right", no_wrap=True) for name in columns]
-    shown = plain(Column("", style="bold", no_wrap=True), *right)
-    shown.padding = (0, 1, 0, 0)
     share = np.abs(values) * scales[1] / scales[0][:, None]
-    for i, state in enumerate(states):
-        cells = []
-        for j in range(len(columns)):
-            nothing = share[i, j] < ROUNDING
-            cell = Text("·" if nothing else f"{values[i, j]:.3g}", style="dim" if nothing else "")
-            if errors is not None and not nothing:
-                if abs(values[i, j]) < UNKNOWN * errors[i, j]:
-                    cell.stylize("dim")
-                cell.append(f"\n±{errors[i, j]:.1g}", style="dim")
-            cells.append(cell)
-        shown.add_row(f"{state}+", *cells)
-    return shown
+    cells = [
+        [
+            _cell(values[i, j], share[i, j], None if errors is None else errors[i, j])
+            for i in range(len(states))
+        ]
+        for j in range(len(columns))
+    ]
+    names = [f"{state}+" for state in states]
+    left = width - max(map(len, names))
+    groups: list[list[int]] = [[]]
+    room = left
+    for j, column in enumerate(cells):
+        needed = 1 + max(len(columns[j]), *(len(line) for cell in column for line in cell.plain.split("\n")))
+        if needed > room and groups[-1]:
+            groups.append([])
+            room = left
+        groups[-1].append(j)
+        room -= needed
+    for group in groups:
+        right = [Column(columns[j], justify="right", no_wrap=True) for j in group]
+        shown = plain(Column("", style="bold", no_wrap=True), *right)
+        shown.padding = (0, 1, 0, 0)
+        for i, name in enumerate(names):
+            shown.add_row(name, *(cells[j][i] for j in group))
+        yield shown
+
+
+def _cell(value: float, share: float, error: float | None) -> Text:
+    if share < ROUNDING:
+        return Text("·", "dim")
+    if error is None:
+        return Text(f"{value:.3g}")
+    cell = Text(f"{value:.3g}", "dim" if abs(value) < UNKNOWN * error else "")
+    return cell.append(f"\n±{error:.1g}", "dim")
 
 
 def poles_text(poles: np.ndarray) -> str:

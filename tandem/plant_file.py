@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -41,7 +42,7 @@ def source(fields: Mapping[str, Any], about: Sequence[str], name: str = "PLANT")
 
 
 def shared_fields(known: Known) -> dict[str, Any]:
-    """What a model with other matrices has in common with this one, as `from_matrices` takes it."""
+    """What a model with other matrices has in common with this one, as `from_matrices` takes it; names come first."""
     names = (
         *("name", "states", "inputs", "units", "x_e", "u_e", "x_min", "x_max", "u_min", "u_max"),
         *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
@@ -51,13 +52,18 @@ def shared_fields(known: Known) -> dict[str, Any]:
 
 
 def _text(value: Any, indent: int) -> str:
-    """Python for a value: matrices a row a line, floats with `DIGITS` digits."""
+    """Python for a value: matrices a row a line, floats with `DIGITS` digits, texts in double quotes."""
     if isinstance(value, np.ndarray) and value.ndim == 2:
         pad = " " * (indent + 4)
         rows = "".join(f"{pad}{_text(row, 0)},\n" for row in value)
         return f"[\n{rows}{' ' * indent}]"
     if isinstance(value, np.ndarray | list):
         return f"[{', '.join(_text(one, 0) for one in np.asarray(value).tolist())}]"
+    if isinstance(value, Mapping):
+        pairs = (f"{_text(key, 0)}: {_text(one, 0)}" for key, one in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, tuple):
+        return f"({', '.join(_text(one, 0) for one in value)}{',' if len(value) == 1 else ''})"
     if isinstance(value, float):
         return repr(float(f"{value:.{DIGITS}g}"))
-    return repr(value)
+    return json.dumps(value) if isinstance(value, str) else repr(value)

@@ -98,21 +98,23 @@ class Identify(Command):
         import numpy as np
 
         from lbmpc.analysis import poles
-        from tandem.model_tables import matrix_table, percent, poles_text
+        from tandem.model_tables import matrix_tables, percent, poles_text
 
         self.say(
             f"{known.name}: {found.samples} samples, one every {found.period:g} s",
             "x+ = A x + B u + c, in deviations from x_e and u_e; below each entry its standard error",
             "",
         )
-        table = matrix_table(
+        tables = matrix_tables(
+            self.console.width,
             known.states,
             (*known.states, *known.inputs, "c"),
             np.column_stack([found.A, found.B, found.offset]),
             (known.x_scale, np.concatenate([known.x_scale, known.u_scale, [1.0]])),
             np.column_stack([found.A_error, found.B_error, found.offset_error]),
         )
-        self.console.print(table)
+        for table in tables:
+            self.console.print(table)
         self.say(
             "", "one step ahead, RMS and largest, in half-widths per second; what is held out is not fitted"
         )
@@ -162,8 +164,7 @@ def _quality_table(known: Known, found: Identified, own: Quality) -> Table:
     for i, state in enumerate(known.states):
         pairs = [f"{percent(q.rms[i])}, {percent(q.largest[i])}" for q in (found.held_out, own)]
         nothing = f"{percent(found.nothing_changes.rms[i])}, {percent(found.nothing_changes.largest[i])}"
-        unit = known.units[state]
-        shown.add_row(state, *pairs, nothing, f"{found.W[i]:.2g}{'' if unit == '1' else ' ' + unit}")
+        shown.add_row(state, *pairs, nothing, f"{found.W[i]:.2g}")
     return shown
 
 
@@ -195,14 +196,8 @@ def _source(known: Known, found: Identified, logs: str) -> str:
     from lbmpc.identification import MARGIN
     from tandem.plant_file import shared_fields, source
 
-    fields = {
-        **shared_fields(known),
-        "A": found.A,
-        "B": found.B,
-        "offset": found.offset,
-        "period": found.period,
-        "W": found.W,
-    }
+    found_here = {key: getattr(found, key) for key in ("A", "B", "offset", "period", "W")}
+    fields = {**found_here, **shared_fields(known)}
     about = [
         f"{known.name} as {found.samples} samples have it, one every {found.period:g} s ({logs}).",
         "",

@@ -76,7 +76,7 @@ class ModelCheck(Configured):
         from lbmpc.plants import Known, PlantError
         from node_runtime.config.plant import initial_state
         from tandem.commands.model.findings import disturbance_finding, findings
-        from tandem.model_tables import matrix_table
+        from tandem.model_tables import matrix_tables
 
         known, horizon, x0 = model.plant, config.controller.horizon, initial_state(config, plant)
         step = _true_step(config, plant)
@@ -84,7 +84,9 @@ class ModelCheck(Configured):
         self.say("x+ = A x + B u, in deviations from x_e and u_e")
         scales = known.x_scale, np.concatenate([known.x_scale, known.u_scale])
         names = (*known.states, *known.inputs)
-        self.console.print(matrix_table(known.states, names, np.hstack([model.A, model.B]), scales))
+        matrices = np.hstack([model.A, model.B])
+        for table in matrix_tables(self.console.width, known.states, names, matrices, scales):
+            self.console.print(table)
         sampled = bound = None
         if step is not None:
             with self.console.status("asking the true motion for h"):
@@ -95,7 +97,8 @@ class ModelCheck(Configured):
         moved = reach(model, horizon)
         self.say(
             "",
-            f"moved: half-widths, by full inputs within the horizon of {horizon * model.period:.3g} s; W, h: per second",
+            f"moved: by full inputs within the horizon of {horizon * model.period:.3g} s, in half-widths; W and h: "
+            "per second",
         )
         self.console.print(_state_table(model, x0, moved, sampled, bound))
         self.console.print(_input_table(known))
