@@ -43,7 +43,7 @@ SHORTEST_WATCH = 8
 
 @dataclass(frozen=True)
 class GivenPlant:
-    """What stands for the plant that a configuration names: of a log, whose configuration never loads anything."""
+    """What stands for the plant that a configuration names, as it is configured: of a log, which loads nothing."""
 
     known: Known | Plant
     """What the controller knew."""
@@ -175,13 +175,12 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
     try:
-        plant = plant_of(config, get_plant, None if given is None else given.known)
+        plant = build_plant(config) if given is None else given.known
         model = nominal_model(plant, config.period, Q, R, settings.terminal)
         require_horizon(model, settings.horizon)
         if given is None or given.equations is None:
             return model
-        equations = plant_of(config, get_plant, given.equations)
-        return replace(model, equations=equations if isinstance(equations, Plant) else None)
+        return replace(model, equations=given.equations)
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
 

@@ -9,33 +9,25 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import casadi as ca
 import numpy as np
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 
-from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.description import Description, PlantDefinitionError
 from lbmpc.plants.equations import Plant
 from lbmpc.plants.inspection import require_model
 from lbmpc.plants.known import Known
+from lbmpc.plants.linear_motion import LinearMotion, Pieces, balanced, discretise, within_period
 from lbmpc.pole_placement import place
 from lbmpc.terminal_cost import TOLERANCE, TerminalCost, shortfall, terminal_cost
 
-Pieces = tuple[tuple[float, np.ndarray], ...]
-"""Stretches of time under one input each: (seconds, u (m,))."""
-
-
-# Up to two periods the argument of the series has a norm of at most 2 * SERIES_NORM = 1, so what is left out is
-# below 1 / 19! = 8e-18.
-SERIES_NORM = 0.5
-TERMS = 19
-
+SAME_PERIOD = 1e-9
+"""How far apart, as a share, two periods are that are the same: one over a rate is rounded."""
 LARGEST_GROWTH = 1e8
 """Of a prediction over the horizon: of 16 digits half are left."""
 
 
 class ModelError(ValueError):
-    """The plant's equations and the chosen period give no usable model."""
+    """The plant and the chosen period give no usable model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +39,8 @@ class Model:
 
     plant: Known
     period: float
-    a: np.ndarray
-    """Continuous-time Jacobian in x, (d, d)."""
-    b: np.ndarray
-    """Continuous-time Jacobian in u, (d, m)."""
+    within: LinearMotion
+    """How it moves within a period."""
     A: np.ndarray
     B: np.ndarray
     Q: np.ndarray
@@ -103,83 +93,16 @@ class Model:
         """
         if not pieces:
             return x_next - self.step(x, u)
-        return x_next - self.A.dot(x) - self.answer(pieces)
+        return x_next - self.A.dot(x) - self.within.answer(pieces)
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """A x + B u, (d,)."""
         # For so few numbers `dot` takes half as long as `@`.
         return self.A.dot(x) + self.B.dot(u)
 
-    def answer(self, pieces: Pieces) -> np.ndarray:
-        """The linear model's state, (d,), after the inputs of `pieces` in turn, from the equilibrium."""
-        x = np.zeros(self.d)
-        for seconds, u in pieces:
-            x = self.ahead(x, u, seconds)
-        return x
-
     def ahead(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray:
-        """The linear model's state, (d,), `seconds` after x, (d,), under the input u, (m,), for use in every tick.
-
-        Up to two periods by a series: `discretise` to rounding, in a tenth of the time.
-        """
-        if not 0.0 <= seconds <= 2.0 * self.period:
-            phi, gamma = discretise(self.a, self.b, seconds, balanced(self.plant))
-            return phi @ x + gamma @ u
-        held = self._held
-        inputs = held.inputs
-        inputs["x"][:, 0], inputs["u"][:, 0], inputs["share"][0, 0] = x, u, seconds / self.period
-        held()
-        return held.outputs["after"][:, 0].copy()
-
-    @cached_property
-    def _held(self) -> Bound:
-        """(x, u, share) -> the state after this share of a period.
-
-        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings), in balanced units, is a polynomial in the share;
-        squaring does the rest.
-        """
-        d, m = self.b.shape
-        units = balanced(self.plant)
-        block = _block(self.a, self.b) * self.period * units / units[:, None]
-        squarings = max(0, math.ceil(math.log2(max(np.abs(block).sum(axis=0).max(), 1e-300) / SERIES_NORM)))
-        block /= 2.0**squarings
-        terms = [np.eye(d + m)]
-        for k in range(1, TERMS):
-            terms.append(terms[-1] @ block / k)
-        share = ca.SX.sym("share")
-        series = ca.DM(terms[-1])
-        for term in reversed(terms[:-1]):
-            series = ca.sparsify(ca.DM(term)) + share * series
-        held = ca.Function("series", [share], [ca.densify(series)])
-        x, u, part = ca.MX.sym("x", d), ca.MX.sym("u", m), ca.MX.sym("share")
-        power = held(part)
-        for _ in range(squarings):
-            power = power @ power
-        after = (power[:d, :d] @ (x / units[:d]) + power[:d, d:] @ (u / units[d:])) * units[:d]
-        return Bound(ca.Function("held", [x, u, part], [after], ["x", "u", "share"], ["after"]))
-
-
-def balanced(plant: Description) -> np.ndarray:
-    """Units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
-
-    A state in pascals beside one in metres would otherwise cost digits. Powers of two: going there and back is exact.
-    """
-    return np.exp2(np.rint(np.log2(np.concatenate([plant.x_scale, plant.u_scale]))))
-
-
-def discretise(
-    a: np.ndarray, b: np.ndarray, period: float, units: np.ndarray | float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Exact zero-order hold: exp([[a, b], [0, 0]] T), computed in these units of (x, u), (d + m,)."""
-    d, m = b.shape
-    units = np.broadcast_to(units, d + m)
-    exponential = expm(_block(a, b) * period * units / units[:, None]) * units[:, None] / units
-    return exponential[:d, :d], exponential[:d, d:]
-
-
-def _block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[[a, b], [0, 0]]."""
-    return np.vstack([np.hstack([a, b]), np.zeros((b.shape[1], sum(b.shape)))])
+        """The linear model's state, (d,), `seconds` after x, (d,), under the input u, (m,), for use in every tick."""
+        return self.within.after(x, u, seconds)
 
 
 def build_model(
@@ -209,16 +132,28 @@ def build_model(
     except PlantDefinitionError as error:
         raise ModelError(str(error)) from error
     known = plant if isinstance(plant, Known) else plant.known()
-    a_c, b_c = known.A, known.B
     units = balanced(known)
-    A, B = discretise(a_c, b_c, period, units)
+    A, B = _of_a_period(known, period, units)
     q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)
     x, u = units[: plant.d], units[plant.d :]
     a, b = A * x / x[:, None], B * u / x[:, None]
     k, p = _gain_and_terminal_weight(plant, period, terminal, a, b, np.diag(q * x**2), np.diag(r * u**2), x)
     gain, terminal_weight = k * u[:, None] / x, p / np.outer(x, x)
     equations = plant if isinstance(plant, Plant) else None
-    return Model(known, period, a_c, b_c, A, B, np.diag(q), np.diag(r), gain, terminal_weight, equations)
+    within = within_period(known, period)
+    return Model(known, period, within, A, B, np.diag(q), np.diag(r), gain, terminal_weight, equations)
+
+
+def _of_a_period(known: Known, period: float, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B over this period. Raises `ModelError`: they are those of another one."""
+    if known.period is None:
+        return discretise(known.A, known.B, period, units)
+    if not math.isclose(known.period, period, rel_tol=SAME_PERIOD):
+        raise ModelError(
+            f"{known.name}: A and B are those of a period of {known.period:g} s, and the rate makes one of {period:g} "
+            f"s: take rate = {1 / known.period:.10g}, or give A and B in continuous time"
+        )
+    return known.A, known.B
 
 
 def _gain_and_terminal_weight(

@@ -27,6 +27,7 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.terminal import terminal_set
 from lbmpc.sets.invariance.tube import tighten, tube_margins
+from lbmpc.sets.motion import require_prediction
 
 Tightening = Literal["none", "first_step", "tube", "invariant"]
 
@@ -86,6 +87,8 @@ def build_problem(
             raise CertificateError(
                 f"these sets are an approximation ({certificate.kind}) that claims nothing"
             )
+        if model.equations is None:
+            require_prediction(model)
         guard = Guard(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)
     n = horizon

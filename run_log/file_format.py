@@ -31,6 +31,8 @@ RECOVERED = "recovered"
 """Metadata of a log that was made whole again."""
 CONFIG = "config.json"
 """The attachment with the resolved configuration."""
+PLANT = "plant.json"
+"""The attachment with what the controller knew of the plant."""
 
 
 def check_header(path: Path, header: Header) -> None:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from lbmpc.plants import Known, Plant, PlantDefinitionError, get_plant
-from node_runtime.config.sections import Config
+import msgspec
+
+import node_runtime.config.plant
+from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant
+from node_runtime.config.reference import is_reference
+from node_runtime.config.sections import Config, PlantConfig
+from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
@@ -62,6 +67,14 @@ class Run:
     """Name of the next one; None: this is the last, or was cut short."""
     note: str = ""
     """What a person should know about the file, e.g. where it was cut."""
+    plant: Known | None = None
+    """What its controllers knew of the plant, as numbers; None: it does not say."""
+    files: dict[str, str] = field(default_factory=dict)
+    """The sha256 of the files that its configuration named, by key."""
+    truth: Known | Plant | TrueMotion | None = None
+    """How the plant really moved; None: a log does not say."""
+    named: Known | Plant | None = None
+    """The plant that whoever reads the log has named beside it."""
 
     plant_states = Messages[m.PlantState](topics.PLANT_STATE)
     commands = Messages[m.Command](topics.COMMAND)
@@ -126,26 +139,79 @@ def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], pat
     return run
 
 
-def plant_of(run: Run) -> Known | Plant:
-    """The plant that the run is about. Raises `LogError` when this Tandem does not have it, or cannot use it."""
-    try:
-        return get_plant(run.config.plant.model)
-    except KeyError as error:
-        raise LogError(
-            f"{run.path}: {error.args[0]} The log needs the plant that it was made with."
-        ) from error
-    except PlantDefinitionError as error:
-        raise LogError(f"{run.path}: {error}") from error
-
-
-def true_plant_of(run: Run) -> Known | Plant:
-    """The plant as it really moved: `plant_of` with the parameters of `plant.truth`.
+def recorded_plant(run: Run) -> Known | Plant | None:
+    """Its numbers, or what somebody has named beside it; None: it is a plant that comes with Tandem, by its name.
 
     Raises:
-        LogError: as `plant_of`, or the plant has no such parameters.
+        LogError: it is none of these.
     """
-    plant, changes = plant_of(run), run.config.plant.truth
+    known, model = run.plant or run.named, run.config.plant.model
+    if known is None and is_reference(model):
+        raise LogError(
+            f"{run.path}: its plant, {model}, is not in the log, and nothing is loaded because a log names it; if you "
+            "have that file, name it: --plant FILE:NAME"
+        )
+    return known
+
+
+def as_logged(run: Run, config: Config, changed: Collection[str] = ()) -> Config:
+    """`config` without what the log's numbers of the plant hold already, except for the keys that were changed."""
+    if run.plant is None or "plant" in changed:
+        return config
+    held = {
+        name: getattr(PlantConfig(), name)
+        for name in ("bounds", "x_e", "u_e")
+        if not any(f"{key}.".startswith(f"plant.{name}.") for key in changed)
+    }
+    return msgspec.structs.replace(config, plant=msgspec.structs.replace(config.plant, **held))
+
+
+def plant_of(run: Run) -> Known | Plant:
+    """The plant that the run is about, as its log says; of a log that does not say it, the one of that name here.
+
+    Nothing is loaded that a log names.
+
+    Raises:
+        LogError: the log does not carry its plant, and this Tandem does not have it or cannot use it.
+    """
+    known = recorded_plant(run)
     try:
-        return plant.varied(**changes) if changes else plant
-    except (LookupError, ArithmeticError) as error:
-        raise LogError(f"{run.path}: plant.truth: {error.args[0]}") from error
+        return node_runtime.config.plant.plant_of(as_logged(run, run.config), get_plant, known)
+    except ConfigError as error:
+        end = "" if known is not None else " The log needs the plant that it was made with."
+        raise LogError(f"{run.path}: {error}{end}") from error
+
+
+def equations_of(run: Run, config: Config) -> Plant | None:
+    """Those that its plant was linearised from: of a plant that comes with Tandem, or that somebody has named.
+
+    Args:
+        run: a log.
+        config: how they are configured.
+
+    Raises:
+        ConfigError: they do not fit the configuration.
+    """
+    found = PLANTS.get(config.plant.model) if run.named is None else run.named
+    if not isinstance(found, Plant):
+        return None
+    equations = node_runtime.config.plant.plant_of(config, get_plant, found)
+    return equations if isinstance(equations, Plant) else None
+
+
+def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
+    """The plant as it really moved: `equations_of` with `plant.truth`; None where that cannot be known from here.
+
+    Raises:
+        LogError: the plant has no such parameters.
+    """
+    if run.truth is not None:
+        return run.truth
+    try:
+        equations = equations_of(run, run.config)
+        if equations is None or isinstance(run.config.plant.truth, str):
+            # Where the log names another plant as the true one, whoever names a plant says what moved.
+            return None if run.named is None else equations
+        return node_runtime.config.plant.true_plant_of(run.config, get_plant, equations)
+    except ConfigError as error:
+        raise LogError(f"{run.path}: {error}") from error

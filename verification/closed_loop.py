@@ -19,9 +19,10 @@ import numpy as np
 
 from lbmpc.controller.signals import Observation
 from lbmpc.controller.step import Controller
-from lbmpc.model import Model, Pieces
+from lbmpc.model import Model
 from lbmpc.oracles import LinearOracle, Oracle, PerfectOracle
 from lbmpc.oracles.base import OracleState
+from lbmpc.plants.linear_motion import Pieces
 from lbmpc.plants.truth import dop853
 from lbmpc.problem import build_problem
 from lbmpc.sets.certificate import Certificate
@@ -147,9 +148,10 @@ class ClosedLoop:
 
 def _flow(model: Model) -> ca.Function:
     """(x, u, seconds), deviations -> the true plant's state, (d,), for up to a period; as `one_period`."""
-    plant, f = model.plant, model.require_equations("this check").function()
+    plant, equations = model.plant, model.require_equations("this check")
+    f = equations.function()
     x, u, seconds = ca.SX.sym("x", model.d), ca.SX.sym("u", model.m), ca.SX.sym("seconds")
-    norm = float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period
+    norm = float(np.abs(np.linalg.eigvals(equations.linearised()[1])).max()) * model.period
     steps = max(1, math.ceil(norm / STEP_NORM))
     after = x + plant.x_e
     for _ in range(steps):

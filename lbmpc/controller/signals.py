@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.model import Pieces
 from lbmpc.oracles.base import HiddenSet, Verdict
+from lbmpc.plants.linear_motion import Pieces
 from lbmpc.sets.guard import FirstInputs
 from lbmpc.solver.solution import Solution
 

@@ -20,7 +20,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.problem import Problem
 from lbmpc.sets.guard import FirstInputs
-from lbmpc.sets.motion import Motion
+from lbmpc.sets.motion import LATEST, motion_of
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
 
@@ -65,7 +65,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self._first_delay = self._acceptable(input_delay)
-        self._motion = None if problem.guard is None else Motion(self.model)
+        self._motion = None if problem.guard is None else motion_of(self.model)
         self.oracle = problem.oracle
         self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
 
@@ -152,14 +152,15 @@ class Controller:
         return self._acceptable(delay + DELAY_GAIN * (measured - delay))
 
     def _acceptable(self, delay: float) -> float:
-        return min(delay, 0.5 * self.model.period)
+        return min(delay, LATEST * self.model.period)
 
     def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
         """The state, (d,), at which the command that is being computed will begin to act.
 
         Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance. With certified sets the plant's own equations say where:
-        an error of the oracle's would be one of the state that the sets are asked about, and they hold for any oracle.
+        between sample and command would be a disturbance. With certified sets the plant's own equations say where, or
+        its numbers where that is all: an error of the oracle's would be one of the state that the sets are asked about,
+        and they hold for any oracle.
         """
         acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:

@@ -78,7 +78,7 @@ class Description:
 
         Args:
             bounds: lower and upper by the name of a state or input, None where there is none; others stay.
-            x_e, u_e: (d,) and (m,). Equations are linearised there; a pair of matrices is taken as it is, about there.
+            x_e, u_e: (d,) and (m,), where equations are linearised.
 
         Raises:
             KeyError: a bound of what is no state or input.

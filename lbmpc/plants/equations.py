@@ -14,9 +14,13 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.description import Description, PlantError, as_tuple
+from lbmpc.plants.faults import bound_faults, name_faults, number_faults, refuse, unusable
 from lbmpc.plants.known import Known
+from lbmpc.plants.rest import nearest_rest
 
 Rhs = Callable[[Any, Any], list[Any]]
+ROUNDS, STILL = 50, 1e-11
+"""Of Newton's method towards a rest; it ends with a step of so many half-widths."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +92,43 @@ class Plant(Description):
 
     def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
-        f = self.function()
+        return _values(self._slopes(), self.x_e, self.u_e)
+
+    def resting_near(self, x_e: Any = None, u_e: Any = None) -> Plant:
+        """The same equations about the rest nearest to (x_e, u_e), by default its own, as of `nearest_rest`.
+
+        For a plant that something known moves, wind or weight: x_e is then where it should be, and u_e a guess.
+
+        Raises:
+            PlantDefinitionError: there is none nearby, or it is outside of X or U.
+        """
+        refuse(self.name, name_faults(self) or tuple(number_faults(self)) or tuple(bound_faults(self)))
+        near_x = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
+        near_u = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
+        slopes, x, u = self._slopes(), near_x, near_u
+        for _ in range(ROUNDS):
+            residual, a, b = _values(slopes, x, u)
+            if not all(np.isfinite(values).all() for values in (residual, a, b)):
+                break
+            drift = residual + a @ (near_x - x) + b @ (near_u - u)
+            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale)
+            if moved is None:
+                break
+            last, x, u = (x, u), near_x + moved[0], near_u + moved[1]
+            steps = np.concatenate([(x - last[0]) / self.x_scale, (u - last[1]) / self.u_scale])
+            if np.abs(steps).max() <= STILL:
+                found = replace(self, x_e=x, u_e=u)
+                refuse(self.name, tuple(bound_faults(found)), " at the nearest rest")
+                return found
+        where = f"x_e = {near_x.tolist()}, u_e = {near_u.tolist()}"
+        raise unusable(self.name, f"it rests nowhere near {where}")
+
+    def _slopes(self) -> ca.Function:
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
-        dx = f(x, u)
-        jacobian = ca.Function("jacobian", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
-        residual, a, b = (np.array(value) for value in jacobian(self.x_e, self.u_e))
-        return residual[:, 0], a, b
+        dx = self.function()(x, u)
+        return ca.Function("slopes", [x, u], [dx, ca.jacobian(dx, x), ca.jacobian(dx, u)])
+
+
+def _values(slopes: ca.Function, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    residual, a, b = (np.array(value) for value in slopes(x, u))
+    return residual[:, 0], a, b

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from lbmpc.plants.description import Description, as_array
+from lbmpc.plants.description import Description, as_array, as_tuple
+from lbmpc.plants.faults import (
+    bound_faults,
+    choice_faults,
+    name_faults,
+    number_faults,
+    pole_faults,
+    refuse,
+    unusable,
+)
+from lbmpc.plants.matrices import matrix_faults, mode_faults, pair_faults
+from lbmpc.plants.rest import nearest_rest
+from lbmpc.plants.written import read, written
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known(Description):
-    """A linear model about (x_e, u_e), in deviations from there.
+    """A linear model about (x_e, u_e), at which the plant rests, in deviations from there.
 
     In continuous time dx/dt = A x + B u; in discrete time x+ = A x + B u after every `period`, with u constant.
     """
@@ -38,14 +50,54 @@ class Known(Description):
             )
         return self
 
+    def resting_near(self, x_e: Any = None, u_e: Any = None) -> Known:
+        """The same model about the rest nearest to (x_e, u_e), by default its own.
+
+        Raises:
+            PlantDefinitionError: the model rests nowhere, or outside of X or U.
+        """
+        x_e = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
+        u_e = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
+        return _at_rest(self, x_e, u_e, self.slope_x @ (x_e - self.x_e) + self.B @ (u_e - self.u_e))
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Known:
+        """As that of a description; about the rest nearest to (x_e, u_e). Raises `PlantDefinitionError` as well."""
+        bounded = super().changed(bounds)
+        if x_e is None and u_e is None:
+            return bounded
+        refuse(self.name, known_faults(bounded))
+        return bounded.resting_near(x_e, u_e)
+
+    def to_builtins(self) -> dict[str, Any]:
+        """What JSON can hold, and `from_builtins` makes the same plant of, bit for bit; infinities are words."""
+        return written({one.name: getattr(self, one.name) for one in fields(self)})
+
+    @classmethod
+    def from_builtins(cls, data: object) -> Known:
+        """Raises `PlantDefinitionError`: it is something else, or a plant that cannot be used."""
+        known = cls(**read(data))
+        refuse(known.name, all_faults(known))
+        return known
+
+    @property
+    def slope_x(self) -> np.ndarray:
+        """Of what moves it in x, (d, d): A of dx/dt, A - I of x+ - x."""
+        return self.A if self.period is None else self.A - np.eye(self.d)
+
     @classmethod
     def from_matrices(
         cls,
         A: Any,
         B: Any,
         *,
-        W: Any,
         period: float | None = None,
+        W: Any = None,
+        offset: Any = None,
         name: str = "plant",
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
@@ -57,7 +109,6 @@ class Known(Description):
         u_min: Any = None,
         u_max: Any = None,
         x0: Any = None,
-        offset: Any = None,
         safe_input: Any = None,
         safe_gain: Any = None,
         performance: Sequence[int] | None = None,
@@ -66,50 +117,99 @@ class Known(Description):
         scale: Mapping[str, float] | None = None,
         names: Mapping[str, str] | None = None,
     ) -> Known:
-        """A plant of which no more is known than a pair of matrices.
+        """A plant of which a pair of matrices is known.
 
         Args:
-            A, B: (d, d) and (d, m): dx/dt = A x + B u in deviations from (x_e, u_e), or x+ where there is a period.
-            W: half-widths of what they do not know, per second, (d,).
-            period: T in seconds of a discrete-time model; None: continuous time.
+            A, B: (d, d) and (d, m): dx/dt = A x + B u in deviations from (x_e, u_e); with a period, x+ = A x + B u.
+            period: T in seconds of a model in discrete time, which is then used at 1 / T only; None: continuous time.
+            W: half-widths of what they do not know, per second, (d,). It has no default.
+            offset: dx/dt, or x+ - x, at (x_e, u_e), (d,): a known bias. (x_e, u_e) then moves to the nearest rest.
             name: of the plant.
-            states, inputs: their names; x1, x2, .. and u1, u2, ..
+            states, inputs: their names; x1, x2, .. and u1, u2, .. by default.
             units: by name; '1' by default, and 's' for time.
             x_e, u_e: zeros by default.
             x_min, x_max, u_min, u_max: no bounds by default; then `scale` says what counts as 1.
-            x0: x_e by default.
-            offset: dx/dt, or x+ - x, at (x_e, u_e): a known constant bias, (d,). (x_e, u_e) moves to the nearest rest.
+            x0: where a simulation begins; x_e by default.
             safe_input: u_e by default.
-            safe_gain, poles, scale, names: as the fields of those names.
             performance: all states by default.
             kernel: all states and inputs by default.
+            safe_gain, poles, scale, names: as the fields of these names.
+
+        Raises:
+            PlantDefinitionError: it cannot be used; the text names every fault.
         """
-        d, m = len(A), len(B[0])
-        states = tuple(states or (f"x{i + 1}" for i in range(d)))
-        inputs = tuple(inputs or (f"u{i + 1}" for i in range(m)))
-        u_e = np.zeros(m) if u_e is None else u_e
-        x_e = np.zeros(d) if x_e is None else x_e
-        return cls(
+        A, B = as_array(A), as_array(B)
+        refuse(name, pair_faults(A, B))
+        states = tuple(f"x{i + 1}" for i in range(len(A))) if states is None else as_tuple(states)
+        inputs = tuple(f"u{i + 1}" for i in range(B.shape[1])) if inputs is None else as_tuple(inputs)
+        zeros, none = np.zeros(len(states)), np.zeros(len(inputs))
+        x_e, u_e = zeros if x_e is None else x_e, none if u_e is None else u_e
+        known = cls(
             name=name,
             states=states,
             inputs=inputs,
             units={**dict.fromkeys((*states, *inputs), "1"), "t": "s", **(units or {})},
             x_e=x_e,
             u_e=u_e,
-            x_min=np.full(d, -np.inf) if x_min is None else x_min,
-            x_max=np.full(d, np.inf) if x_max is None else x_max,
-            u_min=np.full(m, -np.inf) if u_min is None else u_min,
-            u_max=np.full(m, np.inf) if u_max is None else u_max,
+            x_min=zeros - np.inf if x_min is None else x_min,
+            x_max=zeros + np.inf if x_max is None else x_max,
+            u_min=none - np.inf if u_min is None else u_min,
+            u_max=none + np.inf if u_max is None else u_max,
             W=W,
             x0=x_e if x0 is None else x0,
             safe_input=u_e if safe_input is None else safe_input,
             safe_gain=safe_gain,
-            performance=tuple(range(d)) if performance is None else tuple(performance),
-            kernel=tuple(kernel or (*states, *inputs)),
-            poles=None if poles is None else tuple(poles),
+            performance=tuple(range(len(states))) if performance is None else as_tuple(performance),
+            kernel=(*states, *inputs) if kernel is None else as_tuple(kernel),
+            poles=None if poles is None else as_tuple(poles),
             scale=scale or {},
             names=names or {},
             A=A,
             B=B,
             period=period,
         )
+        refuse(known.name, all_faults(known))
+        if offset is None:
+            return known
+        found = _at_rest(known, known.x_e, known.u_e, _offset(known, offset))
+        return replace(
+            found,
+            x0=found.x_e if x0 is None else found.x0,
+            safe_input=found.u_e if safe_input is None else found.safe_input,
+        )
+
+
+def all_faults(known: Known) -> tuple[str, ...]:
+    """Every fault, one sentence each; empty where the plant can be used."""
+    # Lengths and indices mean nothing without states and inputs.
+    return name_faults(known) or (*known_faults(known), *choice_faults(known))
+
+
+def known_faults(known: Known) -> tuple[str, ...]:
+    """What is wrong with the numbers of which a model is made; names are right."""
+    numbers = [
+        *number_faults(known),
+        *matrix_faults(known.A, known.B, known.period, known.states, known.inputs),
+    ]
+    found = numbers or [*bound_faults(known), *pole_faults(known)]
+    return tuple(found or mode_faults(known.A, known.B, known.period, known))
+
+
+def _offset(known: Known, offset: Any) -> np.ndarray:
+    drift = as_array(offset)
+    if not (isinstance(drift, np.ndarray) and drift.shape == (known.d,) and np.isfinite(drift).all()):
+        names = ", ".join(known.states)
+        text = f"offset is {offset!r}: it needs {known.d} finite numbers, one for each of {names}"
+        raise unusable(known.name, text)
+    return np.asarray(drift)
+
+
+def _at_rest(known: Known, x_e: np.ndarray, u_e: np.ndarray, drift: np.ndarray) -> Known:
+    """The model about the rest nearest to (x_e, u_e), at which it drifts."""
+    moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale)
+    if moved is None:
+        text = f"at x_e = {x_e.tolist()} it drifts by {drift.tolist()}, and no input holds it there or nearby"
+        raise unusable(known.name, text)
+    found = replace(known, x_e=x_e + moved[0], u_e=u_e + moved[1])
+    refuse(found.name, tuple(bound_faults(found)), " at the nearest rest")
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import isfinite
 from typing import Any, NamedTuple, Protocol
 
@@ -13,6 +14,7 @@ from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.description import PlantError
 from lbmpc.plants.equations import Plant
 from lbmpc.plants.known import Known
+from lbmpc.plants.linear_motion import balanced, discretise, within_period
 
 INTEGRATION_TOLERANCE = 1e-12
 
@@ -31,11 +33,33 @@ class TrueMotion(Protocol):
 
 def true_motion(plant: Known | Plant | TrueMotion) -> TrueMotion:
     """How this plant moves where nothing else is said to be true; of somebody's own motion that."""
-    if not isinstance(plant, Known | Plant):
-        return Own(plant)
     if isinstance(plant, Known):
-        raise PlantError(f"{plant.name}: numbers alone do not move")
-    return Truth(plant)
+        return LinearTruth(plant)
+    return Truth(plant) if isinstance(plant, Plant) else Own(plant)
+
+
+class LinearTruth:
+    """The true motion of numbers: the linear model is the truth, and h is zero."""
+
+    def __init__(self, known: Known):
+        self._known = known
+        units = balanced(known)
+        self._within = None if known.period is None else within_period(known, known.period)
+        # Few lengths of time come back again and again.
+        self._over = lru_cache(maxsize=64)(lambda dt: discretise(known.A, known.B, dt, units))
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """As `TrueMotion` says. Raises `PlantError`: the numbers are not finite."""
+        known = self._known
+        dx, du = x - known.x_e, u - known.u_e
+        if self._within is None:
+            phi, gamma = self._over(dt)
+            after = phi @ dx + gamma @ du
+        else:
+            after = self._within.after(dx, du, dt)
+        if not np.isfinite(after).all():
+            raise PlantError(f"{known.name}: the state is not finite: {after.tolist()}")
+        return np.asarray(known.x_e + after)
 
 
 class Own:

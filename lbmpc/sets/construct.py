@@ -14,6 +14,7 @@ from lbmpc.sets.geometry.operations import Body, body, body_of
 from lbmpc.sets.geometry.polytope import SetError
 from lbmpc.sets.invariance.regions import ControllableSet, controllable_sets
 from lbmpc.sets.invariance.robust_control import Stage, UncertainSystem, predecessor, predecessor_iteration
+from lbmpc.sets.motion import over_any_delay
 
 Saved = MutableMapping[str, dict[str, np.ndarray]]
 """Where work is kept, so that an interrupted construction goes on: arrays by name."""
@@ -44,7 +45,8 @@ def construct(
             `hull` sets around a way from `start` into it, with h bounded locally; `extension` is the approximation that
             the paper follows (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X: it claims nothing.
         start: a state that should be in the sets, (d,), deviation.
-        W: half-widths (d,) for `given`; the plant's own by default.
+        W: half-widths (d,) for `given`; the plant's own by default. Of a plant without equations the sets have a little
+            more, `lbmpc.sets.motion.over_any_delay`.
         slack, patience: as for `predecessor_iteration`.
         saved: of an earlier call with the same arguments; filled as the work goes on.
 
@@ -105,7 +107,13 @@ def whole(model: Model) -> Region:
 def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report: Report) -> DisturbanceBound:
     region = whole(model)
     if kind == "given":
-        return given_box(model, model.plant.W * model.period if W is None else W, region)
+        given = np.asarray(model.plant.W * model.period if W is None else W)
+        return given_box(model, given if model.equations else over_any_delay(model, given), region)
+    if model.equations is None:
+        raise SetError(
+            f"{model.plant.name} is numbers alone, and what h can be is found from equations: sets of the kind `given` "
+            "take W as it is"
+        )
     name = "W as a box" if kind == "box" else "W as a hull"
     if "W" not in saved:
         find = bound_box if kind == "box" else bound_hull

@@ -2,17 +2,33 @@
 
 The sets are about the state in which a command begins to act. What predicts that state decides what is certified, so
 it is no oracle's guess: the equations are those that the sets were computed for.
+
+Of a plant that is numbers alone the linear motion says it, and then the sets are about the state that is predicted.
+With Phi, Gamma over the delay and h what the model misses from sample to sample, under whatever acted in between,
+
+    y = Phi x + Gamma u_before,      y+ = A y + B u + Phi h,
+
+so W of the predicted states is Phi W. `over_any_delay` is what holds all of them.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
 from lbmpc.model import Model
+from lbmpc.plants.equations import Plant
+from lbmpc.plants.linear_motion import Continuous, discretise
+from lbmpc.sets.certificate import CertificateError
+
+LATEST = 0.5
+"""Of a period: the longest delay that is predicted over."""
+DELAYS = 65
+"""At which `over_any_delay` looks, from none to the longest."""
 
 STEP_NORM = 0.06
 """|a| dt of a Runge-Kutta step over a period, a the linearisation: right to 2e-7 of X's half-widths; over half a
@@ -21,12 +37,62 @@ MOST_STEPS = 1000
 """For a plant that is stiff beside its period; what comes out is then less exact, or not finite."""
 
 
-class Motion:
+class Motion(Protocol):
     """The state up to one period ahead, in deviation coordinates."""
 
+    def after(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray | None:
+        """The state, (d,), `seconds` after x, (d,), under the input u, (m,).
+
+        None where there is none: the motion leaves the domain of the equations, or is not finite.
+        """
+        ...
+
+
+def motion_of(model: Model) -> Motion:
+    """By the plant's equations; where there are none, the linear motion."""
+    return OfNumbers(model) if model.equations is None else OfEquations(model, model.equations)
+
+
+def over_any_delay(model: Model, W: np.ndarray) -> np.ndarray:
+    """Half-widths, (d,), of a box that holds Phi w for every w of the box W, (d,), and every delay up to `LATEST`.
+
+    Raises:
+        CertificateError: nothing is known of the model's motion within a period.
+    """
+    within = require_prediction(model)
+    seconds = np.linspace(0.0, LATEST * model.period, DELAYS).tolist()
+    moved = [np.abs(discretise(within.a, within.b, one, within.units)[0]) @ W for one in seconds]
+    return np.asarray(np.max(moved, axis=0))
+
+
+def require_prediction(model: Model) -> Continuous:
+    """The linear motion within a period. Raises `CertificateError`: nothing is known of it."""
+    within = model.within
+    if not isinstance(within, Continuous):
+        raise CertificateError(
+            f"{model.plant.name}: its A and B are in discrete time and have no motion between two samples, so that the "
+            "state in which a command begins to act cannot be predicted. Certified sets need equations, A and B in "
+            "continuous time, or such as come from them: no eigenvalue of A negative or zero"
+        )
+    return within
+
+
+class OfNumbers:
+    """The linear motion."""
+
     def __init__(self, model: Model):
-        plant = model.require_equations("the prediction over the delay")
-        norm = float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period
+        self._model = model
+
+    def after(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray | None:
+        found = self._model.ahead(x, u, seconds)
+        return found if np.isfinite(found).all() else None
+
+
+class OfEquations:
+    """dx/dt = f(x, u), integrated."""
+
+    def __init__(self, model: Model, plant: Plant):
+        norm = float(np.abs(np.linalg.eigvals(plant.linearised()[1])).max()) * model.period
         steps = min(max(1, math.ceil(norm / STEP_NORM)), MOST_STEPS)
         x, u, seconds = ca.MX.sym("x", model.d), ca.MX.sym("u", model.m), ca.MX.sym("seconds")
         # The classical method of order 4: CasADi's own, where DOP853 would cost the start half a second for scipy.
@@ -37,10 +103,6 @@ class Motion:
         )
 
     def after(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray | None:
-        """The state, (d,), `seconds` after x, (d,), under the input u, (m,).
-
-        None where the equations give none: the motion leaves their domain, or is not finite.
-        """
         function = self._after
         function.inputs["x"][:, 0], function.inputs["u"][:, 0] = x, u
         function.inputs["seconds"][0, 0] = seconds

@@ -189,8 +189,7 @@ def _written_out(config: Config, fail: Fail, origins: Mapping[str, str], folder:
 def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
     """With None for the infinite ends of `plant.bounds`: JSON has no infinity, and no other key may be one."""
     plant = tree.get("plant")
-    bounds = plant.get("bounds") if isinstance(plant, dict) else None
-    if not isinstance(bounds, dict):
+    if not isinstance(plant, dict) or not isinstance(bounds := plant.get("bounds"), dict):
         return tree
 
     def ends(pair: Any) -> Any:

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar
 
+import msgspec
 import numpy as np
 
-from node_runtime.config.reference import is_reference, load, loaded
+from node_runtime.config.reference import is_reference, load, sha256_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError, did_you_mean
 
@@ -24,6 +25,20 @@ class Described(Protocol):
     def states(self) -> Sequence[str]: ...
     @property
     def inputs(self) -> Sequence[str]: ...
+    @property
+    def x_e(self) -> np.ndarray: ...
+    @property
+    def u_e(self) -> np.ndarray: ...
+    @property
+    def x_min(self) -> np.ndarray: ...
+    @property
+    def x_max(self) -> np.ndarray: ...
+    @property
+    def u_min(self) -> np.ndarray: ...
+    @property
+    def u_max(self) -> np.ndarray: ...
+    @property
+    def W(self) -> np.ndarray: ...
     @property
     def x0(self) -> np.ndarray: ...
 
@@ -52,7 +67,7 @@ Find = Callable[[Any, Callable[[P], P]], P]
 `LookupError` with a text for a plant that is unknown or cannot be used."""
 
 
-def plant_of(config: Config, find: Find[P], plant: P | None = None) -> P:
+def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P:
     """The plant that `config` names, as its model knows it, with every length and name in `config` checked against it.
 
     Args:
@@ -72,11 +87,12 @@ def plant_of(config: Config, find: Find[P], plant: P | None = None) -> P:
         found = find(which, lambda plant: _as_configured(config, plant))
     except LookupError as error:
         raise ConfigError(f"plant.model = {named!r}: {error.args[0]}") from error
-    _with_parameters(config, found)
+    if plant is None:
+        _with_parameters(config, found)
     return found
 
 
-def true_plant_of(config: Config, find: Find[P], plant: P | None = None) -> P | Motion:
+def true_plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P | Motion:
     """The plant as it really moves: `plant_of` with the parameters of `plant.truth`, or what that names.
 
     Raises:
@@ -112,13 +128,39 @@ def load_plant(reference: str) -> Any:
 
 
 def files_of(config: Config) -> dict[str, str]:
-    """The sha256 of the files that the plant of `config` comes from, by key. Raises `ConfigError`."""
-    named = {"plant.model": (config.plant.model, _is_plant), "plant.truth": (config.plant.truth, _moves)}
-    return {
-        key: loaded(text, fits, "plant").sha256
-        for key, (text, fits) in named.items()
-        if isinstance(text, str) and is_reference(text)
+    """The sha256 of the files that the plant of `config` comes from, as far as they are here, by key."""
+    named = {"plant.model": config.plant.model, "plant.truth": config.plant.truth}
+    references = {key: text for key, text in named.items() if isinstance(text, str) and is_reference(text)}
+    return {key: found for key, text in references.items() if (found := sha256_of(text)) is not None}
+
+
+def spelt_out(config: Config, plant: Described) -> Config:
+    """With all that is `plant`'s own written into the configuration: the same run, whatever becomes of its file."""
+    bounds = {
+        name: [low if np.isfinite(low) else None, high if np.isfinite(high) else None]
+        for names, lows, highs in (
+            (plant.states, plant.x_min, plant.x_max),
+            (plant.inputs, plant.u_min, plant.u_max),
+        )
+        for name, low, high in zip(names, lows.tolist(), highs.tolist(), strict=True)
     }
+    settings = config.controller
+    return msgspec.structs.replace(
+        config,
+        plant=msgspec.structs.replace(
+            config.plant,
+            x0=initial_state(config, plant).tolist(),
+            x_e=plant.x_e.tolist(),
+            u_e=plant.u_e.tolist(),
+            bounds=bounds,
+        ),
+        controller=msgspec.structs.replace(
+            settings,
+            W=plant.W.tolist() if settings.W is None else settings.W,
+            Q=[1.0] * len(plant.states) if settings.Q is None else settings.Q,
+            R=[1.0] * len(plant.inputs) if settings.R is None else settings.R,
+        ),
+    )
 
 
 def initial_state(config: Config, plant: Described) -> np.ndarray:

@@ -74,6 +74,20 @@ def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str 
     return Loaded(value, getattr(module, "__file__", None) or "", sha256)
 
 
+def sha256_of(reference: str) -> str | None:
+    """Of the file's bytes; nothing of it runs. None: not there, or of a package that this process has not loaded."""
+    place, _name = _parts(reference)
+    file = (
+        os.path.expanduser(place)
+        if place.endswith(".py")
+        else getattr(sys.modules.get(place), "__file__", None)
+    )
+    try:
+        return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return None
+
+
 def is_reference(text: str) -> bool:
     """Whether `text` names code outside the package; the names of what comes with Tandem have none of these signs."""
     return any(sign in text for sign in ":/.")

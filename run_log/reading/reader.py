@@ -12,7 +12,8 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from run_log.errors import LogError
-from run_log.file_format import CONFIG, CONTINUED, IDENTITY, RAW, RECOVERED, check_header
+from run_log.file_format import CONFIG, CONTINUED, IDENTITY, PLANT, RAW, RECOVERED, check_header
+from run_log.plant_record import PlantRecordError, decode
 from run_log.reading.mcap_scan import Scan
 from run_log.run import Entry, Run
 
@@ -24,7 +25,7 @@ def read_run(path: str | Path) -> Run:
     log but is no valid message is counted in `bad`.
 
     Raises:
-        LogError: unreadable, not MCAP, MCAP of something else, damaged or edited, no usable configuration.
+        LogError: unreadable, not MCAP, MCAP of something else, damaged or edited, no usable configuration or plant.
     """
     path = Path(path)
     scan = Scan(path)
@@ -57,6 +58,11 @@ def read_run(path: str | Path) -> Run:
     elif run.continued is not None:
         run.note = f"{path} is part {run.part} of its log, which goes on in {run.continued}."
     run.config = _config(path, run)
+    if PLANT in run.attachments:
+        try:
+            run.plant, run.files = decode(run.attachments[PLANT])
+        except PlantRecordError as error:
+            raise LogError(f"{path}: {PLANT}: {error}") from error
     return run
 
 

@@ -14,11 +14,12 @@ from node_runtime.config.architecture import OwnArchitecture, register_architect
 from node_runtime.config.loading import override
 from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
+from node_runtime.config.strict import ConfigError, apply_override
 from node_runtime.provenance import versions
 from node_runtime.realtime.scheduling import one_blas_thread
 from protocol import codec, topics
 from run_log.errors import LogError
+from run_log.named_plant import given_plant
 from run_log.replaying.comparison import Comparison, Difference
 from run_log.replaying.recorded import RecordedController, recorded_controllers
 from run_log.replaying.segments import replayable
@@ -133,12 +134,19 @@ def _core(
     config = override(recorded.config, list(overrides)) if overrides else recorded.config
     _know_architecture(run, recorded, config, own)
     sets = _sets_for(run, recorded, config)
+    changed = {apply_override({}, text) for text in overrides}
+    hint = ""
     try:
-        return ControllerCore(config, recorded.run_id, sets)
+        given = given_plant(run, config, changed)
+        if given.equations is None and is_reference(config.plant.model):
+            hint = "; --plant FILE:NAME gives the replay the equations of its plant"
+        elif isinstance(config.plant.truth, str) and given.truth is None:
+            hint = "; --set plant.truth=FILE:NAME gives the replay its true plant"
+        return ControllerCore(config, recorded.run_id, sets, given)
     except ConfigError as error:
         if overrides:
-            raise
-        raise LogError(f"{run.path}: its configuration admits no controller: {error}") from error
+            raise ConfigError(f"{error}{hint}") from error
+        raise LogError(f"{run.path}: its configuration admits no controller: {error}{hint}") from error
 
 
 def _know_architecture(

@@ -17,14 +17,15 @@ AT_ONCE = 4096
 """Periods in memory together."""
 
 
-def excess(motion: Trajectory, truth: Description) -> float | None:
+def excess(motion: Trajectory, plant: Description, truth: object) -> float | None:
     """Largest distance from X, as a share of the state's half-width; 0 where X is kept, samples included.
 
     From every sample the equations are integrated under what was applied, which takes about 0.15 ms for each.
 
     Args:
         motion: the samples, and what acted between them.
-        truth: the plant whose motion this is; it may differ from the one that the controller models.
+        plant: its bounds are X.
+        truth: the plant whose motion this is; it may differ from `plant`. None, or no equations: it is not known.
 
     Returns:
         None where that is not known: the equations do not lead from a sample to the next (a real plant, one that
@@ -33,7 +34,7 @@ def excess(motion: Trajectory, truth: Description) -> float | None:
     known = [k for k in range(1, len(motion.pieces)) if motion.pieces[k]]
     if not known or not isinstance(truth, Plant):
         return None
-    found, steps = _beyond(motion.x, truth), _dop853(truth)
+    found, steps = _beyond(motion.x, plant), _dop853(truth)
     for first in range(0, len(known), AT_ONCE):
         ends = known[first : first + AT_ONCE]
         start, end = motion.x[[k - 1 for k in ends]], motion.x[ends]
@@ -47,7 +48,7 @@ def excess(motion: Trajectory, truth: Description) -> float | None:
                 passed[:, i] = _exact_steps(exact, start[i], pieces[i], len(passed))
                 if not _arrived(passed[:, [i]], end[[i]], truth).all():
                     return None
-        found = max(found, _beyond(passed, truth))
+        found = max(found, _beyond(passed, plant))
     return found if found > SAME else 0.0
 
 

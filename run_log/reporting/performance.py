@@ -48,14 +48,14 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     where the equations of the truth do not lead from sample to sample."""
 
 
-def performance(motion: Trajectory, plant: Description, config: Config, truth: Description) -> Performance:
+def performance(motion: Trajectory, plant: Description, config: Config, truth: object) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
     Args:
         motion: the samples.
         plant: its equilibrium, bounds and half-widths.
         config: the weights and the rate.
-        truth: the plant whose motion this is, where its equations differ from `plant`'s.
+        truth: the plant whose motion this is, as of `excess`.
     """
     names = [plant.states[i] for i in plant.performance]
     own = list(plant.performance)
@@ -83,7 +83,7 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: D
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
-        excess_between_samples=excess(motion, truth),
+        excess_between_samples=excess(motion, plant, truth),
     )
 
 

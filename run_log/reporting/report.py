@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from run_log.reading.reader import read_run
 from run_log.reporting.canvas import PictureError, drawing, save
 from run_log.reporting.traces import traces
-from run_log.run import Run
+from run_log.run import Run, plant_of
 
 
 class Report(NamedTuple):
@@ -18,14 +17,13 @@ class Report(NamedTuple):
     failed: list[PictureError]
 
 
-def report(path: str | Path, out_dir: str | Path) -> Report:
-    """Draw the log at `path` into `out_dir`: NAME.png is the whole run, NAME-states.png etc. its parts.
+def report(run: Run, out_dir: str | Path) -> Report:
+    """Draw the log NAME.mcap into `out_dir`: NAME.png is the whole run, NAME-states.png etc. its parts.
 
     Raises:
-        LogError: the log cannot be read or holds nothing to draw.
+        LogError: the log holds nothing to draw.
     """
-    path, out_dir = Path(path), Path(out_dir)
-    run = read_run(path)
+    path, out_dir = run.path, Path(out_dir)
     data = traces(run)
     made = Report([], [])
     try:
@@ -63,6 +61,6 @@ def title(run: Run) -> str:
     config = run.config
     cut = ", log cut short" if run.truncated or run.recovered else ""
     return (
-        f"{config.name}: {config.plant.model}, oracle {config.controller.oracle}, "
+        f"{config.name}: {plant_of(run).name}, oracle {config.controller.oracle}, "
         f"{config.rate:g} Hz, seed {config.seed}{cut}"
     )

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
 
-from lbmpc.plants import Description
+from lbmpc.plants import Known, Plant
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from run_log.errors import LogError, LogExistsError
@@ -52,6 +52,7 @@ class PartedLog:
     Args:
         config: the resolved configuration; `log.path` is the first part's.
         plant: the plant that `config` names.
+        files: as of `LogWriter`.
         now: seconds on the monotonic clock.
         start_ns: Unix time of the beginning.
 
@@ -59,11 +60,19 @@ class PartedLog:
         LogExistsError: something is at `log.path` already.
     """
 
-    def __init__(self, config: Config, plant: Description, *, now: float, start_ns: int):
-        self._config, self._plant = config, plant
+    def __init__(
+        self,
+        config: Config,
+        plant: Known | Plant,
+        files: Mapping[str, str] | None = None,
+        *,
+        now: float,
+        start_ns: int,
+    ):
+        self._config, self._plant, self._files = config, plant, files
         self._first = Path(config.log.path)
         self._numbers = count(2)
-        self._writer = LogWriter(self._first, config, plant, start_ns=start_ns, patient=True)
+        self._writer = LogWriter(self._first, config, plant, files, start_ns=start_ns, patient=True)
         self._old: LogWriter | None = None
         """Written beside `_writer` while both overlap."""
         self._paths = [self._first]
@@ -161,7 +170,10 @@ class PartedLog:
             path = part_path(self._first, number)
             try:
                 writer = LogWriter(
-                    path, self._config, self._plant, start_ns=unix_ns, patient=True, part=number
+                    *(path, self._config, self._plant, self._files),
+                    start_ns=unix_ns,
+                    patient=True,
+                    part=number,
                 )
             except LogExistsError as error:
                 log.warning("%s", error)

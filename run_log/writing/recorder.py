@@ -8,7 +8,7 @@ import time
 
 from lbmpc.plants import get_plant
 from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
-from node_runtime.config.plant import plant_of
+from node_runtime.config.plant import files_of, plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
@@ -45,7 +45,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
     ):
         try:
             plant = plant_of(config, get_plant)
-            writer = PartedLog(config, plant, now=clock.now(), start_ns=time.time_ns())
+            writer = PartedLog(config, plant, files_of(config), now=clock.now(), start_ns=time.time_ns())
         except (LogError, ConfigError) as error:
             log.error("%s", error)
             return EXIT_CANNOT

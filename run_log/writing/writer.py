@@ -3,18 +3,20 @@
 - `raw/<topic>`: the exact bytes that travelled (msgpack), for replay. No schema in the channel: the
   attachment schemas.json has them all, and a generic msgpack reader needs none.
 - `view/<topic>`: the same message as plottable JSON with a JSON schema (`run_log.writing.views`).
-- attachments: config.json, config.toml, versions.json, seeds.json, units.json, schemas.json.
+- attachments: config.json, config.toml, plant.json (what is known of the plant, as numbers), versions.json, seeds.json,
+  units.json, schemas.json.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
-from lbmpc.plants import Description
+from lbmpc.plants import Known, Plant
 from node_runtime import provenance
 from node_runtime.bus.inbox import Follower
 from node_runtime.config.loading import to_json, to_toml
@@ -24,7 +26,8 @@ from protocol import codec, topics
 from protocol.codec import Head
 from protocol.messages import Message
 from run_log.errors import LogError
-from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PROFILE, RAW, VIEW
+from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PLANT, PROFILE, RAW, VIEW
+from run_log.plant_record import encode
 from run_log.writing.durable_file import Sink, mcap_writer
 from run_log.writing.views import View, views
 
@@ -42,6 +45,7 @@ class LogWriter:
         path: a file that does not exist yet.
         config: the resolved configuration.
         plant: the plant that `config` names; its names and units label the views.
+        files: the sha256 of the files that it comes from, by key of the configuration.
         start_ns: time of the attachments, in the same clock as the messages.
         versions: what ran; None: the packages installed here.
         patient: see `Sink`.
@@ -56,7 +60,8 @@ class LogWriter:
         self,
         path: str | Path,
         config: Config,
-        plant: Description,
+        plant: Known | Plant,
+        files: Mapping[str, str] | None = None,
         *,
         start_ns: int = 0,
         versions: dict[str, str] | None = None,
@@ -83,9 +88,8 @@ class LogWriter:
         self._mcap.start(profile=PROFILE, library=LIBRARY)
         identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, identity)
-        for name, kind, text in _attachments(
-            config, plant, versions if versions is not None else provenance.versions()
-        ):
+        versions = versions if versions is not None else provenance.versions()
+        for name, kind, text in _attachments(config, plant, files or {}, versions):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
 
@@ -196,13 +200,16 @@ class LogWriter:
         self.last_bad = str(error)
 
 
-def _attachments(config: Config, plant: Description, versions: dict[str, str]) -> list[tuple[str, str, str]]:
+def _attachments(
+    config: Config, plant: Known | Plant, files: Mapping[str, str], versions: dict[str, str]
+) -> list[tuple[str, str, str]]:
     _, schemas = msgspec.json.schema_components([topic.type for topic in topics.ALL])
     channels = {RAW + topic.name: topic.type.__name__ for topic in topics.ALL}
     as_json = "application/json"
     return [
         (CONFIG, as_json, msgspec.json.format(to_json(config))),
         ("config.toml", "application/toml", to_toml(config)),
+        (PLANT, as_json, encode(plant, files)),
         ("versions.json", as_json, json.dumps(versions, indent=2)),
         ("seeds.json", as_json, json.dumps({"seed": config.seed})),
         ("units.json", as_json, json.dumps(plant.units, indent=2)),

@@ -13,11 +13,13 @@ from tandem.commands.base import Configured
 
 @dataclass(frozen=True, kw_only=True)
 class ConfigShow(Configured):
-    """Print the whole configuration as it is resolved: file, then --set, then defaults."""
+    """Print the whole configuration as it is resolved: file, then --set, then the plant's own values and defaults."""
 
     def run(self) -> int:
-        config, _ = self.resolve_with_plant()
         from node_runtime.config.loading import to_toml, to_tree
+        from node_runtime.config.plant import spelt_out
+
+        config = spelt_out(*self.resolve_with_plant())
 
         if self.json:
             terminal.emit(to_tree(config))

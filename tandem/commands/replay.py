@@ -28,16 +28,23 @@ class Replay(Command):
     """The file of the log's network, where its architecture is one of your own. A log's own word is never enough to
     load code."""
 
+    plant: Annotated[
+        str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
+    ] = None
+    """The plant file that the log was made with, where a replay needs equations: oracle perfect, certified sets."""
+
     def run(self) -> int:
         """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
         import msgspec
 
         from node_runtime.config.architecture import load_architecture
+        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.replaying.replay import ROUNDING, replay
 
         own = None if self.architecture is None else load_architecture(self.architecture)
         ran = read_run(self.file)
+        notes = [] if self.plant is None else name_plant(ran, self.plant)
         with terminal.progress_bar(self.console) as bar:
             task = bar.add_task("replaying", total=None)
             found = replay(
@@ -74,6 +81,7 @@ class Replay(Command):
             self.say(f"first at tick {first.tick}: {first.field} {values}")
         if not (found.equal or found.rounding) and found.largest_difference is not None:
             self.say(f"largest difference of an input: {found.largest_difference:.3g}")
+        found = msgspec.structs.replace(found, notes=[*notes, *found.notes])
         self.say(*(f"note: {note}" for note in found.notes), style="yellow")
         self.emit(msgspec.to_builtins(found))
         return 0 if found.equal and not found.lost_ticks else 1

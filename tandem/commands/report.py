@@ -23,24 +23,35 @@ class Report(Command):
     output: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the log's)")] = None
     """Where the pictures go."""
 
+    plant: Annotated[
+        str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
+    ] = None
+    """The plant file whose equations moved in that run: without it, nothing is said of the motion between samples."""
+
     def run(self) -> int:
         """0, or 1 when a picture cannot be drawn or written."""
         import msgspec
 
+        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.reporting.report import report
         from run_log.reporting.summary import summarise
+        from run_log.run import true_plant_of
         from tandem import summary_table
 
         require("matplotlib")
         ran = read_run(self.file)
+        notes = [] if self.plant is None else name_plant(ran, self.plant)
         summary = summarise(ran)
         self.console.print(summary_table.table(summary))
         with self.console.status("drawing"):
-            drawn, failed = report(self.file, self.output or self.file.parent)
+            drawn, failed = report(ran, self.output or self.file.parent)
         self.say(*(f"picture {picture}" for picture in drawn))
-        if ran.note:
-            self.say(ran.note, style="yellow")
+        if true_plant_of(ran) is None:
+            notes.append(
+                "nothing is said of the motion between samples: the log has no equations; --plant FILE:NAME names them"
+            )
+        self.say(*filter(None, (ran.note, *(f"note: {note}" for note in notes))), style="yellow")
         for error in failed:
             terminal.complain(str(error), as_json=False)
         result = {**msgspec.to_builtins(summary), "pictures": [str(picture) for picture in drawn]}

@@ -94,7 +94,7 @@ class Run(Configured):
                 terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", self.json)
                 return INTERRUPTED
             try:
-                return self._conclude(files, trouble, logged, monitor.first_command is not None)
+                return self._conclude(resolved, files, trouble, logged, monitor.first_command is not None)
             except Impatient:
                 text = f"interrupted; `tandem report {files.log}` gives figures and pictures"
                 terminal.complain(text, self.json)
@@ -123,9 +123,17 @@ class Run(Configured):
             trouble = supervisor.run()
             return trouble, not supervisor.recorder_died
 
-    def _conclude(self, files: RunFiles, trouble: str | None, logged: bool, began: bool) -> int:
-        """Figures and picture from the log alone. Raises `Impatient` when the figures are not waited for."""
+    def _conclude(
+        self, config: Config, files: RunFiles, trouble: str | None, logged: bool, began: bool
+    ) -> int:
+        """Figures and picture from the log, with the equations that `config` names.
+
+        Raises:
+            Impatient: the figures are not waited for.
+        """
+        from node_runtime.config.reference import is_reference
         from run_log.errors import LogError
+        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.reporting import report
         from run_log.reporting.canvas import PictureError
@@ -146,6 +154,8 @@ class Run(Configured):
             with self.console.status("reading the log"):
                 parts = existing_parts(files.log)
                 ran = read_run(parts[0] if parts else files.log)
+                if is_reference(config.plant.model):
+                    name_plant(ran, config.plant.model)
                 summary = summarise(ran)
             result = summary_table.of(summary)
             self.console.print(summary_table.table(summary))

@@ -8,8 +8,9 @@ import warnings
 import numpy as np
 import pytest
 
-from lbmpc.model import Model, ModelError, build_model, discretise
+from lbmpc.model import Model, ModelError, build_model
 from lbmpc.plants import Truth
+from lbmpc.plants.linear_motion import discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER as PLANT
 from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.science import compressor
@@ -34,7 +35,7 @@ def test_a_part_of_a_period_is_discretised_exactly(period: float) -> None:
     model = compressor(period)
     directions = np.eye(model.d + model.m)
     for share in (0.0, 1e-6, 0.1, 0.37, 1.0, 1.9, 2.0, 3.5):
-        exact = np.hstack(discretise(model.a, model.b, share * period))
+        exact = np.hstack(discretise(model.plant.A, model.plant.B, share * period))
         quick = [model.ahead(way[: model.d], way[model.d :], share * period) for way in directions]
         np.testing.assert_allclose(
             np.transpose(quick), exact, rtol=0, atol=1e-13 * max(1.0, np.abs(exact).max())
@@ -156,8 +157,8 @@ def test_weights_of_the_wrong_length_are_refused() -> None:
 
 def test_the_answer_to_one_piece_is_B_u_and_pieces_compose() -> None:
     model, u = compressor(), np.array([0.3])
-    np.testing.assert_allclose(model.answer(((0.05, u),)), model.B @ u, atol=1e-15)
-    np.testing.assert_allclose(model.answer(((0.02, u), (0.03, u))), model.B @ u, atol=1e-14)
+    np.testing.assert_allclose(model.within.answer(((0.05, u),)), model.B @ u, atol=1e-15)
+    np.testing.assert_allclose(model.within.answer(((0.02, u), (0.03, u))), model.B @ u, atol=1e-14)
 
 
 def test_a_label_with_pieces_is_free_of_the_commands_timing() -> None:

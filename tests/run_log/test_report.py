@@ -168,7 +168,7 @@ def test_a_second_without_a_tick_has_no_prediction_error(
 
 
 def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
-    files, failed = report(whole, tmp_path / "new" / "folder")
+    files, failed = report(read_run(whole), tmp_path / "new" / "folder")
     assert failed == []
     parts = ["", "-states", "-input", "-error", "-model_error", "-timing", "-weights"]
     assert [file.name for file in files] == [f"run{part}.png" for part in parts]
@@ -246,7 +246,7 @@ def test_a_picture_replaces_files_alone(whole: Path, tmp_path: Path, make: Calla
     (tmp_path / "elsewhere").write_text("somebody else's")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
-    (why,) = report(whole, tmp_path).failed
+    (why,) = report(read_run(whole), tmp_path).failed
     assert re.search(r"run\.png: cannot be written: it is a (pipe|link|folder)", str(why))
     assert (tmp_path / "run.png").lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_text() == "somebody else's"

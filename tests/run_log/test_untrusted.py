@@ -105,7 +105,7 @@ def test_a_number_far_away_takes_no_memory_for_all_between(tmp_path: Path) -> No
     run = read_run(far_log(tmp_path / "far.mcap"))
     assert (run.controllers[0], 59, FAR - 59) in lost_ticks(run)
     assert summarise(run).lost_ticks >= FAR - 59
-    assert report(run.path, tmp_path)
+    assert report(run, tmp_path)
 
 
 def configured(path: Path, **changes: dict[str, object]) -> Path:

@@ -82,7 +82,9 @@ def one_period(model: Model) -> ca.Function:
     plant = model.require_equations("a way into the sets")
     f = plant.function()
     x, u = ca.SX.sym("x", model.d), ca.SX.sym("u", model.m)
-    steps = max(1, math.ceil(float(np.abs(np.linalg.eigvals(model.a)).max()) * model.period / STEP_NORM))
+    steps = max(
+        1, math.ceil(float(np.abs(np.linalg.eigvals(plant.linearised()[1])).max()) * model.period / STEP_NORM)
+    )
     after = x + plant.x_e
     for _ in range(steps):
         after = dop853(f, after, u + plant.u_e, model.period / steps).after

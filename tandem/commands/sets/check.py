@@ -73,6 +73,11 @@ class SetsCheck(Configured):
             result |= {"invariance_margin": verdict.margin, "vertices": verdict.vertices}
             if not verdict.ok:
                 return f"the claim does not hold: {verdict.reason}"
+            if model.equations is None:
+                result["W"] = (
+                    "not looked at: the plant is numbers alone, without equations to hold it against"
+                )
+                return ""
             found = sample(certificate, model, self.samples)
             result |= {"samples": found.samples, "largest_excess_over_W": found.excess}
             if found.excess > HAIR:

@@ -207,6 +207,8 @@ def _meaning(sets: CertifiedSets, model: Model) -> str:
     if not given:
         return text + "whatever the true h does within its proved bound."
     text += "as long as h stays in the W that was given."
+    if model.equations is None:
+        return text + " There are no equations to hold it against."
     found = sample(certificate, model, WARNING_SAMPLES)
     if found.excess > HAIR:
         text += f"\nWarning: the plant's own equations leave that W: {found.where}."

@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from tandem import terminal
-from tandem.commands.base import NO_SETS, Command, require
+from tandem.commands.base import NO_SETS, Configured, require
 from tandem.terminal import Refused
 
 if TYPE_CHECKING:
     from controller_node.certified_sets import CertifiedSets
+    from lbmpc.plants import Known, Plant
 
 
 @dataclass(frozen=True, kw_only=True)
-class SetsPlot(Command):
-    """Draw sets: projections and slices with X, W, the tube, x0, and a run if there is one."""
+class SetsPlot(Configured):
+    """Draw sets: projections and slices with X, W, the tube, x0, and a run if there is one.
+
+    The plant is the run's, or the configuration's; without both the one that the file names, of those that come with
+    Tandem.
+    """
 
     EXTRAS = "log"
 
@@ -35,19 +40,24 @@ class SetsPlot(Command):
 
         from controller_node.certified_sets import read_sets
         from lbmpc.model import ModelError, build_model
-        from lbmpc.plants import get_plant
         from lbmpc.sets.certificate import CertificateError, require_match
         from run_log.reading.reader import read_run
         from run_log.reporting.canvas import drawing, save
         from run_log.reporting.motion import trajectory
-        from run_log.run import plant_of
+        from run_log.run import plant_of as plant_of_run
 
         require("matplotlib")
         file, log = self.file, self.log
         out = file.with_suffix("").with_suffix(".png") if self.out is None else self.out
         try:
             sets = read_sets(file)
-            plant = get_plant(sets.certificate.model.plant)
+            ran = None if log is None else read_run(log)
+            plant = self._plant(sets.certificate.model.plant) if ran is None else plant_of_run(ran)
+            if plant.name != sets.certificate.model.plant:
+                whose = self.config or "this configuration" if log is None else log
+                raise Refused(
+                    f"{whose}: is about {plant.name}, and the sets are of {sets.certificate.model.plant}"
+                )
             model = build_model(plant, sets.certificate.model.period)
             require_match(sets.certificate, model)
         except (CertificateError, ModelError) as error:
@@ -56,10 +66,7 @@ class SetsPlot(Command):
         except LookupError as error:
             raise Refused(f"{file}: {error.args[0]}") from error
         states, x0 = None, plant.x0
-        if log is not None:
-            ran = read_run(log)
-            if plant_of(ran).name != plant.name:
-                raise Refused(f"{log}: is a run of {plant_of(ran).name}, and the sets are of {plant.name}")
+        if ran is not None:
             states = trajectory(ran, plant).x
             x0 = states[0]
         with drawing(out):
@@ -69,6 +76,15 @@ class SetsPlot(Command):
         self.say(f"picture {out}")
         self.emit({"picture": str(out), "sha256": sets.sha256})
         return 0
+
+    def _plant(self, name: str) -> Known | Plant:
+        """The configuration's where there is one. Raises `LookupError`."""
+        from lbmpc.plants import get_plant
+        from node_runtime.config.plant import plant_of
+
+        if self.config is None and not self.set:
+            return get_plant(name)
+        return plant_of(self.resolve()[0], get_plant)
 
 
 def _title(sets: CertifiedSets) -> str:

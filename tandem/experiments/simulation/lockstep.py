@@ -132,7 +132,7 @@ class LockStep:
         self.config, self.faults = config, faults
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER)
-        self.true = self.first = true_plant_of(config, get_plant)
+        self.true = self.first_true = true_plant_of(config, get_plant)
         self.plant = self._started_plant(PLANT)
         self.changes = self._changes()
         self.noise = self._noise()
@@ -195,7 +195,9 @@ class LockStep:
             log.append(self._where_it_is())
         if last >= 0 and self.taken % self.config.controller.keyframe_every:
             log.append(self._noted(topics.KEYFRAME, self.core.memory.keyframe(last), last))
-        return gather(self.config, log)
+        run = gather(self.config, log)
+        run.plant, run.truth, run.files = self.core.plant, self.first_true, files_of(self.config)
+        return run
 
     def start_again(self) -> None:
         """Another episode: the plant is at x0 again. Raises `PlantError` as `so_far` does."""
@@ -219,9 +221,9 @@ class LockStep:
         true = self.plant.sample(t)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
-            self.true = self.changes.pop(0)[1]
-            self.plant.change(true_motion(self.true))
-            truth = self.true.parameters
+            self.true = now = self.changes.pop(0)[1]
+            self.plant.change(true_motion(now))
+            truth = now.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = self._arriving(seq)

@@ -10,9 +10,9 @@ import pytest
 from lbmpc.controller.signals import Observation
 from lbmpc.controller.state import ControllerState
 from lbmpc.controller.step import Controller
-from lbmpc.model import discretise
 from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import HiddenSet, Verdict
+from lbmpc.plants.linear_motion import discretise
 from lbmpc.problem import build_problem
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
@@ -244,9 +244,11 @@ def test_the_problem_is_solved_from_where_the_command_will_act() -> None:
         acting = commanded
         state, result = CONTROLLER.step(state, seen_now)
         before, commanded = state.predicted, float(result.plan[0, 0])
-        x = MODEL.A @ x + (MODEL.answer(((delay, np.array([acting])), (0.05 - delay, np.array([commanded])))))
+        x = MODEL.A @ x + (
+            MODEL.within.answer(((delay, np.array([acting])), (0.05 - delay, np.array([commanded]))))
+        )
         # Where the next command will act, under this one until then.
-        phi, gamma = discretise(MODEL.a, MODEL.b, delay)
+        phi, gamma = discretise(MODEL.plant.A, MODEL.plant.B, delay)
         errors.append(np.abs(phi @ x + gamma @ [commanded] - before).max())
     assert abs(state.delay - delay) < 1e-6
     assert max(errors[40:]) < 1e-6

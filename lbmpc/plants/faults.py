@@ -1,0 +1,172 @@
+"""What is wrong with the description of a plant, in a person's words: names, numbers, bounds, poles, choices."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lbmpc.plants.description import INPUT_VECTORS, STATE_VECTORS, Description, PlantDefinitionError
+
+TIME = "t"
+"""The name of time in a plant's units."""
+W_IS = (
+    "W is missing: give the half-widths of what the model does not know, per second, one for each of {names}. "
+    "`tandem identify` finds them from a log; zeros claim that the model is exact"
+)
+
+
+def refuse(name: str, found: Sequence[str], where: str = "") -> None:
+    """Raise `unusable` if there are any faults."""
+    if found:
+        raise unusable(name, *found, where=where)
+
+
+def unusable(name: str, *found: str, where: str = "") -> PlantDefinitionError:
+    """What says that the plant of that name has these faults, at least one; `where` it is written."""
+    listed = f" {found[0]}" if len(found) == 1 else "".join(f"\n  - {fault}" for fault in found)
+    return PlantDefinitionError(f"the plant {name!r} cannot be used{where}:{listed}")
+
+
+def name_faults(plant: Description) -> tuple[str, ...]:
+    found = [] if isinstance(plant.name, str) and plant.name else [f"name is {plant.name!r}: give it a name"]
+    for field in ("states", "inputs"):
+        names: Any = getattr(plant, field)
+        if isinstance(names, str):
+            found.append(
+                f"{field} is the text {names!r}: write ({names!r},), with the comma, for a single name"
+            )
+        elif not isinstance(names, tuple) or not all(isinstance(name, str) and name for name in names):
+            found.append(f"{field} is {names!r}: give a tuple of names")
+        elif not names:
+            found.append(f"{field} is empty: the plant needs at least one")
+    if found:
+        return tuple(found)
+    for name, count in Counter((*plant.states, *plant.inputs)).items():
+        if count > 1:
+            found.append(f"{count} states or inputs are called {name!r}: give each its own name")
+        if name == TIME:
+            found.append(f"a state or input is called {name!r}, the name of time: call it something else")
+    return tuple(found)
+
+
+def number_faults(plant: Description) -> Iterator[str]:
+    """Shapes, and what must be finite."""
+    for fields, names in ((STATE_VECTORS, plant.states), (INPUT_VECTORS, plant.inputs)):
+        for field in fields:
+            yield from _vector(field, getattr(plant, field), names)
+    gain, shape = plant.safe_gain, (plant.m, plant.d)
+    if gain is not None and not (numeric(gain) and gain.shape == shape and np.isfinite(gain).all()):
+        yield f"safe_gain is {shown(gain)}: it needs finite numbers, a row for each input and a column for each state"
+
+
+def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:
+    if value is None:
+        yield (W_IS if field == "W" else field + " is missing: give numbers, one for each of {names}").format(
+            names=", ".join(names)
+        )
+    elif not numeric(value):
+        yield f"{field} is {value!r}: give numbers, one for each of {', '.join(names)}"
+    elif value.shape != (len(names),):
+        yield f"{field} is {shown(value)}: it needs {len(names)} entries, one for each of {', '.join(names)}"
+    else:
+        # A bound may be infinite.
+        unusable = np.isnan(value) if field.endswith(("_min", "_max")) else ~np.isfinite(value)
+        for i in np.flatnonzero(unusable).tolist():
+            yield f"{field} of {names[i]} is {value[i]:g}: give a finite number"
+
+
+def bound_faults(plant: Description) -> Iterator[str]:
+    known = (*plant.states, *plant.inputs)
+    scale: Any = plant.scale
+    if not isinstance(scale, Mapping):
+        yield f"scale is {scale!r}: give it by name, as in {{{known[0]!r}: 1.0}}"
+        return
+    for name, width in scale.items():
+        if name not in known:
+            yield f"scale has {name!r}, which is no state or input: choose from {', '.join(known)}"
+        elif not (isinstance(width, int | float) and 0.0 < width < np.inf):
+            yield f"scale of {name} is {width!r}: give the half-width that counts as 1, a positive number"
+    for axis, names, rest in (("x", plant.states, plant.x_e), ("u", plant.inputs, plant.u_e)):
+        low, high = (getattr(plant, f"{axis}_{end}").tolist() for end in ("min", "max"))
+        for i, name in enumerate(names):
+            between = f"{axis}_min of {name} is {low[i]:g} and {axis}_max is {high[i]:g}"
+            if not low[i] < high[i]:
+                yield f"{between}: the lower bound must be below the upper one"
+            elif not low[i] <= rest[i] <= high[i]:
+                yield f"{axis}_e of {name} is {rest[i]:g}, but {between}: the equilibrium must lie between its bounds"
+            elif name not in scale and not np.isfinite(high[i] - low[i]):
+                yield (
+                    f"{between}: give both bounds, or scale={{{name!r}: ...}}, the half-width that counts as 1 where "
+                    "there is no bound"
+                )
+    for i in np.flatnonzero(plant.W < 0.0).tolist():
+        yield f"W of {plant.states[i]} is {plant.W[i]:g}: a half-width is at least 0"
+    ordered = plant.u_min < plant.u_max
+    outside = (plant.safe_input < plant.u_min) | (plant.safe_input > plant.u_max)
+    for i in np.flatnonzero(ordered & outside).tolist():
+        yield (
+            f"safe_input of {plant.inputs[i]} is {plant.safe_input[i]:g}, outside u_min = {plant.u_min[i]:g} and "
+            f"u_max = {plant.u_max[i]:g}: the plant cannot apply it"
+        )
+
+
+def pole_faults(plant: Description) -> Iterator[str]:
+    if plant.poles is None:
+        return
+    try:
+        poles = np.asarray(plant.poles, dtype=complex)
+    except (TypeError, ValueError):
+        poles = np.zeros(0, dtype=complex)
+    if poles.shape != (plant.d,) or not np.isfinite(poles).all():
+        yield f"poles is {plant.poles!r}: it needs {plant.d} numbers, one for each state; None takes the LQR gain"
+    elif (poles.real >= 0.0).any():
+        yield f"poles is {plant.poles!r}: in continuous time a stable pole has a negative real part"
+    elif Counter(poles.tolist()) != Counter(poles.conj().tolist()):
+        yield f"poles is {plant.poles!r}: complex poles come in conjugate pairs"
+
+
+def choice_faults(plant: Description) -> Iterator[str]:
+    """What refers to states and inputs by index or by name."""
+    known = (*plant.states, *plant.inputs)
+    performance: Any = plant.performance
+    if not isinstance(performance, tuple) or not performance:
+        yield f"performance is {performance!r}: name at least one state by its index; {indices(plant)}"
+    else:
+        for k, index in enumerate(performance):
+            if not is_index(index, plant.d):
+                yield f"performance has {index!r}: {indices(plant)}"
+            elif index in performance[:k]:
+                yield f"performance has {index!r} twice: each state once"
+    kernel: Any = plant.kernel
+    if not isinstance(kernel, tuple) or not kernel:
+        yield f"kernel is {kernel!r}: give a tuple of at least one of {', '.join(known)}"
+    else:
+        for k, name in enumerate(kernel):
+            if name not in known:
+                yield f"kernel has {name!r}, which is no state or input: choose from {', '.join(known)}"
+            elif name in kernel[:k]:
+                yield f"kernel has {name!r} twice: each state or input once"
+    units: Any = plant.units if isinstance(plant.units, Mapping) else {}
+    without = [name for name in (*known, TIME) if not isinstance(units.get(name), str)]
+    if without:
+        yield f"units has none for {', '.join(without)}: give each one, '1' where it has no unit"
+
+
+def numeric(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == float
+
+
+def is_index(value: Any, length: int) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) < length
+
+
+def indices(plant: Description) -> str:
+    last = plant.d - 1
+    return f"a state's index is from 0 ({plant.states[0]}) to {last} ({plant.states[last]})"
+
+
+def shown(value: Any) -> str:
+    return str(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

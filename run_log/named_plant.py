@@ -1,0 +1,80 @@
+"""The plant file that whoever reads a log names beside it, for what numbers are not enough for."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from controller_node.build import GivenPlant
+from lbmpc.plants import Known, Plant, get_plant
+from node_runtime.config.plant import load_plant, plant_of, true_plant_of
+from node_runtime.config.reference import absolute, is_reference, sha256_of
+from node_runtime.config.sections import Config
+from run_log.run import Run, as_logged, equations_of, recorded_plant
+
+
+def name_plant(run: Run, reference: str) -> list[str]:
+    """Take it, and say where it is not what the log was made with.
+
+    Args:
+        run: a log; gets `named`.
+        reference: "tanks.py:TANKS", relative to the current folder, or the name of a plant that comes with Tandem.
+
+    Raises:
+        ConfigError: there is no such plant, or it does not fit the log's configuration.
+    """
+    whole = absolute(reference, Path.cwd())
+    named = load_plant(whole) if is_reference(whole) else get_plant(whole)
+    here = plant_of(run.config, get_plant, named)
+    run.named = named
+    notes = []
+    sha256, theirs = sha256_of(whole), sorted(run.files.values())
+    if theirs and sha256 is not None and sha256 not in theirs:
+        logged = " and ".join(text[:12] for text in theirs)
+        notes.append(
+            f"{reference} is not the file of the log: its sha256 is {sha256[:12]}, the log's {logged}"
+        )
+    if run.plant is not None and (other := _other(run.plant, here)):
+        notes.append(f"{reference} differs from the log in {', '.join(other)}; the log's numbers are used")
+    return notes
+
+
+def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
+    """What a replay controls: the log's numbers, and equations where somebody has named them or Tandem has them.
+
+    Args:
+        run: a log.
+        config: of one of its controllers, with the changes of whoever replays.
+        changed: the keys of these changes. They may name code; what the log names is never loaded.
+
+    Raises:
+        ConfigError: the plant does not fit the configuration.
+        LogError: the log does not say which plant it was, and nobody else does.
+    """
+    if changed & {"plant", "plant.model"}:
+        known = plant_of(config, get_plant)
+        equations = known if isinstance(known, Plant) else None
+    else:
+        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run))
+        equations = equations_of(run, config)
+    truth, of_the_log = config.plant.truth, not changed & {"plant", "plant.truth"}
+    if config.controller.oracle != "perfect" or equations is None:
+        return GivenPlant(known, equations)
+    if isinstance(truth, str) and is_reference(truth) and of_the_log:
+        return GivenPlant(known, equations)
+    return GivenPlant(known, equations, true_plant_of(config, get_plant, equations))
+
+
+def _other(logged: Known, plant: Known | Plant) -> list[str]:
+    """The fields in which they differ."""
+    here = plant if isinstance(plant, Known) else plant.known()
+
+    def same(name: str) -> bool:
+        one, other = getattr(logged, name), getattr(here, name)
+        if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+            return one is not None and other is not None and np.array_equal(one, other)
+        return bool(one == other)
+
+    return [one.name for one in fields(Known) if not same(one.name)]

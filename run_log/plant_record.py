@@ -1,0 +1,40 @@
+"""The attachment plant.json: what the controller knew of its plant, as numbers, and the hashes of the files named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from lbmpc.plants import Known, Plant, PlantDefinitionError
+
+LARGEST = 1_000_000
+"""Bytes; two hundred states."""
+
+
+class PlantRecordError(ValueError):
+    """An attachment that describes no plant; the text says why."""
+
+
+class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    known: dict[str, Any]
+    files: dict[str, str]
+
+
+def encode(plant: Known | Plant, files: Mapping[str, str]) -> str:
+    """plant: as it is controlled; files: the sha256 of what the configuration names, by key."""
+    known = plant if isinstance(plant, Known) else plant.known()
+    content = _Content(known.to_builtins(), dict(files))
+    return msgspec.json.format(msgspec.json.encode(content)).decode()
+
+
+def decode(data: bytes) -> tuple[Known, dict[str, str]]:
+    """What `encode` was given, bit for bit. Raises `PlantRecordError`: it is something else, or cannot be used."""
+    if len(data) > LARGEST:
+        raise PlantRecordError(f"{len(data)} bytes, and {LARGEST} is the most")
+    try:
+        content = msgspec.json.decode(data, type=_Content)
+        return Known.from_builtins(content.known), content.files
+    except (msgspec.DecodeError, PlantDefinitionError) as error:
+        raise PlantRecordError(str(error)) from error

@@ -1,0 +1,328 @@
+"""A plant of numbers alone: defaults, faults, its motion within a period, its rest, and what is written of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lbmpc.model import ModelError, build_model
+from lbmpc.plants import PLANTS, Known, PlantDefinitionError, Truth, get_plant, true_motion
+from lbmpc.plants.inspection import faults
+from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
+from lbmpc.plants.moore_greitzer import MOORE_GREITZER
+from tests.helpers.plants.integrator import INTEGRATOR
+from tests.helpers.plants.pendulum import PENDULUM
+from tests.helpers.plants.quadrotor import QUADROTOR
+from tests.helpers.plants.two_tanks import TWO_TANKS
+
+INF, NAN = float("inf"), float("nan")
+A, B = [[0.0, 1.0], [-2.0, -0.3]], [[0.0], [1.0]]
+BOX: dict[str, Any] = {
+    **{"W": [0.01, 0.1], "x_min": [-1.0, -2.0], "x_max": [1.0, 2.0]},
+    **{"u_min": [-3.0], "u_max": [3.0]},
+}
+
+
+def numbers(a: Any = A, b: Any = B, **changes: Any) -> Known:
+    return Known.from_matrices(a, b, **{**BOX, **changes})
+
+
+def sampled(a: Any = A, b: Any = B, period: float = 0.1, **changes: Any) -> Known:
+    """In discrete time."""
+    A_d, B_d = discretise(np.array(a), np.array(b), period)
+    return numbers(A_d, B_d, period=period, **changes)
+
+
+def test_what_has_a_default_need_not_be_said() -> None:
+    known = Known.from_matrices(A, B, W=[0.01, 0.1], scale={"x1": 1.0, "x2": 2.0, "u1": 3.0})
+    assert (known.states, known.inputs, known.performance) == (("x1", "x2"), ("u1",), (0, 1))
+    assert (known.x_e.tolist(), known.u_e.tolist(), known.x0.tolist()) == ([0.0, 0.0], [0.0], [0.0, 0.0])
+    assert known.units == {"x1": "1", "x2": "1", "u1": "1", "t": "s"}
+    assert faults(known) == ()
+    model = build_model(known, 0.1)
+    assert model.plant is known
+    assert model.equations is None
+
+
+def test_the_numbers_of_equations_make_the_same_model() -> None:
+    known = MOORE_GREITZER.known()
+    from_numbers, from_equations = build_model(known, 0.05), build_model(MOORE_GREITZER, 0.05)
+    for name in ("A", "B", "K", "P", "Q", "R"):
+        np.testing.assert_array_equal(getattr(from_numbers, name), getattr(from_equations, name))
+    x, u = np.array([0.1, -0.2, 0.3, 2.0]), np.array([0.4])
+    np.testing.assert_array_equal(from_numbers.ahead(x, u, 0.02), from_equations.ahead(x, u, 0.02))
+    assert from_equations.equations is MOORE_GREITZER
+    with pytest.raises(ModelError, match="the oracle perfect needs the equations of moore_greitzer"):
+        from_numbers.require_equations("the oracle perfect")
+
+
+# -- faults -----------------------------------------------------------------------------------
+
+FAULTY: dict[str, tuple[dict[str, Any], str]] = {
+    "A in words": ({"a": "fast"}, "A is 'fast': give a square matrix"),
+    "A of rows of different lengths": ({"a": [[0.0, 1.0], [2.0]]}, "A is .*: give a square matrix"),
+    "A that is not square": ({"a": [[0.0, 1.0]]}, "A is .*: give a square matrix"),
+    "B without columns": ({"b": [0.0, 1.0]}, r"B is \[0.0, 1.0\]: .* of a single input it is \[\[0.0\]"),
+    "B of another plant": (
+        {"b": [[0.0]]},
+        r"B has the shape \(1, 1\): it needs \(2, 1\), a row for each of x1, x2",
+    ),
+    "more names than states": (
+        {"states": ("a", "b", "c"), "x_min": None, "x_max": None, "W": [1, 1, 1]},
+        r"3 states are named \(a, b, c\), and A and B have 2 rows",
+    ),
+    "names in one word": ({"states": "ab"}, "states is the text 'ab'"),
+    "NaN in A": ({"a": [[0.0, 1.0], [NAN, 0.0]]}, "A is nan from x1 to x2: give a finite number"),
+    "infinity in B": ({"b": [[0.0], [INF]]}, "B is inf from u1 to x2"),
+    "a period of nothing": ({"period": 0.0}, "period is 0.0: give the seconds from x to"),
+    "a negative period": ({"period": -0.1}, "period is -0.1"),
+    "a period in words": ({"period": "fast"}, "period is 'fast'"),
+    "no W": ({"W": None}, "W is missing: give the half-widths .* x1, x2"),
+    "an infinite W": ({"W": [0.1, INF]}, "W of x2 is inf"),
+    "no bounds and no scale": (
+        {"x_max": [INF, 2.0]},
+        r"x_min of x1 is -1 and x_max is inf: give both bounds, or scale=\{'x1'",
+    ),
+    "a state that no input moves": (
+        {"a": [[0.0, 1.0], [0.0, 0.5]], "b": [[1.0], [0.0]]},
+        r"no input moves x2, which grows by exp\(0.5 t\) \(eigenvalue 0.5 of A\): A and B cannot be stabilised",
+    ),
+    "a constant that no input moves": (
+        {"a": [[-1.0, 1.0], [0.0, 0.0]], "b": [[1.0], [0.0]]},
+        "x2, which does not decay",
+    ),
+    "a pair that no input moves": (
+        {"a": [[0.1, 1.0], [-1.0, 0.1]], "b": [[0.0], [0.0]]},
+        r"no input moves the mode of x1, x2, which grows by exp\(0.1 t\) \(eigenvalue 0.1 \+ 1i",
+    ),
+    "a sampled state that no input moves": (
+        {"a": [[0.5, 1.0], [0.0, 1.1]], "b": [[1.0], [0.0]], "period": 0.1},
+        r"no input moves .*x2, which grows by exp\(0.953 t\) \(eigenvalue 1.1 of A\)",
+    ),
+    "an offset of the wrong length": (
+        {"offset": [1.0]},
+        r"offset is \[1.0\]: it needs 2 finite numbers, .* x1, x2",
+    ),
+    "an offset that nothing holds": (
+        {"a": [[-9.0, 0.0], [0.0, 0.0]], "b": [[1.0], [1.0]], "offset": [0.0, 4.0]},
+        "cannot be used at the nearest rest: u_e of u1 is -4, but u_min of u1 is -3",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAULTY)
+def test_a_fault_of_numbers_is_named(case: str) -> None:
+    given, message = FAULTY[case]
+    with pytest.raises(PlantDefinitionError, match=message) as caught:
+        numbers(**given)
+    text = str(caught.value)
+    assert text.startswith("the plant 'plant' cannot be used")
+    # One fault is one sentence.
+    assert "\n" not in text
+
+
+def test_faults_of_numbers_are_named_where_they_were_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = replace(numbers(), W=[-1.0, 0.1], A=np.eye(3))
+    monkeypatch.setitem(PLANTS, "plant", bad)
+    with pytest.raises(PlantDefinitionError, match=r"A has the shape \(3, 3\)"):
+        get_plant("plant")
+    with pytest.raises(ModelError, match=r"A has the shape \(3, 3\)"):
+        build_model(bad, 0.1)
+
+
+def test_a_mode_that_decays_needs_no_input() -> None:
+    assert faults(numbers([[0.5, 0.0], [0.0, -1.0]], [[1.0], [0.0]])) == ()
+
+
+# -- discrete time ----------------------------------------------------------------------------
+
+
+def test_a_model_in_discrete_time_is_used_at_its_own_rate_only() -> None:
+    known = sampled(period=0.02)
+    model = build_model(known, 1 / 50)
+    np.testing.assert_array_equal(model.A, known.A)
+    with pytest.raises(
+        ModelError, match=r"of a period of 0.02 s, and the rate makes one of 0.05 s: take rate = 50"
+    ):
+        build_model(known, 0.05)
+
+
+@pytest.mark.parametrize("shares", [(1.0,), (0.3,), (0.3, 0.7), (1.5,), (4.2,)])
+def test_a_sampled_model_moves_within_a_period_as_what_it_was_sampled_from(shares: tuple[float, ...]) -> None:
+    continuous, discrete = build_model(numbers(), 0.1), build_model(sampled(), 0.1)
+    assert isinstance(discrete.within, Continuous)
+    x, there = np.array([0.3, -0.5]), np.array([0.3, -0.5])
+    for k, share in enumerate(shares):
+        u = np.array([0.7 - k])
+        x, there = continuous.ahead(x, u, 0.1 * share), discrete.ahead(there, u, 0.1 * share)
+    np.testing.assert_allclose(there, x, atol=1e-12)
+
+
+def test_a_label_of_pieces_is_that_of_the_true_motion() -> None:
+    known = sampled()
+    model, truth = build_model(known, 0.1), true_motion(numbers())
+    x, pieces = np.array([0.3, -0.5]), ((0.03, np.array([1.0])), (0.07, np.array([-2.0])))
+    after = x
+    for seconds, u in pieces:
+        after = truth.step(after, u, seconds)
+    np.testing.assert_allclose(model.label(x, np.array([-1.1]), after, pieces), np.zeros(2), atol=1e-12)
+
+
+WITHOUT_MOTION = {
+    "a dead time": ([[0.9, 0.5], [0.0, 0.0]], [[0.0], [1.0]]),
+    "two of it": ([[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], [[0.0], [0.0], [1.0]]),
+    "a dead time that was identified": (
+        [[0.9, 0.5, 0.0], [0.0, 1e-9, 1.0], [0.0, 1e-9, 1e-9]],
+        [[0.0], [0.0], [1.0]],
+    ),
+    "a sign that alternates": ([[-0.4, 0.1], [0.0, 0.8]], [[1.0], [1.0]]),
+}
+
+
+@pytest.mark.parametrize("case", WITHOUT_MOTION)
+def test_where_nothing_is_known_between_two_states_a_straight_line_stands_for_it(case: str) -> None:
+    a, b = WITHOUT_MOTION[case]
+    d = len(a)
+    known = Known.from_matrices(
+        a, b, period=0.1, W=[0.1] * d, x_min=[-1.0] * d, x_max=[1.0] * d, u_min=[-1], u_max=[1]
+    )
+    model = build_model(known, 0.1)
+    assert isinstance(model.within, StraightLine)
+    x, u = np.linspace(0.5, -0.4, d), np.array([0.3])
+    after = model.step(x, u)
+    np.testing.assert_allclose(model.ahead(x, u, 0.0), x)
+    np.testing.assert_allclose(model.ahead(x, u, 0.04), 0.6 * x + 0.4 * after)
+    np.testing.assert_allclose(model.ahead(x, u, 0.1), after)
+    np.testing.assert_allclose(
+        model.ahead(x, u, 0.25), 0.5 * (model.step(after, u) + model.step(model.step(after, u), u))
+    )
+    # The label of a constant input is the same, however it is cut into pieces.
+    for pieces in ((), ((0.1, u),), ((0.03, u), (0.07, u))):
+        np.testing.assert_allclose(model.label(x, u, after, pieces), np.zeros(d), atol=1e-15)
+
+
+# -- numbers as the truth ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known", [numbers(), sampled()], ids=["continuous", "discrete"])
+def test_numbers_move_as_their_model_says(known: Known) -> None:
+    x_e, u_e = np.array([0.1, 0.2]), np.array([0.5])
+    model, truth = build_model(known, 0.1), true_motion(replace(known, x_e=x_e, u_e=u_e))
+    x, u = np.array([0.3, -0.5]), np.array([-0.7])
+    after = truth.step(x + x_e, u + u_e, 0.1) - x_e
+    np.testing.assert_allclose(after, model.step(x, u), atol=1e-13)
+    halfway = truth.step(truth.step(x + x_e, u + u_e, 0.06), u + u_e, 0.04) - x_e
+    np.testing.assert_allclose(halfway, after, atol=1e-12)
+
+
+# -- rest -------------------------------------------------------------------------------------
+
+
+def test_an_input_holds_an_offset_where_it_can() -> None:
+    known = numbers(offset=[0.0, 0.4])
+    assert (known.x_e.tolist(), known.u_e.tolist()) == ([0.0, 0.0], [-0.4])
+    # What follows from it by default, follows.
+    assert (known.x0.tolist(), known.safe_input.tolist()) == ([0.0, 0.0], [-0.4])
+    kept = numbers(offset=[0.0, 0.4], x0=[0.5, 0.0], safe_input=[0.0])
+    assert (kept.x0.tolist(), kept.safe_input.tolist()) == ([0.5, 0.0], [0.0])
+
+
+def test_the_state_gives_way_where_no_input_holds_an_offset() -> None:
+    known = numbers(offset=[0.3, 0.4], x_e=[0.1, 0.0], u_e=[1.0])
+    drift = np.array(A) @ (known.x_e - [0.1, 0.0]) + np.array(B) @ (known.u_e - 1.0) + [0.3, 0.4]
+    np.testing.assert_allclose(drift, np.zeros(2), atol=1e-14)
+    # A speed of -0.3 and no more.
+    np.testing.assert_allclose(known.x_e, [0.1, -0.3], atol=1e-14)
+
+
+def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
+    known = sampled(offset=[0.01, 0.02])
+    there = known.A @ -known.x_e + known.B @ -known.u_e + known.x_e + [0.01, 0.02]
+    # From the old origin, one step: x+ - x is the offset.
+    np.testing.assert_allclose(
+        there + known.A @ known.x_e + known.B @ known.u_e - known.x_e, [0.01, 0.02], atol=1e-14
+    )
+    np.testing.assert_allclose(
+        (known.A - np.eye(2)) @ known.x_e + known.B @ known.u_e, [-0.01, -0.02], atol=1e-14
+    )
+
+
+def test_numbers_rest_elsewhere_too() -> None:
+    moved = numbers().resting_near(x_e=[0.5, 0.0])
+    np.testing.assert_allclose(moved.x_e, [0.5, 0.0], atol=1e-14)
+    np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
+    again = moved.resting_near()
+    assert (again.x_e.tolist(), again.u_e.tolist()) == (moved.x_e.tolist(), moved.u_e.tolist())
+
+
+def test_equations_rest_where_a_known_wind_lets_them() -> None:
+    windy = QUADROTOR.varied(wind=2.0)
+    with pytest.raises(ModelError, match=r"dvy/dt is 0.823 .* The nearest rest is x_e = \[.*resting_near"):
+        build_model(windy, 0.02)
+    rest = windy.resting_near()
+    drift = np.array(rest.function()(rest.x_e, rest.u_e))
+    np.testing.assert_allclose(drift, np.zeros((6, 1)), atol=1e-9)
+    # It leans into the wind, and stands still where it should be.
+    np.testing.assert_allclose(rest.x_e[[0, 1, 3, 4, 5]], np.zeros(5), atol=1e-12)
+    assert rest.x_e[2] == pytest.approx(np.arctan(0.1 * 4 / (0.486 * 9.81)), abs=1e-9)
+    assert rest.u_e[0] == pytest.approx(rest.u_e[1])
+    assert rest.u_e[0] > QUADROTOR.u_e[0]
+    assert faults(rest) == ()
+    # The numbers are those there.
+    model = build_model(rest, 0.02)
+    np.testing.assert_array_equal(model.plant.A, rest.linearised()[1])
+    truth = Truth(rest)
+    np.testing.assert_allclose(truth.step(rest.x_e, rest.u_e, 0.02), rest.x_e, atol=1e-9)
+
+
+def test_another_level_is_held_by_another_inflow() -> None:
+    other = TWO_TANKS.resting_near(x_e=[9.0, 14.0])
+    np.testing.assert_allclose(np.array(other.function()(other.x_e, other.u_e)), np.zeros((2, 1)), atol=1e-9)
+    assert np.abs(other.x_e - [9.0, 14.0]).max() < 1.0
+    with pytest.raises(PlantDefinitionError, match="at the nearest rest: u_e of torque is"):
+        replace(PENDULUM, u_max=np.array([0.5])).resting_near(x_e=[-0.3, 0.0])
+
+
+# -- written ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "plant", [MOORE_GREITZER, INTEGRATOR, QUADROTOR, sampled(poles=(-1.0, -2.0))], ids=lambda p: p.name
+)
+def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
+    known = plant if isinstance(plant, Known) else plant.known()
+    again = Known.from_builtins(json.loads(json.dumps(known.to_builtins(), allow_nan=False)))
+    for one in fields(known):
+        ours, its = getattr(known, one.name), getattr(again, one.name)
+        if isinstance(ours, np.ndarray):
+            np.testing.assert_array_equal(its, ours, strict=True)
+        else:
+            assert its == ours
+            assert type(its) is type(ours)
+    for name in ("A", "B", "K", "P"):
+        period = known.period or 0.05
+        np.testing.assert_array_equal(
+            getattr(build_model(again, period), name), getattr(build_model(known, period), name)
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"A": "words"}, "Expected `array`, got `str` - at `\\$.A`"),
+        ({"shape": 1}, "unknown field `shape`"),
+        ({"x_min": ["infinite", 0.0]}, "\\$.x_min\\[0\\]"),
+        ({"names": 5}, "\\$.names"),
+        ({"B": [[1.0]]}, r"B has the shape \(1, 1\)"),
+        ({"performance": [7]}, "performance has 7"),
+    ],
+)
+def test_what_is_no_plant_is_not_read(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(PlantDefinitionError, match=message):
+        Known.from_builtins(numbers().to_builtins() | change)
+    with pytest.raises(PlantDefinitionError, match="missing required field"):
+        Known.from_builtins({})
