@@ -21,7 +21,7 @@ import numpy as np
 from controller_node.core import ControllerCore, Outputs
 from lbmpc.plants import Plant, PlantError, get_plant, true_motion
 from node_runtime.config.architecture import register_architecture
-from node_runtime.config.plant import initial_state, true_plant_of
+from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
