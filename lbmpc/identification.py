@@ -5,7 +5,10 @@
 Each row is fitted on its own, in half-widths per second. The samples are cut into blocks of time. What is said of the
 quality comes from fits without one block each: their residuals in that block are those of samples that the fit has not
 seen, and their scatter is the jackknife's standard error (Efron and Tibshirani, An Introduction to the Bootstrap,
-section 11), which needs no residuals that are white: what a linear model leaves of a plant is not.
+section 11). What a linear model leaves of a plant is no noise, though. It persists from sample to sample, comes back
+wherever the plant goes the same way, and is taken for an effect of whatever moved along with it: more samples do not
+mend that. So the part of a residual that persists, by its autocovariance at one sample, counts once and whole in every
+direction, beside how far the samples moved there.
 
 u may be fed back from x. Then A and B are separable only as far as u does more than a fixed linear feedback; where it
 does not, the samples are refused.
@@ -98,7 +101,10 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """x+ = A x + B u + offset + h with |h| <= W T, in deviations and the plant's units; `*_error`: standard errors."""
+    """x+ = A x + B u + offset + h with |h| <= W T, in deviations and the plant's units.
+
+    `*_error`: standard errors, with what the linear model leaves out and may have been taken for an effect.
+    """
 
     period: float
     A: np.ndarray
@@ -143,27 +149,36 @@ def identify(samples: Transitions, period: float, variables: Variables) -> Ident
     # About the middle of the samples: the offset there is known best, and shares no digits with the slopes.
     regressors = np.column_stack([z - middle, np.ones(len(z))])
     fit = _Blockwise(regressors, y)
-    residual = np.sqrt(((y - regressors @ fit.whole) ** 2).mean(axis=0)) * period
-    noise = np.sqrt((directions[:, :d] ** 2) @ residual**2)
+    residual = y - regressors @ fit.whole
+    noise = np.sqrt((directions[:, :d] ** 2) @ (period**2 * (residual**2).mean(axis=0)))
     _require_motion(variables, z, rms, directions, noise)
-    _require_known(variables, rms, directions, period * fit.error(lambda theta: directions @ theta[:-1]))
+    persistent = _persistent(residual)
+
+    def error(of: Callable[[np.ndarray], np.ndarray], moved: np.ndarray) -> np.ndarray:
+        """Of a function of the coefficients, (n, d); moved (n,): what a share of 1 in the samples is in it."""
+        return period * np.hypot(fit.error(of), np.outer(moved, persistent))
+
+    _require_known(variables, rms, directions, error(lambda theta: directions @ theta[:-1], 1.0 / rms))
 
     def at_origin(theta: np.ndarray) -> np.ndarray:
-        return theta[-1] - middle @ theta[:-1]
+        return theta[-1:] - middle @ theta[:-1]
 
-    slopes, errors = period * fit.whole[:-1].T, period * fit.error(lambda theta: theta[:-1]).T
     units = variables.x_scale[:, None] / scale
-    slopes, errors = slopes * units, errors * units
+    slopes = period * fit.whole[:-1].T * units
+    spread = np.sqrt((directions**2 / rms[:, None] ** 2).sum(axis=0))
+    errors = error(lambda theta: theta[:-1], spread).T * units
+    far = np.sqrt(1.0 + (((directions @ middle) / rms) ** 2).sum(keepdims=True))
+    offset_error = error(at_origin, far)[0] * variables.x_scale
     missed = fit.held_out * variables.x_scale * period
     found = Quality.of(missed, variables.x_scale, period)
     return Identified(
         period=period,
         A=np.eye(d) + slopes[:, :d],
         B=slopes[:, d:],
-        offset=period * variables.x_scale * at_origin(fit.whole),
+        offset=period * variables.x_scale * at_origin(fit.whole)[0],
         A_error=errors[:, :d],
         B_error=errors[:, d:],
-        offset_error=period * variables.x_scale * fit.error(at_origin),
+        offset_error=offset_error,
         W=_rounded_up(MARGIN * found.largest * variables.x_scale),
         held_out=found,
         nothing_changes=Quality.of(samples.after - samples.x, variables.x_scale, period),
@@ -197,6 +212,14 @@ def _solved(factors: Sequence[np.ndarray], p: int) -> np.ndarray:
     """(p, d). Of directions that did not move, nothing."""
     stacked = np.vstack(factors)
     return np.linalg.lstsq(stacked[:, :p], stacked[:, p:], rcond=None)[0]
+
+
+def _persistent(residual: np.ndarray) -> np.ndarray:
+    """RMS of the part of residuals (n, d) that is still there a sample later, (d,); of white noise 0."""
+    n, power = len(residual), (residual**2).mean(axis=0)
+    later = (residual[1:] * residual[:-1]).sum(axis=0) / n
+    # Two standard deviations of what it is for white noise.
+    return np.sqrt(np.maximum(later - 2.0 / np.sqrt(n) * power, 0.0))
 
 
 def _principal(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -238,9 +261,9 @@ def _require_known(variables: Variables, rms: np.ndarray, directions: np.ndarray
         worst = int(error.argmax())
         if error[worst] > KNOWN:
             found.append(
-                f"what {_combination(variables, direction)} does to {variables.states[worst]} is not known: one step "
-                f"from a half-width away to ±{error[worst]:.2g} half-widths (a standard error; {KNOWN:g} is allowed). "
-                f"It moves by {_percent(moved)} (RMS), and the parts of the log disagree"
+                f"what {_combination(variables, direction)} does to {variables.states[worst]} is known to "
+                f"±{error[worst]:.2g} half-widths a step only, from a half-width away ({KNOWN:g} at most): it moves by "
+                f"{_percent(moved)} (RMS), too little beside what a linear model leaves out"
             )
     _refuse(found)
 
