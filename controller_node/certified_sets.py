@@ -25,6 +25,7 @@ import numpy as np
 from lbmpc.model import Model
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
+from lbmpc.sets.motion import over_any_delay
 from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
@@ -160,7 +161,9 @@ class Work:
         cls, model: Model, kind: Kind, start: np.ndarray, W: np.ndarray | None, slack: float, cache: Path
     ) -> Work:
         """`start` (d,) in deviation coordinates, W (d,) as of `construct`."""
-        given = (model.plant.W * model.period if W is None else W).tolist() if kind == "given" else None
+        given = None
+        if kind == "given":
+            given = over_any_delay(model, model.plant.W * model.period if W is None else W).tolist()
         base = {
             "model": hashes(model_of(model)),
             "kind": "hull" if kind == "regions" else kind,

@@ -87,7 +87,7 @@ def build_problem(
             raise CertificateError(
                 f"these sets are an approximation ({certificate.kind}) that claims nothing"
             )
-        if model.equations is None:
+        if certificate.source_of_W == "given":
             require_prediction(model)
         guard = Guard(certificate)
     x_set, u_set, w_set = state_set(model), input_set(model), disturbance_set(model, W)

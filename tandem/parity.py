@@ -66,13 +66,17 @@ def drawn(name: str, rng: np.random.Generator) -> NetworkDescription:
         states=states,
         inputs=inputs,
         hidden=rng.integers(1, 41, layers).tolist(),
-        activations=[*rng.choice(ACTIVATIONS, layers - 1).tolist(), str(rng.choice(BOUNDED))],
+        activations=[*_any(ACTIVATIONS, layers - 1, rng), *_any(BOUNDED, 1, rng)],
         input_scale=(10.0 ** rng.uniform(-3, 3, states + inputs)).tolist(),
         output_scale=(10.0 ** rng.uniform(-3, 3, states)).tolist(),
         architecture=name,
         window=window,
         options=options,
     )
+
+
+def _any(of: tuple[Activation, ...], count: int, rng: np.random.Generator) -> list[Activation]:
+    return [of[i] for i in rng.integers(0, len(of), count)]
 
 
 def parity(description: NetworkDescription, seed: int, size: float = 1.0) -> Parity:

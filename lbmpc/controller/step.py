@@ -65,7 +65,8 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self.model: Model = problem.model
         self._first_delay = self._acceptable(input_delay)
-        self._motion = None if problem.guard is None else motion_of(self.model)
+        guard = problem.guard
+        self._motion = None if guard is None else motion_of(self.model, guard.certificate)
         self.oracle = problem.oracle
         self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
 
@@ -158,9 +159,9 @@ class Controller:
         """The state, (d,), at which the command that is being computed will begin to act.
 
         Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance. With certified sets the plant's own equations say where, or
-        its numbers where that is all: an error of the oracle's would be one of the state that the sets are asked about,
-        and they hold for any oracle.
+        between sample and command would be a disturbance. With certified sets it is no oracle that says
+        where, `lbmpc.sets.motion`: its error would be one of the state that the sets are asked about, and they hold for
+        any oracle.
         """
         acting = _acting(seen)
         if seen.x is None or acting is None or delay == 0.0:

@@ -9,7 +9,14 @@ import numpy as np
 from lbmpc.model import Model
 from lbmpc.sets.certificate import FORMAT, Certificate, Kind, Piece, model_of
 from lbmpc.sets.constraint_sets import input_set, state_set
-from lbmpc.sets.enclosures.disturbance import DisturbanceBound, Region, bound_box, bound_hull, given_box
+from lbmpc.sets.enclosures.disturbance import (
+    DisturbanceBound,
+    Region,
+    bound_box,
+    bound_hull,
+    given_box,
+    require_half_widths,
+)
 from lbmpc.sets.geometry.operations import Body, body, body_of
 from lbmpc.sets.geometry.polytope import SetError
 from lbmpc.sets.invariance.regions import ControllableSet, controllable_sets
@@ -45,8 +52,7 @@ def construct(
             `hull` sets around a way from `start` into it, with h bounded locally; `extension` is the approximation that
             the paper follows (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X: it claims nothing.
         start: a state that should be in the sets, (d,), deviation.
-        W: half-widths (d,) for `given`; the plant's own by default. Of a plant without equations the sets have a little
-            more, `lbmpc.sets.motion.over_any_delay`.
+        W: half-widths (d,) for `given`; the plant's own by default. The sets have a little more, `over_any_delay`.
         slack, patience: as for `predecessor_iteration`.
         saved: of an earlier call with the same arguments; filled as the work goes on.
 
@@ -107,8 +113,8 @@ def whole(model: Model) -> Region:
 def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report: Report) -> DisturbanceBound:
     region = whole(model)
     if kind == "given":
-        given = np.asarray(model.plant.W * model.period if W is None else W)
-        return given_box(model, given if model.equations else over_any_delay(model, given), region)
+        half = require_half_widths(model, model.plant.W * model.period if W is None else W)
+        return given_box(model, over_any_delay(model, half), region)
     if model.equations is None:
         raise SetError(
             f"{model.plant.name} is numbers alone, and what h can be is found from equations: sets of the kind `given` "

@@ -3,8 +3,8 @@
 The sets are about the state in which a command begins to act. What predicts that state decides what is certified, so
 it is no oracle's guess: the equations are those that the sets were computed for.
 
-Of a plant that is numbers alone the linear motion says it, and then the sets are about the state that is predicted.
-With Phi, Gamma over the delay and h what the model misses from sample to sample, under whatever acted in between,
+Where W is given there may be no equations. Then the linear motion says it, and the sets are about the state that is
+predicted. With Phi, Gamma over the delay and h what the model misses from sample to sample, whatever acted in between,
 
     y = Phi x + Gamma u_before,      y+ = A y + B u + Phi h,
 
@@ -23,7 +23,7 @@ from lbmpc.casadi_buffers import Bound
 from lbmpc.model import Model
 from lbmpc.plants.equations import Plant
 from lbmpc.plants.linear_motion import Continuous, discretise
-from lbmpc.sets.certificate import CertificateError
+from lbmpc.sets.certificate import Certificate, CertificateError
 
 LATEST = 0.5
 """Of a period: the longest delay that is predicted over."""
@@ -48,9 +48,17 @@ class Motion(Protocol):
         ...
 
 
-def motion_of(model: Model) -> Motion:
-    """By the plant's equations; where there are none, the linear motion."""
-    return OfNumbers(model) if model.equations is None else OfEquations(model, model.equations)
+def motion_of(model: Model, certificate: Certificate) -> Motion:
+    """By the plant's equations; with sets of a given W the linear motion.
+
+    Raises:
+        ModelError: the sets were computed from equations, and there are none.
+    """
+    if certificate.source_of_W == "given":
+        return OfNumbers(model)
+    return OfEquations(
+        model, model.require_equations("the prediction over the delay, about which these sets are,")
+    )
 
 
 def over_any_delay(model: Model, W: np.ndarray) -> np.ndarray:

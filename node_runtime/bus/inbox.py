@@ -142,6 +142,10 @@ class Inbox(Generic[M]):
         checked = (self._check(delivery) for delivery in self._mailbox.drain())
         return [received for received in checked if received is not None]
 
+    def wait_any(self, timeout_s: float) -> None:
+        """Wait up to `timeout_s` for a message, whatever it is worth: `take_all` then judges it."""
+        self._mailbox.wait(timeout_s)
+
     def wait(self, timeout_s: float) -> Received[M] | None:
         """Like `take`, waiting up to `timeout_s` for a message that may be obeyed."""
         newest = self.take()

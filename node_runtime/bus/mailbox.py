@@ -58,6 +58,11 @@ class Mailbox:
             self._bytes -= len(delivery.payload)
             return delivery
 
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a message is here, after up to `timeout_s` in which one was waited for."""
+        with self._arrived:
+            return bool(self._arrived.wait_for(lambda: self._items, timeout_s))
+
     def drain(self) -> list[Delivery]:
         """Everything that is here, oldest first."""
         with self._arrived:

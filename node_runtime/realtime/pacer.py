@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from node_runtime.realtime import clock
@@ -82,15 +83,17 @@ class Grid:
 class Pacer:
     """A `Grid` with sleep."""
 
-    def __init__(self, grid: Grid, stop: threading.Event):
+    def __init__(self, grid: Grid, stop: threading.Event, wait: Callable[[float], bool] | None = None):
+        """wait: waits until a time on the monotonic clock, False when told to stop; None: `sleep_until`."""
         self.grid = grid
         self._stop = stop
+        self._wait = wait or self.sleep_until
 
     def next(self) -> tuple[Slot, float] | None:
         """Sleep until the next slot; it and its lateness in seconds, or None when told to stop."""
         slot = self.grid.next(clock.now())
         while True:
-            if not self.sleep_until(slot.time):
+            if not self._wait(slot.time):
                 return None
             now = clock.now()
             # A process that was frozen, or without a core, wakes long after its slot: that one is over.

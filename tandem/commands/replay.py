@@ -27,7 +27,6 @@ class Replay(Command):
     architecture: Annotated[str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: none)")] = None
     """The file of the log's network, where its architecture is one of your own. A log's own word is never enough to
     load code."""
-
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
     ] = None

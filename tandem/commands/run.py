@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from tandem.live.monitor import Monitor, Snapshot
     from tandem.live.supervisor import Wish
 
-LONGEST_S = 1e8
-"""Three years. Whoever wants no end runs the processes themselves."""
+USUAL_S, LONGEST_S = 20.0, 1e8
+"""The second: three years."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,9 @@ class Run(Configured):
     EXTRAS = "trainer,log"
     KEYS = (("oracle", "controller.oracle"), ("rate", "rate"), ("seed", "seed"), ("log", "log.path"))
 
-    seconds: Annotated[float, arg(metavar="S")] = 20.0
+    seconds: Annotated[
+        float | None, arg(metavar="S", help_behavior_hint="(default: 20; with --no-plant until Ctrl-C)")
+    ] = None
     """How long, counted from the first command."""
     oracle: Annotated[
         OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
@@ -47,13 +50,14 @@ class Run(Configured):
     no_trainer: bool = False
     """Start no trainer here: it comes from another machine ("Put the trainer on another machine" in the
     documentation), or not at all."""
+    no_plant: bool = False
+    """Start no plant here, and wait for one: `tandem plant`, or the gateway of a machine ("The wire" in the
+    documentation). The router is at the configuration's endpoint then."""
 
     def run(self) -> int:
         """Run everything for `seconds` from the first command."""
         config, given = self.resolve()
-        if not self.seconds > config.period:
-            raise terminal.Refused(f"--seconds {self.seconds:g}: less than one period of {config.period:g} s")
-        terminal.limited("--seconds", self.seconds, 0.0, LONGEST_S)
+        seconds = self._seconds(config.period)
         path = Path(config.log.path).absolute()
         # A file's name may be any bytes; but what moves the cursor is a trap for whoever lists the folder.
         shown = readable(str(path))
@@ -76,14 +80,15 @@ class Run(Configured):
         with claimed(Path(config.log.path)) as (files, moved), wishes() as wish:
             self.say(*moved, style="dim")
             self.say(said)
-            endpoint = config.bus.endpoint if "endpoint" in given.get("bus", {}) else _free_endpoint()
+            known = self.no_plant or "endpoint" in given.get("bus", {})
+            endpoint = config.bus.endpoint if known else _free_endpoint()
             bus = msgspec.structs.replace(config.bus, endpoint=endpoint)
             log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
             # A run is a new experiment: it begins with what the configuration says and nothing else.
             controller = msgspec.structs.replace(config.controller, checkpoint="")
             resolved = msgspec.structs.replace(config, bus=bus, log=log, controller=controller)
             files.config.write_text(to_toml(resolved), encoding="utf-8")
-            monitor = Monitor(resolved, plant, self.seconds)
+            monitor = Monitor(resolved, plant, seconds)
             try:
                 trouble, logged = self._supervise(resolved, files, monitor, wish)
             except StartError as error:
@@ -99,6 +104,20 @@ class Run(Configured):
                 text = f"interrupted; `tandem report {files.log}` gives figures and pictures"
                 terminal.complain(text, self.json)
                 return INTERRUPTED
+
+    def _seconds(self, period: float) -> float:
+        """How long to run, infinity where only the person ends it. Raises `Refused`."""
+        if self.seconds is None:
+            return math.inf if self.no_plant else USUAL_S
+        if not self.seconds > period:
+            raise terminal.Refused(f"--seconds {self.seconds:g}: less than one period of {period:g} s")
+        terminal.limited("--seconds", self.seconds, 0.0, LONGEST_S)
+        return self.seconds
+
+    def _elsewhere(self) -> list[str]:
+        """The processes that are not started here."""
+        absent = {"plant": self.no_plant, "trainer": self.no_trainer}
+        return [name for name, is_absent in absent.items() if is_absent]
 
     def _supervise(
         self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
@@ -118,7 +137,7 @@ class Run(Configured):
                 garbage.idle()
 
             supervisor = Supervisor(
-                config, files.config, files.folder, monitor, wish, show, not self.no_trainer
+                config, files.config, files.folder, monitor, wish, show, self._elsewhere()
             )
             trouble = supervisor.run()
             return trouble, not supervisor.recorder_died
@@ -147,7 +166,7 @@ class Run(Configured):
                 f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
             )
         if trouble is None and not began:
-            trouble = "stopped before the first command"
+            trouble = "stopped before the first command" + (": no plant came" if self.no_plant else "")
         result: dict[str, Any] = {}
         code = 1
         try:

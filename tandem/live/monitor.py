@@ -20,8 +20,8 @@ from run_log.reporting.summary import SOFT
 
 RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
-# Health comes twice a second.
-SILENT_S = 2.0
+# Health comes twice a second, and a plant's states once a period.
+SILENT_S, SILENT_PERIODS = 2.0, 3.0
 TREND_SECONDS = 40
 EVENTS = 10
 
@@ -75,7 +75,7 @@ class Snapshot:
     plant: Description
     seconds: float
     phase: str = ""
-    """What is being waited for, e.g. "the trainer"; empty while the run goes on."""
+    """What is being waited for, e.g. "the trainer" or "the plant"; empty while the run goes on."""
     elapsed: float | None = None
     """Seconds since the first command, None before it."""
     states: tuple[Gauge, ...] = ()
@@ -123,13 +123,17 @@ class Monitor:
         self.config, self.plant, self.seconds = config, plant, seconds
         self.bad = RejectedMessages()
         self.phase = ""
-        """See `Snapshot`; whoever supervises says it."""
+        """See `Snapshot`; whoever supervises says it. While it is empty, a plant is waited for that is silent."""
         self.first_command: float | None = None
         """When the first command arrived; seconds on the monotonic clock."""
         self.slots = 0
         """Of the controller, up to its newest tick."""
         self._seen = Snapshot(config, plant, seconds)
         self._followers: dict[str, Follower] = {}
+        self._plant: tuple[str, float] | None = None
+        """The plant's run, and when its newest state came."""
+        self._missed_at: float | None = None
+        """The same moment once it has been said that nothing came after it; None: nothing is missed."""
         self._x: list[float] | None = None
         self._u: list[float] | None = None
         self._health: dict[str, tuple[m.Health, float]] = {}
@@ -168,6 +172,8 @@ class Monitor:
             message = codec.decode(topic, delivery.payload)
             codec.check_dimensions(topic, message, self.plant.d, self.plant.m)
         except codec.BadMessage as error:
+            if f"bad {topic.name}: {error.reason}" not in self.bad.counters():
+                self.say(f"{error}; not obeyed", now, "bad")
             self.bad.count(topic.name, error.reason, error.detail)
             return
         follower = self._followers.setdefault(topic.name, Follower(self.config.bus.follow_silence))
@@ -181,6 +187,7 @@ class Monitor:
         seen = self._seen
         match message:
             case m.PlantState():
+                self._take_plant(message.run_id, now)
                 self._x, seen.source = message.x, message.source
             case m.Command():
                 if self.first_command is None:
@@ -204,6 +211,26 @@ class Monitor:
                 seen.loss, seen.samples = (message.loss_before, message.loss_after), message.samples
             case m.Health():
                 self._take_health(message, now)
+
+    def _take_plant(self, run_id: str, now: float) -> None:
+        away = "" if self._missed_at is None else f" after {now - self._missed_at:.1f} s"
+        if self._plant is not None and run_id != self._plant[0]:
+            self.say(f"the plant was started again{away}, as {run_id}: a new episode", now, "good")
+        elif away:
+            self.say(f"the plant is back{away}", now, "good")
+        self._plant, self._missed_at = (run_id, now), None
+
+    def miss_plant(self, now: float) -> None:
+        """Say it, once, when a plant that was there is silent."""
+        if self._plant is not None and self._missed_at is None and self._silent(now):
+            self._missed_at = self._plant[1]
+            self.say(f"the plant is silent: no state for {now - self._missed_at:.1f} s", now, "bad")
+
+    def _silent(self, now: float) -> bool:
+        """Whether there is no plant: none of its states came for a while, or ever."""
+        return self._plant is None or now - self._plant[1] > max(
+            SILENT_S, SILENT_PERIODS * self.config.period
+        )
 
     def _take_result(self, result: m.TickResult, now: float) -> None:
         seen, tick = self._seen, f"tick {result.seq}:"
@@ -295,14 +322,15 @@ class Monitor:
 
     def snapshot(self, now: float) -> Snapshot:
         """What there is to see at `now`, seconds on the monotonic clock."""
-        plant = self.plant
+        plant, silent = self.plant, self._silent(now)
+        x, u = (None, None) if silent else (self._x, self._u)
         recent = [error for at, error in self._errors if at > now - 1.0]
         return replace(
             self._seen,
-            phase=self.phase,
+            phase=self.phase or ("the plant" if silent else ""),
             elapsed=None if self.first_command is None else now - self.first_command,
-            states=_gauges(plant.states, self._x, plant.x_min, plant.x_max, plant.x_e, plant.x_scale),
-            inputs=_gauges(plant.inputs, self._u, plant.u_min, plant.u_max, plant.u_e, plant.u_scale),
+            states=_gauges(plant.states, x, plant.x_min, plant.x_max, plant.x_e, plant.x_scale),
+            inputs=_gauges(plant.inputs, u, plant.u_min, plant.u_max, plant.u_e, plant.u_scale),
             measured_rate=_rate(self._tick_times, now),
             solve_ms=_percentiles(self._solve_ms),
             tick_ms=_percentiles(self._tick_ms),
@@ -315,6 +343,10 @@ class Monitor:
 
     def _row(self, name: str, now: float) -> ProcessRow:
         if name not in self._health:
+            if name == "plant" and self._plant is not None and name not in self._ended:
+                return ProcessRow(
+                    name, "silent" if self._silent(now) else "running", "says only its states", {}
+                )
             return ProcessRow(name, "ended" if name in self._ended else "not heard of", "", {})
         health, at = self._health[name]
         status = "ended" if name in self._ended else "silent" if now - at > SILENT_S else health.status

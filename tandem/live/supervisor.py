@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from types import FrameType
 from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import new_run_id
+from protocol import topics
 from tandem.live.monitor import Monitor, Snapshot
 from tandem.live.processes import STOP_S, TABLE, Child
 
@@ -85,7 +86,7 @@ class Supervisor:
         monitor: is fed with everything on the bus.
         wish: when to stop.
         show: is called about five times a second with what there is to see.
-        trainer: False: none is started, for it runs elsewhere.
+        elsewhere: those of the table that are not started here.
     """
 
     def __init__(
@@ -96,10 +97,11 @@ class Supervisor:
         monitor: Monitor,
         wish: Wish,
         show: Show,
-        trainer: bool = True,
+        elsewhere: Collection[str] = (),
     ):
         self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
-        table = [process for process in TABLE if process.name != "trainer" or (trainer and trains(config))]
+        absent = {*elsewhere, *(() if trains(config) else ("trainer",))}
+        table = [process for process in TABLE if process.name not in absent]
         # The log's name may be any bytes, which a TOML file cannot say.
         options = {"recorder": ("--log", config.log.path)}
         self.children = {
@@ -209,24 +211,35 @@ class Supervisor:
     def _watch(self) -> str | None:
         """Until the time is over, or the person asks, or a process without which nothing goes on has died."""
         self.monitor.phase = ""
-        slots = max(1, round(self.monitor.seconds * self.config.rate))
+        slots = max(1.0, self.monitor.seconds * self.config.rate)
         waiting_since = time.monotonic()
+        if "plant" not in self.children and self.monitor.first_command is None:
+            self.monitor.say(self._what_a_plant_needs(), waiting_since)
         while not self.wish.stop:
             first = self.monitor.first_command
             # The last slot says it exactly, the clock in any case.
-            if self.monitor.slots >= slots:
+            if self.monitor.slots > slots - 0.5:
                 return None
             if first is not None and time.monotonic() >= first + self.monitor.seconds + GRACE_S:
                 return None
-            if first is None and time.monotonic() > waiting_since + 30.0:
+            if first is None and "plant" in self.children and time.monotonic() > waiting_since + 30.0:
                 return "the controller is ready, but no command came for 30 s"
             for child in self.children.values():
                 if child.exit_code() is not None:
                     trouble = self._died(child)
                     if trouble is not None:
                         return trouble
+            self.monitor.miss_plant(time.monotonic())
             self._listen()
         return None
+
+    def _what_a_plant_needs(self) -> str:
+        """For whoever starts it elsewhere, or looks why nothing comes."""
+        plant, bus = self.monitor.plant, self.config.bus
+        places = " or ".join(filter(None, (bus.endpoint, bus.remote)))
+        what = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
+        key = topics.PLANT_STATE.key(self.config.name)
+        return f"waiting for the plant: {what} as {key}, by the router at {places}"
 
     def _died(self, child: Child) -> str | None:
         """What to do about a process that has ended: text that ends the run, or None to go on."""

@@ -79,6 +79,8 @@ def line(now: Snapshot) -> str:
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
+    if now.phase:
+        parts.append(f"waiting for {now.phase}")
     troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
     return " | ".join(parts + troubled)
 
@@ -102,6 +104,8 @@ def _heading(now: Snapshot, width: int) -> Text:
     left = Text.assemble((" Tandem ", "bold reverse"), f" {config.name}  ", (about, "dim"))
     if now.phase or now.elapsed is None:
         right = Text(f"waiting for {now.phase or 'the first command'} ", "yellow")
+    elif math.isinf(now.seconds):
+        right = Text(f"{now.elapsed:.1f} s, until Ctrl-C ")
     else:
         elapsed = min(now.elapsed, now.seconds)
         cells = max(0, min(30, width - left.cell_len - 22))

@@ -12,7 +12,7 @@ from tandem.cli import main
 from tests.helpers.paths import INSTALLED, ROOT
 
 PACKAGES = (*INSTALLED, "benchmarks", "verification", "tests")
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")])
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)
 PATH = re.compile(rf"(?<![\w/.<-])((?:{NAME}|configs|docs|docker)/[\w./-]*\w/?)(?![\w*<])")

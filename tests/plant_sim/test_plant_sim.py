@@ -18,8 +18,8 @@ from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from node_runtime.router import open_router
 from plant_sim import node
-from plant_sim.simulator import PlantSim
-from plant_sim.watchdog import Orders, Standby
+from plant_sim.orders import Orders, Standby
+from plant_sim.simulator import Motion, PlantSim
 from protocol import messages as m
 from protocol import topics
 from tests.helpers.live import BusListener, Process, health_of, live_config, matched, wait_for
@@ -69,8 +69,11 @@ def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
 
 
 def test_the_process_has_the_true_plant() -> None:
-    sim = node.build(override(Config(), ["plant.truth.slope=1.4"]), "plant-a")
-    assert sim.plant.parameters == {**PLANT.parameters, "slope": 1.4}
+    motion = node.motion_of(override(Config(), ["plant.truth.slope=1.4"]))
+    motion.read(0.0)
+    motion.write(PLANT.u_e, 0.0)
+    true = Truth(PLANT.varied(slope=1.4))
+    assert motion.read(PERIOD).tolist() == true.step(PLANT.x0, PLANT.u_e, PERIOD).tolist()
 
 
 # -- in virtual time -------------------------------------------------------------------------------------
@@ -82,7 +85,7 @@ def test_the_plant_is_held_until_its_first_command() -> None:
         state = sim.sample(k * PERIOD)
         assert (state.seq, state.x, state.applied) == (k, PLANT.x0.tolist(), None)
         assert (state.source, state.command_seq) == ("hold", -1)
-    assert not sim.moving
+    assert sim.sample(5 * PERIOD).pieces == []
 
 
 # With a period of 0.03 s an average over the period would round, with 0.05 s it would not.
@@ -206,9 +209,8 @@ def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
     """With a constant input it would leave for the surge that the equilibrium is unstable towards."""
 
     def after(plant: Plant) -> float:
-        sim = PlantSim(
-            plant, Truth(plant), period, PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0]), 1.5, "plant-a"
-        )
+        x0 = PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0])
+        sim = PlantSim(plant, Truth(plant), period, x0, 1.5, "plant-a")
         sim.sample(0.0)
         sim.command(command(0, U, period=period), 0.0)
         for k in range(1, round(10 / period)):
@@ -248,7 +250,7 @@ def test_what_drives_always_moves_on(
     standby = Standby(backup(0, [0.0] * backups, period=period), arrived) if backups else None
     t, sources = arrived, []
     while np.isfinite(t):
-        drive = orders.drive(t, PLANT.x_e, standby)
+        drive = orders.drive(t, lambda: PLANT.x_e, standby)
         assert drive.until > t
         sources.append(drive.source)
         t = drive.until
@@ -298,18 +300,17 @@ def test_old_commands_in_a_burst_are_refused() -> None:
     assert verdicts == ["stale"] * 57 + ["ok"] * 3
 
 
-def test_working_ahead_changes_nothing() -> None:
-    def states(ahead: bool) -> list[m.PlantState]:
-        sim, rng, found = plant(), np.random.default_rng(1), []
+def test_looking_ahead_changes_nothing() -> None:
+    def states(ahead: bool) -> list[list[float]]:
+        motion, rng, found = Motion(Truth(PLANT), PLANT.x0, PERIOD), np.random.default_rng(1), []
         for k in range(30):
-            found.append(sim.sample(k * PERIOD))
-            if ahead:
-                sim.prepare((k + 1) * PERIOD)
+            found.append(motion.read(1e5 + k * PERIOD).tolist())
             if k % 7 < 5:
-                at = (k + rng.uniform(0.0, 0.9)) * PERIOD
-                sim.command(command(k, U + rng.uniform(-0.05, 0.05), [U] * 2, answers=k), at)
+                motion.write(
+                    np.array([U + rng.uniform(-0.05, 0.05)]), 1e5 + (k + rng.uniform(0.0, 0.9)) * PERIOD
+                )
             if ahead:
-                sim.prepare((k + 1) * PERIOD)
+                motion.look_ahead()
         return found
 
     assert states(ahead=True) == states(ahead=False)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
+from lbmpc.plants import get_plant, true_motion
 from node_runtime.bus.batches import Waiting, encode_batch
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from node_runtime.provenance import run_info
-from plant_sim.node import build
+from plant_sim.simulator import PlantSim
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
@@ -34,7 +35,10 @@ def seeds() -> dict[str, list[bytes]]:
     """By topic or answer, payloads that every reader accepts."""
     settings = config()
     core = ControllerCore(settings, "controller-1")
-    plant = build(settings, "plant-1")
+    true = get_plant(settings.plant.model)
+    plant = PlantSim(
+        true, true_motion(true), settings.period, true.x0, settings.plant.plan_patience, "plant-1"
+    )
     outbox = Outbox("controller-1")
     out: dict[str, list[bytes]] = {topic.name: [] for topic in (*topics.ALL, *ANSWERS)}
 

@@ -155,13 +155,19 @@ def given_box(model: Model, half_widths: np.ndarray, region: Region) -> Disturba
         DisturbanceError: not d finite numbers that are not negative.
     """
     _check(model, region)
+    half = require_half_widths(model, half_widths)
+    return DisturbanceBound.plain(region, _corners(-half, half))
+
+
+def require_half_widths(model: Model, half_widths: np.ndarray) -> np.ndarray:
+    """These, (d,). Raises `DisturbanceError`: not d finite numbers that are not negative."""
     half = np.asarray(half_widths, dtype=float)
     if half.shape != (model.d,) or not np.isfinite(half).all() or (half < 0).any():
         raise DisturbanceError(
             f"{model.plant.name}: W is {half.tolist()}; give {model.d} half-widths, one per state "
             f"({', '.join(model.plant.states)}), finite and not negative"
         )
-    return DisturbanceBound.plain(region, _corners(-half, half))
+    return half
 
 
 def _extent(

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from controller_node.build import GivenPlant
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Plant, PlantError, get_plant, true_motion
+from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, true_motion
 from node_runtime.config.architecture import register_architecture
 from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
@@ -108,13 +109,15 @@ def drive(loop: LockStep, steps: int, progress: Progress | None = None, episodes
     return Outcome(run, lost, ended)
 
 
-@dataclass(frozen=True)
-class Step:
-    """What one period came to."""
+class _Motion:
+    """How the plant moves, unless it is said where it is."""
 
-    state: m.PlantState
-    """The plant's sample at its beginning, without noise."""
-    outputs: Outputs
+    def __init__(self, true: TrueMotion):
+        self._true = true
+        self.at: np.ndarray | None = None
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        return self._true.step(x, u, dt) if self.at is None else self.at
 
 
 class LockStep:
@@ -123,17 +126,21 @@ class LockStep:
     Args:
         config: the resolved configuration.
         faults: what goes wrong.
+        given: objects that stand for the plant of the configuration and for its truth.
 
     Raises:
         ConfigError: the configuration admits no controller, or the faults do not fit the plant.
     """
 
-    def __init__(self, config: Config, faults: Faults):
+    def __init__(self, config: Config, faults: Faults = NO_FAULTS, given: GivenPlant | None = None):
         self.config, self.faults = config, faults
         register_architecture(config)
-        self.core = ControllerCore(config, CONTROLLER)
-        self.true = self.first_true = true_plant_of(config, get_plant)
-        self.plant = self._started_plant(PLANT)
+        self.core = ControllerCore(config, CONTROLLER, given=given)
+        truth = None if given is None else given.truth
+        self.true = self.first_true = true_plant_of(config, get_plant) if truth is None else truth
+        self.motion = self._motion(self.true)
+        self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
+        self.plant = self._started_plant(initial_state(config, self.core.plant))
         self.changes = self._changes()
         self.noise = self._noise()
         if faults.command_seconds >= config.period:
@@ -143,17 +150,22 @@ class LockStep:
         self.draws = np.random.default_rng([config.seed, 0x4015E])
         self.trainer = self._trainer() if config.trainer.enabled else None
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
-        self.taken, self.episode = 0, 1
         self.log: list[tuple[Topic, m.Message, int]] = []
         self._note(topics.RUN_INFO["controller"], self.core.run_info(0.0), 0)
         if (sets := self.core.certified_sets()) is not None:
             self._note(topics.SETS, sets, 0)
         self._note(topics.KEYFRAME, self.core.memory.keyframe(-1), 0)
 
-    def _started_plant(self, run_id: str) -> PlantSim:
+    def _motion(self, true: Known | Plant | TrueMotion) -> _Motion:
+        try:
+            return _Motion(true_motion(true))
+        except PlantError as error:
+            raise ConfigError(f"plant.truth: {error}") from error
+
+    def _started_plant(self, x0: np.ndarray) -> PlantSim:
+        run_id = PLANT if self.episode == 1 else f"{PLANT}-{self.episode}"
         plant, patience = self.core.plant, self.config.plant.plan_patience
-        x0 = initial_state(self.config, plant)
-        return PlantSim(plant, true_motion(self.true), self.config.period, x0, patience, run_id)
+        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -190,9 +202,7 @@ class LockStep:
         Raises:
             PlantError: the true motion cannot be followed to the end of the last period.
         """
-        last, log = self.taken - 1, list(self.log)
-        if not lost:
-            log.append(self._where_it_is())
+        last, log = self.taken - 1, [*self.log, *([] if lost else self._end())]
         if last >= 0 and self.taken % self.config.controller.keyframe_every:
             log.append(self._noted(topics.KEYFRAME, self.core.memory.keyframe(last), last))
         run = gather(self.config, log)
@@ -201,28 +211,41 @@ class LockStep:
 
     def start_again(self) -> None:
         """Another episode: the plant is at x0 again. Raises `PlantError` as `so_far` does."""
-        self.log.append(self._where_it_is())
-        self.episode += 1
-        self.plant = self._started_plant(f"{PLANT}-{self.episode}")
+        self.log += self._end()
+        self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
+        self.plant = self._started_plant(initial_state(self.config, self.core.plant))
 
-    def _where_it_is(self) -> tuple[Topic, m.Message, int]:
+    def _end(self) -> list[tuple[Topic, m.Message, int]]:
+        """Where the last command has led the plant; of one that moves elsewhere that is not known."""
+        if self.elsewhere:
+            return []
         # A sample of a copy: the plant's own next one must say what acted in the last period.
         end = copy.copy(self.plant).sample(self.taken * self.config.period)
-        return self._noted(topics.PLANT_STATE, end, self.taken)
+        return [self._noted(topics.PLANT_STATE, end, self.taken)]
 
-    def step(self) -> Step:
+    def step(self, x: np.ndarray | None = None) -> tuple[m.PlantState, Outputs]:
         """The next period, up to the command that acts in it.
+
+        Args:
+            x: where the plant is, (d,), of one that moves elsewhere; None: where its true motion has led it.
+
+        Returns:
+            The plant's sample, without noise, and what the controller said to it.
 
         Raises:
             PlantError: the true plant left every state from which its equations can be followed.
         """
         started, seq = time.perf_counter(), self.taken
+        self.elsewhere, self.motion.at = x is not None, x
+        if x is not None and seq == self.began:
+            self.plant = self._started_plant(x)
         t = seq * self.config.period
         true = self.plant.sample(t)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             self.true = now = self.changes.pop(0)[1]
-            self.plant.change(true_motion(now))
+            self.motion = self._motion(now)
+            self.plant.change(self.motion)
             truth = now.parameters
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
@@ -262,7 +285,8 @@ class LockStep:
         if (seq + 1) % self.config.controller.keyframe_every == 0:
             self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
         self.taken += 1
-        return Step(true, outputs)
+        self.motion.at = None
+        return true, outputs
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
         """The newest hidden weights that are here by now."""

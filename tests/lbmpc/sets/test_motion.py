@@ -8,7 +8,7 @@ import pytest
 from lbmpc.model import Model, build_model
 from lbmpc.plants import get_plant
 from lbmpc.plants.truth import Truth
-from lbmpc.sets.motion import motion_of
+from lbmpc.sets.motion import OfEquations
 from tests.helpers.plants.pendulum import pendulum, two_inputs
 
 COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
@@ -16,12 +16,8 @@ COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
 
 @pytest.mark.parametrize("model", [COMPRESSOR, pendulum(), two_inputs()], ids=lambda one: one.plant.name)
 def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
-    plant, motion, truth, rng = (
-        model.plant,
-        motion_of(model),
-        Truth(model.equations),
-        np.random.default_rng(0),
-    )
+    plant, rng = model.plant, np.random.default_rng(0)
+    motion, truth = OfEquations(model, model.equations), Truth(model.equations)
     for _ in range(50):
         x, u = rng.uniform(plant.x_min, plant.x_max), rng.uniform(plant.u_min, plant.u_max)
         seconds = rng.uniform(0.0, 0.5 * model.period)
@@ -32,7 +28,7 @@ def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
 
 
 def test_where_the_equations_do_not_hold_there_is_none() -> None:
-    plant, motion = COMPRESSOR.plant, motion_of(COMPRESSOR)
+    plant, motion = COMPRESSOR.plant, OfEquations(COMPRESSOR, COMPRESSOR.equations)
     without_pressure = np.array([0.5, -0.1, 1.0, 0.0])
     assert motion.after(without_pressure - plant.x_e, np.zeros(1), 0.01) is None
     assert motion.after(np.array([1e6, 0.0, 0.0, 0.0]), np.zeros(1), 0.01) is None

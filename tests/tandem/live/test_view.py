@@ -6,11 +6,13 @@ import io
 import math
 from dataclasses import replace
 
+import msgspec
 import pytest
 from rich.console import Console
 
 from lbmpc.plants import get_plant
 from node_runtime.bus.mailbox import Delivery
+from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
@@ -158,7 +160,7 @@ def test_a_process_that_says_nothing_any_more_is_silent(monitor: Monitor):
     rows = {row.name: row.status for row in monitor.snapshot(START + 10.0).processes}
     assert rows == {
         "router": "silent",
-        "plant": "not heard of",
+        "plant": "silent",
         "controller": "silent",
         "trainer": "ended",
         "recorder": "silent",
@@ -220,7 +222,10 @@ def test_one_line(monitor: Monitor):
     assert "\n" not in text
     for expected in ("z 0.3000", "50 ticks, 1 late", "1 adopted, 1 refused"):
         assert expected in text
-    assert view.line(Monitor(CONFIG, PLANT, 20.0).snapshot(START)).startswith("waiting for the first command")
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    assert view.line(seen.snapshot(START)).startswith("waiting for the plant: ")
+    seen.feed(delivery(topics.PLANT_STATE, state(0), START))
+    assert view.line(seen.snapshot(START)).startswith("waiting for the first command: ")
 
 
 def test_bars_fall_with_the_error():
@@ -254,6 +259,70 @@ def test_the_first_command_is_not_overlooked_among_others() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(k), START + 0.001 * k) for k in range(5)])
     assert seen.first_command == pytest.approx(START)
+
+
+def plant_row(now: Snapshot) -> tuple[str, str]:
+    (row,) = (row for row in now.processes if row.name == "plant")
+    return row.status, row.note
+
+
+def test_a_plant_that_says_only_its_states_runs_while_they_come() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    assert plant_row(seen.snapshot(START)) == ("not heard of", "")
+    seen.feed(delivery(topics.PLANT_STATE, state(0), START))
+    assert plant_row(seen.snapshot(START + 1.0)) == ("running", "says only its states")
+    assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "says only its states")
+
+
+def test_a_plant_that_falls_silent_is_missed_and_its_return_is_said() -> None:
+    def said() -> list[str]:
+        return [event.text for event in seen.new_events()]
+
+    seen = Monitor(CONFIG, PLANT, math.inf)
+    seen.feed_all(
+        [delivery(topics.COMMAND, command(0), START), delivery(topics.PLANT_STATE, state(0), START)]
+    )
+    said()
+    seen.miss_plant(START + 1.9)
+    assert said() == []
+    assert seen.snapshot(START + 1.9).phase == ""
+    for at in (2.1, 2.2):
+        seen.miss_plant(START + at)
+    assert said() == ["the plant is silent: no state for 2.1 s"]
+    away = seen.snapshot(START + 2.2)
+    assert away.phase == "the plant"
+    assert [gauge.value for gauge in (*away.states, *away.inputs)] == [None] * 5
+    assert "waiting for the plant" in drawn(away, 100, 30)[0]
+    assert "waiting for the plant" in view.line(away)
+    seen.feed(delivery(topics.PLANT_STATE, state(60), START + 3.0))
+    assert said() == ["the plant is back after 3.0 s"]
+    assert seen.snapshot(START + 3.0).states[0].value == pytest.approx(0.3)
+    assert "3.0 s, until Ctrl-C" in drawn(seen.snapshot(START + 3.0), 100, 30)[0]
+    again = m.PlantState(
+        run_id="q", seq=0, t=0.0, x=[0.3, 1.5, 1.1, 0.2], applied=None, source="hold", command_seq=-1
+    )
+    seen.miss_plant(START + 7.0)
+    seen.feed(delivery(topics.PLANT_STATE, again, START + 8.0))
+    assert said()[-1] == "the plant was started again after 5.0 s, as q: a new episode"
+
+
+def test_a_slow_plant_is_not_missed_between_two_of_its_samples() -> None:
+    seen = Monitor(override(CONFIG, ["rate=0.2"]), PLANT, 100.0)
+    seen.feed(delivery(topics.PLANT_STATE, state(0), START))
+    seen.miss_plant(START + 10.0)
+    assert seen.snapshot(START + 10.0).phase == ""
+    seen.miss_plant(START + 15.1)
+    assert seen.new_events()
+
+
+def test_what_is_wrong_with_a_message_is_said_once() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    fields = {"run_id": "p", "seq": 0, "t": 0.0, "x": [0.0] * 4, "applied": None, "command_seq": -1}
+    for _ in range(3):
+        seen.feed(Delivery(topics.PLANT_STATE.key(CONFIG.name), msgspec.msgpack.encode(fields), 0))
+    (event,) = seen.new_events()
+    assert event.text == "plant/state: malformed: Object missing required field `source`; not obeyed"
+    assert seen.bad.total == 3
 
 
 def test_a_state_without_bounds_has_an_axis_as_long_as_its_scale() -> None:

@@ -3,7 +3,8 @@
     python traced_plant.py SUPERVISOR CONFIG TRACE
 
 What the true plant does while the router is dead or its link is cut is not on the bus. The plant's own code is
-`plant_sim.node.main`, unchanged; here it only gets a `PlantSim` that writes down what it is asked and what it answers.
+`plant_sim.node.main`, unchanged; here its gateway only gets a `Shield` that writes down what it is asked and what it
+answers.
 A line on standard input lets it begin.
 """
 
@@ -15,11 +16,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 import msgspec
+import numpy as np
 
 from node_runtime.config.loading import load
 from node_runtime.realtime import clock
-from plant_sim import node
-from plant_sim.simulator import CommandVerdict, PlantSim
+from plant_sim import gateway, node
+from plant_sim.shield import Shield, Verdict
 from protocol.messages import Command, PlantState
 from tandem.child import end_with
 
@@ -51,19 +53,18 @@ def read(path: Path) -> list[Traced]:
     return [decoder.decode(line) for line in lines]
 
 
-class TracedPlant(PlantSim):
-    """A `PlantSim` that writes down what happens."""
+class TracedShield(Shield):
+    """A `Shield` that writes down what happens."""
 
     file: BinaryIO
     encoder = msgspec.json.Encoder()
 
-    def sample(self, t: float) -> PlantState:
-        began = clock.now()
-        state = super().sample(t)
-        self._note(Sampled(began, state))
+    def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
+        state = super().sample(t, x, measured)
+        self._note(Sampled(clock.now(), state))
         return state
 
-    def command(self, command: Command, t: float) -> CommandVerdict:
+    def command(self, command: Command, t: float) -> Verdict:
         verdict = super().command(command, t)
         self._note(Commanded(t, command.run_id, command.seq, verdict))
         return verdict
@@ -77,8 +78,8 @@ def main(supervisor: int, config: str, trace: str) -> int:
     end_with(supervisor)
     logging.basicConfig(format="%(message)s", level="INFO")
     with open(trace, "ab", buffering=0) as file:
-        TracedPlant.file = file
-        node.PlantSim = TracedPlant  # type: ignore[misc]
+        TracedShield.file = file
+        gateway.Shield = TracedShield  # type: ignore[misc]
         if not sys.stdin.readline():
             return 1
         return node.main(load(config))

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from lbmpc.plants import Description
 from protocol.messages import Backup, Command, InputSource
+
+Measure = Callable[[], np.ndarray | None]
+"""x, (d,), of this moment; None where it cannot be measured. Called only by what depends on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,13 +37,14 @@ class Standby:
         self._inputs = backup.inputs
         self._gain = np.array(backup.gain)
 
-    def drive(self, t: float, x: np.ndarray) -> tuple[np.ndarray, float] | None:
-        """What it wants at time t in state x (d,), and until when.
+    def drive(self, t: float, measure: Measure) -> tuple[np.ndarray, float] | None:
+        """What it wants at time t, and until when.
 
-        None before its first entry, behind its last, and where its numbers, each of them finite, add up to none.
+        None before its first entry, behind its last, where the state is not known, and where its numbers, each of them
+        finite, add up to none.
         """
         entry = _elapsed(self._arrived, t, self._period)
-        if not 1 <= entry <= len(self._inputs):
+        if not 1 <= entry <= len(self._inputs) or (x := measure()) is None:
             return None
         with np.errstate(over="ignore", invalid="ignore"):
             u = self._inputs[entry - 1] + self._gain @ x
@@ -57,30 +63,46 @@ class Orders:
         self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived
         self._period = command.period
-        self._patience = patience
+        self._patience_ends = arrived + patience * command.period
         self._plant = plant
         self._plan = [command.u, *command.plan[1:]]
-        self._first = self._within(command.u)
+        self._first = within(plant, command.u)
 
-    def drive(self, t: float, x: np.ndarray, standby: Standby | None = None) -> Drive:
-        """What acts at time t, `arrived` or later, in state x (d,), plant units."""
-        patience_ends = self.arrived + self._patience * self._period
-        if patience_ends > _reached(t, self._period):
-            return Drive(self._first, "command", patience_ends)
-        if standby is not None and (backup := standby.drive(t, x)) is not None:
-            return Drive(self._within(backup[0]), "plan", backup[1])
+    def without_plan(self) -> Orders:
+        """The same command, after which the safe input follows."""
+        alone = copy(self)
+        alone._plan = self._plan[:1]
+        return alone
+
+    def drive(self, t: float, measure: Measure, standby: Standby | None = None) -> Drive:
+        """What acts at time t, `arrived` or later."""
+        if self._patience_ends > _reached(t, self._period):
+            return Drive(self._first, "command", self._patience_ends)
+        if standby is not None and (backup := standby.drive(t, measure)) is not None:
+            return Drive(within(self._plant, backup[0]), "plan", backup[1])
         entry = _elapsed(self.arrived, t, self._period)
         ends = self.arrived + (entry + 1) * self._period
         if entry < len(self._plan):
-            return Drive(self._within(self._plan[entry]), "plan", ends)
-        safe, gain = self._plant.safe_input, self._plant.safe_gain
-        if gain is None:
-            return Drive(self._within(safe), "safe", math.inf)
-        return Drive(self._within(safe + gain @ (x - self._plant.x_e)), "safe", ends)
+            # Entry by entry, as they are needed: most plans are never followed beyond their first.
+            return Drive(within(self._plant, self._plan[entry]), "plan", ends)
+        return safe_drive(self._plant, measure, ends)
 
-    def _within(self, u: list[float] | np.ndarray) -> np.ndarray:
-        # Entry by entry, as they are needed: most plans are never followed beyond their first.
-        return np.minimum(np.maximum(u, self._plant.u_min), self._plant.u_max)
+
+def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
+    """The safe input; of one that depends on the state: until `ends`, and without its feedback where none is known."""
+    if plant.safe_gain is None:
+        return Drive(within(plant, plant.safe_input), "safe", math.inf)
+    u = plant.safe_input
+    if (x := measure()) is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            fed_back = u + plant.safe_gain @ (x - plant.x_e)
+        u = fed_back if np.isfinite(fed_back).all() else u
+    return Drive(within(plant, u), "safe", ends)
+
+
+def within(plant: Description, u: list[float] | np.ndarray) -> np.ndarray:
+    """The nearest input, (m,), in the actuator's range."""
+    return np.minimum(np.maximum(u, plant.u_min), plant.u_max)
 
 
 def _reached(t: float, period: float) -> float:

@@ -1,0 +1,244 @@
+"""A machine on the bus: two functions of its own, and around them all that a controller expects of a plant.
+
+import numpy as np
+from plant_sim import Gateway
+
+def read() -> np.ndarray:
+    return np.array([tank.level(), tank.temperature()])
+
+def write(u: np.ndarray) -> None:
+    valve.open(u[0])
+
+Gateway(None, "tandem.toml").serve(read, write)
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+
+from lbmpc.plants import Known, Plant, PlantError, get_plant
+from lbmpc.plants.inspection import require_sound
+from node_runtime.bus.inbox import Inbox
+from node_runtime.bus.session import OpenInterrupted
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.loading import load
+from node_runtime.config.plant import plant_of
+from node_runtime.config.sections import Config
+from node_runtime.health import HealthPublisher
+from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.provenance import run_info
+from node_runtime.realtime import clock
+from node_runtime.realtime.pacer import Grid, Pacer, Slot
+from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual
+from plant_sim.machine import Guarded, Read, Write
+from plant_sim.shield import Shield
+from protocol import topics
+from protocol.messages import Backup, Command, InputSource, ProcessStatus
+
+log = logging.getLogger(__name__)
+
+LATE = 0.2
+"""Share of a period after which a sample counts as late."""
+LONGEST_WAIT_S = 0.1
+"""How soon the loop notices that it is told to stop."""
+NOTES: dict[InputSource, str] = {
+    "hold": "held at x0 until the first command",
+    "command": "",
+    "plan": "no fresh command: following the backup policy, or the last plan",
+    "safe": "no fresh command and nothing left to follow: safe input",
+}
+BEFORE_COMMANDS = "safe input until the first command"
+
+
+class Gateway:
+    """A plant as controllers know one, made of two functions.
+
+    At every sampling time the state is read and published. A command acts from its arrival; one that is foreign, stale
+    or of another period is refused and counted. While none comes the backup policy acts, then the plan, then the safe
+    input (`plant_sim.shield`). Before the first command, and in the end, it is the safe input.
+
+    Args:
+        known: what is known of the plant: its dimensions, bounds and safe input. None: what `config` names.
+        config: the resolved configuration, or the file that has it.
+        simulated: the two functions are a simulation's. It stands still until the first `write`, and each call counts
+            as made when it was `due`, not when a busy computer got to it.
+
+    Raises:
+        ConfigError: a configuration that is wrong or does not fit the plant.
+    """
+
+    def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
+        self.config = config if isinstance(config, Config) else load(config)
+        self.known = plant_of(self.config, get_plant if known is None else partial(_given, known))
+        self._simulated = simulated
+        self._serving: tuple[Shield, Guarded] | None = None
+
+    @property
+    def due(self) -> float:
+        """For which moment the call under way is made, seconds on the monotonic clock."""
+        return 0.0 if self._serving is None else self._serving[1].due
+
+    def new_epoch(self) -> None:
+        """The next sample does not follow from the last: the origin is another, or the state was set by hand.
+
+        It says that nothing is known of what acted before it, so that nobody learns from it. Of older samples no
+        command is obeyed any more, and of the plan and the backup policy nothing is followed. Any thread may call this,
+        `read` too.
+        """
+        if self._serving is not None:
+            self._serving[0].jump()
+
+    def serve(self, read: Read, write: Write, stop: threading.Event | None = None) -> None:
+        """Be the plant until `stop` is set or a signal ends the process; waits for the router first.
+
+        Both functions are called from this thread, never at the same time. What they raise is counted, logged and told
+        in health, and the loop goes on: a state that could not be measured is not published, an input that could not be
+        written counts as unknown. Between samples `read` is called for the backup policy and the safe input where these
+        depend on the state.
+
+        Args:
+            read: the state, (d,), plant units, as it is now.
+            write: lets an input, (m,), act from now on; always within the bounds. Called for every command and at least
+                once a period, also where the input is the same: a watchdog of the machine's own may rely on it.
+            stop: outside the main thread, where no signal arrives, the only way to end it.
+
+        Raises:
+            ConfigError: a core that this process may not use, or certificates that are none.
+            PlantError: raised by one of the two: the machine cannot go on.
+        """
+        config, run_id = self.config, new_run_id("plant")
+        place = core_for(config, "plant", os.sched_getaffinity(0))
+        shield = Shield(self.known, config.period, config.plant.plan_patience, run_id, held=self._simulated)
+        machine = Guarded(read, write, self.known.d, config.period, self._simulated)
+        self._serving = shield, machine
+        # Until there is a router, too.
+        _leave_safe(shield, machine)
+        with (
+            stopped_by_signals(stop) as stopping,
+            punctual(config.realtime.priority, keep_awake=config.awake) as note,
+            _left_at_once(),
+            Bus(config, "plant", run_id, stopping) as bus,
+        ):
+            loop = _Loop(shield, machine, bus, self._simulated)
+            info = run_info(config, "plant", run_id, self.known.units)
+            standing = "; ".join(filter(None, (note, core_note(place))))
+            with HealthPublisher(bus, info, loop.figures, standing) as health, on_core(place):
+                try:
+                    loop.run(health, stopping)
+                finally:
+                    _leave_safe(shield, machine)
+
+
+def _given(known: Known | Plant, _name: str) -> Known | Plant:
+    require_sound(known)
+    return known
+
+
+def _leave_safe(shield: Shield, machine: Guarded) -> None:
+    # Of a machine that is lost nothing is to be made safe.
+    with suppress(PlantError):
+        if (u := shield.rest()) is not None:
+            machine.write(u, clock.now())
+
+
+@contextmanager
+def _left_at_once() -> Iterator[None]:
+    """Told to stop before there was a router."""
+    try:
+        yield
+    except OpenInterrupted as interrupted:
+        log.info("%s", interrupted)
+
+
+class _Loop:
+    """Samples on an absolute grid; between them, commands as they arrive and what else is due."""
+
+    def __init__(self, shield: Shield, machine: Guarded, bus: Bus, simulated: bool):
+        self._shield, self._machine, self._bus, self._simulated = shield, machine, bus, simulated
+        self._period = bus.config.period
+        plant = shield.plant
+        self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=plant.d, inputs=plant.m)
+        self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=plant.d, inputs=plant.m)
+        names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
+        self._counts = dict.fromkeys(names, 0)
+        self._source: InputSource = "hold"
+        self._health: HealthPublisher | None = None
+
+    def run(self, health: HealthPublisher, stop: threading.Event) -> None:
+        """Until `stop` is set. Raises `PlantError`."""
+        self._health = health
+        garbage = GarbageCollection.at(self._period)
+        garbage.begin()
+        pacer = Pacer(Grid(self._period, clock.now() + self._period), stop, partial(self._obey_until, stop))
+        while (turn := pacer.next()) is not None:
+            self._sample(*turn)
+            self._say()
+            garbage.idle()
+
+    def figures(self) -> dict[str, int]:
+        """For health, whose thread goes on where the loop waits for a call that does not return."""
+        if self._machine.hangs:
+            self._say()
+        return self._counts | self._machine.counts
+
+    def _say(self) -> None:
+        if self._health is None:
+            return
+        moving, trouble = self._shield.moving, self._machine.trouble()
+        note = BEFORE_COMMANDS if self._source == "safe" and not moving else NOTES[self._source]
+        status: ProcessStatus = "failed" if trouble else "running" if moving else "ready"
+        self._health.set(status, "; ".join(filter(None, (trouble, note))))
+
+    def _obey_until(self, stop: threading.Event, time: float) -> bool:
+        """Let act what arrives and what is due, until `time`; False when told to stop."""
+        while not stop.is_set():
+            self._take_orders()
+            now = clock.now()
+            self._act(min(now, time))
+            if now >= time:
+                return True
+            self._commands.wait_any(min(time - now, max(0.0, self._shield.due - now), LONGEST_WAIT_S))
+        return False
+
+    def _act(self, t: float) -> None:
+        if self._simulated:
+            self._shield.advance(t, self._machine)
+        elif self._shield.due <= t:
+            # After a standstill only what acts now: a real machine needs no burst of what should have been.
+            self._shield.act(t, self._machine)
+
+    def _sample(self, slot: Slot, lateness: float) -> None:
+        counts = self._counts
+        x = self._machine.read(slot.time)
+        if x is not None:
+            state = self._shield.sample(slot.time, x, self._machine.measured)
+            self._bus.publish(topics.PLANT_STATE, state)
+            counts["samples"] += 1
+            counts[f"driven by {state.source}"] += 1
+            self._source = state.source
+        counts["samples skipped"] += slot.skipped
+        counts["samples late"] += lateness > LATE * self._period
+        self._shield.renew(slot.time, x, self._machine)
+
+    def _take_orders(self) -> None:
+        for received in self._commands.take_all():
+            command = received.message
+            verdict = self._shield.command(command, received.arrived)
+            if verdict != "ok":
+                detail = (
+                    f"command {command.seq} of {command.run_id} for {command.state_seq}, {command.period} s"
+                )
+                self._bus.bad.count(topics.COMMAND.name, verdict, detail)
+        for ready in self._backups.take_all():
+            backup = ready.message
+            verdict = self._shield.backup(backup)
+            if verdict != "ok":
+                self._bus.bad.count(
+                    topics.BACKUP.name, verdict, f"for command {backup.seq} of {backup.run_id}"
+                )

@@ -1,0 +1,106 @@
+"""A stranger's two functions as a `Machine`: whatever they do, the loop that calls them goes on and says so."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from lbmpc.plants import PlantError
+from node_runtime.realtime import clock
+
+log = logging.getLogger(__name__)
+
+Read = Callable[[], np.ndarray]
+Write = Callable[[np.ndarray], object]
+Call = Literal["read", "write"]
+R = TypeVar("R")
+
+SLOW = 0.5
+"""Share of a period above which a call counts as slow."""
+HANGS_S = 1.0
+"""Seconds for which a call must not have returned to be a trouble."""
+REMEMBERED_S = 1.0
+"""Seconds for which one that failed is a trouble."""
+
+
+class Guarded:
+    """Calls them, never both at a time, and counts what goes wrong. `trouble` may be asked by any thread."""
+
+    def __init__(self, read: Read, write: Write, states: int, period: float, simulated: bool):
+        """states: d. simulated: each call counts as made when it was due, else when it was made."""
+        self._read, self._write = read, write
+        self._states, self._slow, self._simulated = states, SLOW * period, simulated
+        self._under_way: tuple[Call, float] | None = None
+        self._failures: dict[Call, tuple[str, float]] = {}
+        self.counts = dict.fromkeys(("reads failed", "reads slow", "writes failed", "writes slow"), 0)
+        self.due = 0.0
+        """For which moment the last call was made, seconds on the monotonic clock."""
+        self.measured = 0.0
+        """When the last `read` began."""
+
+    def read(self, due: float) -> np.ndarray | None:
+        return self._call("read", due, self._measure)
+
+    def write(self, u: np.ndarray, due: float) -> float | None:
+        return self._call("write", due, partial(self._apply, u))
+
+    def trouble(self) -> str:
+        """What is wrong now, for a person; empty when nothing is."""
+        now = clock.now()
+        failed = [text for text, at in self._failures.copy().values() if now - at < REMEMBERED_S]
+        return "; ".join(filter(None, (*failed, self.hangs)))
+
+    @property
+    def hangs(self) -> str:
+        """Which call has not returned for long, for a person; empty when none."""
+        under_way = self._under_way
+        if under_way is None or clock.now() - under_way[1] < HANGS_S:
+            return ""
+        return f"{under_way[0]} has not returned for more than {HANGS_S:g} s"
+
+    def _measure(self) -> np.ndarray:
+        self.measured = self._now()
+        x = np.array(self._read(), dtype=float)
+        if x.shape != (self._states,):
+            raise ValueError(f"x has the shape {x.shape}, the plant has {self._states} states")
+        if not np.isfinite(x).all():
+            raise ValueError("x is not finite")
+        return x
+
+    def _apply(self, u: np.ndarray) -> float:
+        # A copy: what others do with it is not what acted.
+        self._write(u.copy())
+        return self._now()
+
+    def _now(self) -> float:
+        return self.due if self._simulated else clock.now()
+
+    def _call(self, name: Call, due: float, function: Callable[[], R]) -> R | None:
+        began, self.due = clock.now(), due
+        self._under_way = name, began
+        try:
+            result = function()
+        except PlantError:
+            raise
+        except Exception as error:  # noqa: BLE001 - not our code: whatever it raises, the plant still needs an input
+            self._failed(name, f"{name} failed: {type(error).__name__}: {error}"[:300])
+            return None
+        finally:
+            self._under_way = None
+        if clock.now() - began > self._slow:
+            self.counts[f"{name}s slow"] += 1
+        return result
+
+    def _failed(self, name: Call, text: str) -> None:
+        self.counts[f"{name}s failed"] += 1
+        now = clock.now()
+        first, last = self._failures.get(name, ("", -REMEMBERED_S))
+        if now - last > REMEMBERED_S:
+            first = text
+            log.warning("%s; the loop goes on, and further failures are only counted", text)
+        # The first of many, so that what is said does not change with each.
+        self._failures[name] = first, now

@@ -1,0 +1,257 @@
+"""The rules between a controller and a plant: what is obeyed, what acts, what a sample says. No clock and no I/O."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from operator import mul
+from typing import Literal, Protocol
+
+import numpy as np
+
+from lbmpc.plants import Description
+from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
+from protocol.messages import Backup, Command, InputSource, Piece, PlantState
+
+Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
+JITTER = 0.1
+"""Share of a period by which the time between two measurements may differ from it: the error of a label is that share
+of what the plant moves in a period."""
+
+
+class Machine(Protocol):
+    """The plant itself. `due`: seconds, for which moment a call is made."""
+
+    def read(self, due: float) -> np.ndarray | None:
+        """x, (d,), plant units; None where it cannot be measured."""
+        ...
+
+    def write(self, u: np.ndarray, due: float) -> float | None:
+        """Let u, (m,), act from now on. From when it does, seconds; None where that is not known."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Acting:
+    """From `since` on, u acts; None: the plant is held, or nobody knows."""
+
+    since: float
+    u: np.ndarray | None
+    source: InputSource
+
+
+class Shield:
+    """What stands between the commands and a plant's input. Every time is an argument, in seconds.
+
+    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` closes a period and
+    `renew` opens the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    """
+
+    def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
+        """patience: periods without a command before the plan goes on.
+
+        held: the plant stands still until the first command that answers one of its samples; else the safe input acts.
+        """
+        self.plant = plant
+        self._period, self._patience, self._run_id = period, patience, run_id
+        self._held = held
+        self._first: float | None = None
+        self._t = self._measured = self._acted = -math.inf
+        self._seq = -1
+        self._orders: Orders | None = None
+        self._pending: list[Orders] = []
+        self._standby: dict[int, Standby] = {}
+        self._until = math.inf
+        self._tape = [_Acting(-math.inf, None, "hold")]
+        self._written = False
+        self._jumped = False
+        self._before_jump: Orders | None = None
+        self._epoch = 0
+
+    @property
+    def moving(self) -> bool:
+        """Whether there was a command to obey."""
+        return self._orders is not None
+
+    @property
+    def due(self) -> float:
+        """When `advance` has something to do next, if nothing else arrives; infinite where never."""
+        return min(self._until, self._pending[0].arrived) if self._pending else self._until
+
+    # -- what is obeyed ----------------------------------------------------------------------------------
+
+    def command(self, command: Command, t: float) -> Verdict:
+        """Let `command` act from time t on, or from the last sample if t lies before it.
+
+        It must have the plant's dimensions (`check_dimensions`). It is refused when its period is not the plant's, when
+        it answers another plant's sample or none, and when it answers a sample so old that the plan had to take over
+        already, or one from before a jump. A controller that hears no states goes on with a plan that keeps only the
+        nominal model in X; the backup policy that the plant has is better, and it has its own sensors.
+        """
+        if not math.isclose(command.period, self._period, rel_tol=1e-6):
+            return "wrong period"
+        if command.state_seq < 0:
+            return "answers no sample"
+        if command.state_run_id != self._run_id or command.state_seq > self._seq or self._first is None:
+            return "foreign"
+        age = t - (self._first + command.state_seq * self._period)
+        if command.state_seq < self._epoch or age > (1.0 + self._patience) * self._period:
+            return "stale"
+        at = max(t, self._t, self._acted, self._pending[-1].arrived if self._pending else -math.inf)
+        self._pending.append(Orders(self.plant, command, at, self._patience))
+        return "ok"
+
+    def backup(self, backup: Backup) -> Verdict:
+        """Keep `backup` ready for when commands stop coming.
+
+        It must have the plant's dimensions. It is refused unless it belongs to one of the last commands: only these
+        say when its periods begin.
+        """
+        if not math.isclose(backup.period, self._period, rel_tol=1e-6):
+            return "wrong period"
+        known = [order for order in (self._orders, *self._pending) if order is not None]
+        for order in known:
+            if (order.run_id, order.seq) == (backup.run_id, backup.seq) and order is not self._before_jump:
+                self._standby[backup.seq] = Standby(backup, order.arrived)
+                return "ok"
+        return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
+
+    def jump(self) -> None:
+        """From the next sample on the state is another one than the last inputs led to: a new origin, a fresh start.
+
+        That sample says that nothing is known of what acted before it. The input stays what it is until a command
+        comes that answers it or a later one, or else, after the patience, the safe input: the plan and the policy that
+        there were belong to the state from before. Any thread may call this.
+        """
+        self._jumped = True
+
+    # -- what acts ---------------------------------------------------------------------------------------
+
+    def advance(self, t: float, machine: Machine) -> None:
+        """Let all act that has to by time t, each at its own time: for a plant whose time is an argument."""
+        while (due := max(self.due, self._acted)) <= t:
+            self.act(due, machine)
+
+    def act(self, t: float, machine: Machine) -> None:
+        """Let act what has to at time t: the newest command, or what is due since the last."""
+        while self._pending and self._pending[0].arrived <= t:
+            self._orders = self._pending.pop(0)
+        self._write(self._drive(t, partial(machine.read, t)), t, machine)
+
+    def renew(self, t: float, x: np.ndarray | None, machine: Machine) -> None:
+        """At every sample, with its x: what depends on the state follows it.
+
+        And what was not written for a period is written again: a machine's own watchdog may wait for it, and where the
+        last write failed the next one may not.
+        """
+        written, self._written = self._written, False
+        acting = self._tape[-1]
+        if (self._held and self._orders is None) or (written and acting.source == "command"):
+            return
+        drive = self._drive(t, lambda: x)
+        same = acting.u is not None and np.array_equal(drive.u, acting.u)
+        if written and same and drive.source == acting.source:
+            return
+        self._write(drive, t, machine)
+        self._written = False
+
+    def rest(self) -> np.ndarray | None:
+        """The input, (m,), to leave a machine with; None: none, it stands still as it is."""
+        return None if self._held and self._orders is None else within(self.plant, self.plant.safe_input)
+
+    def _drive(self, t: float, measure: Measure) -> Drive:
+        orders = self._orders
+        if orders is None:
+            return safe_drive(self.plant, measure, math.inf)
+        # Until the backup of the last command is here, that of the one before serves.
+        return orders.drive(t, measure, self._standby.get(orders.seq) or self._standby.get(orders.seq - 1))
+
+    def _write(self, drive: Drive, due: float, machine: Machine) -> None:
+        since = machine.write(drive.u, due)
+        self._acted, self._until = due, drive.until
+        self._written = since is not None
+        u = None if since is None else drive.u
+        self._tape.append(
+            _Acting(max(due if since is None else since, self._tape[-1].since), u, drive.source)
+        )
+
+    # -- what a sample says ------------------------------------------------------------------------------
+
+    def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
+        """x(t), (d,), and what acted since the sample before; t must rise by about whole periods, after `advance`.
+
+        `applied` is the time average of the input over the last period, that input itself when only one
+        acted, and None when a part of it is not known or the last sample is not one period ago.
+        `source` is what acted just before t.
+
+        measured: when x was really measured, where that was not at t.
+        """
+        measured = t if measured is None else measured
+        if self._first is None:
+            self._first = self._t = t
+        self._seq = max(self._seq + 1, round((t - self._first) / self._period))
+        if self._jumped:
+            self._begin_epoch(t)
+        acted = self._acted_until(t)
+        whole = abs(measured - self._measured - self._period) <= JITTER * self._period
+        applied = self._average(acted) if whole else None
+        # Also where it has acted for no time at all yet.
+        pieces = _pieces(acted or [(0.0, self._tape[0])])
+        orders = self._orders
+        if orders is not None:
+            # Of older commands nothing is followed any more, but for the one before the last: see `_drive`.
+            self._standby = {seq: one for seq, one in self._standby.items() if seq >= orders.seq - 1}
+        self._t, self._measured = t, measured
+        return PlantState(
+            run_id=self._run_id,
+            seq=self._seq,
+            t=t,
+            x=x.tolist(),
+            applied=applied,
+            pieces=pieces if applied is None or len(pieces) > 1 else [],
+            source=acted[-1][1].source if acted else self._tape[0].source,
+            command_seq=-1 if orders is None else orders.seq,
+        )
+
+    def _begin_epoch(self, t: float) -> None:
+        """Of what was before t only the input that acts is still true."""
+        self._jumped, self._epoch, self._measured = False, self._seq, -math.inf
+        self._pending, self._standby = [], {}
+        if self._orders is not None:
+            self._orders = self._before_jump = self._orders.without_plan()
+        self._tape = [replace(self._tape[-1], since=t)]
+
+    def _acted_until(self, t: float) -> list[tuple[float, _Acting]]:
+        """For how many seconds what acted since the last sample, in order; the tape then begins at t."""
+        acted, tape = [], []
+        for one, end in zip(self._tape, [*(after.since for after in self._tape[1:]), math.inf], strict=True):
+            seconds = min(end, t) - max(one.since, self._t)
+            if seconds > 0.0:
+                # Differences of large times are not exact; the period is.
+                whole = math.isclose(seconds, self._period, rel_tol=1e-6)
+                acted.append((self._period if whole else seconds, one))
+            if end > t:
+                tape.append(one if one.since > t else replace(one, since=t))
+        self._tape = tape
+        return acted
+
+    def _average(self, acted: list[tuple[float, _Acting]]) -> list[float] | None:
+        total = sum(seconds for seconds, _one in acted)
+        # Lists of Python's numbers: in a fast loop numpy would take longer than all else here.
+        inputs = [one.u.tolist() for _seconds, one in acted if one.u is not None]
+        if len(inputs) < len(acted) or not math.isclose(total, self._period, rel_tol=1e-6):
+            return None
+        if all(u == inputs[0] for u in inputs):
+            return inputs[0]
+        shares = [seconds / total for seconds, _one in acted]
+        return [sum(map(mul, shares, entries)) for entries in zip(*inputs, strict=True)]
+
+
+def _pieces(acted: list[tuple[float, _Acting]]) -> list[Piece]:
+    """The known inputs at the end, one piece for equal ones; the last still acts."""
+    pieces: list[Piece] = []
+    for u, same in groupby(acted, key=lambda part: None if part[1].u is None else part[1].u.tolist()):
+        pieces = [] if u is None else [*pieces, Piece(sum(seconds for seconds, _one in same), u)]
+    return pieces

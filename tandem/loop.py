@@ -1,0 +1,294 @@
+"""The closed loop in Python: the controller, its trainer and a plant, or a plant of yours, one step at a time.
+
+The same lock-step as `tandem simulate`: equal settings and seeds give equal bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controller_node.build import GivenPlant, build_plant
+from lbmpc.plants import (
+    Description,
+    Known,
+    Plant,
+    PlantDefinitionError,
+    PlantError,
+    TrueMotion,
+    get_plant,
+)
+from node_runtime.config import strict
+from node_runtime.config.loading import from_tree, to_tree
+from node_runtime.config.plant import true_plant_of
+from node_runtime.config.sections import Config
+from node_runtime.config.shipped import config_file
+from node_runtime.config.strict import ConfigError
+from node_runtime.realtime.scheduling import one_blas_thread
+from protocol.messages import TickResult
+from run_log.reporting.summary import Summary, summarise
+from run_log.reporting.traces import Traces, traces
+from run_log.run import Run
+from run_log.writing.save import save
+from tandem.experiments.simulation.lockstep import LockStep
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Step(NamedTuple):
+    """One period."""
+
+    t: float
+    """Seconds since the beginning."""
+    x: np.ndarray
+    """The plant's state at that time, (d,), in its own units."""
+    u: np.ndarray
+    """The input from then on, (m,)."""
+    result: TickResult
+    """What the controller concluded: status, iterations, h and h_hat, what became of hidden weights, and more."""
+
+
+class Loop:
+    """A controller with its trainer and its plant, in this process.
+
+    Args:
+        known: what the controller knows: `Known` (matrices), `Plant` (equations, which are linearised), the name of a
+            plant of Tandem, or a reference, "tanks.py:TANKS". None: the configuration's.
+        truth: how the plant really moves: a `Plant`, an object with `step(x, u, dt) -> x` (a simulator of yours), a
+            reference to either, or other parameters of the same equations, {"leak": 0.02}. None: the configuration's,
+            or as known.
+        oracle: what h is estimated with: linear (not at all), constant, l2nw, dnn or perfect.
+        train: whether the hidden layers of dnn are trained; needs torch.
+        config: a configuration: its file, the name of one that comes with Tandem, or a `Config`. None: defaults.
+        settings: what is otherwise in it, as in the file: `rate=50, controller={"horizon": 40}`.
+
+    Raises:
+        ConfigError: what was given admits no controller; says what, and what would be right.
+    """
+
+    def __init__(
+        self,
+        known: str | Known | Plant | None = None,
+        *,
+        truth: str | Mapping[str, float] | Known | Plant | TrueMotion | None = None,
+        oracle: str | None = None,
+        train: bool | None = None,
+        config: str | Path | Config | None = None,
+        **settings: Any,
+    ):
+        named = truth if isinstance(truth, str | Mapping) else None
+        moving = None if isinstance(truth, str | Mapping) else truth
+        arguments = {
+            "known": ("plant.model", known.name if isinstance(known, Description) else known),
+            "truth": ("plant.truth", dict(named) if isinstance(named, Mapping) else named),
+            "oracle": ("controller.oracle", oracle),
+            "train": ("trainer.enabled", train),
+        }
+        self.config = _resolved(config, settings, arguments)
+        given = _given(self.config, known, moving)
+        with one_blas_thread():
+            self._lockstep = LockStep(self.config, given=given)
+        self._lost: str | None = None
+
+    @property
+    def plant(self) -> Description:
+        """What the controller knows: names, units, bounds, equilibrium."""
+        return self._lockstep.core.plant
+
+    def step(self) -> Step:
+        """One period: the plant's state, and the input that the controller gives to it.
+
+        Raises:
+            PlantError: the true plant left every state from which its motion can be followed.
+        """
+        return self._step(None)
+
+    def control(self, x: ArrayLike) -> np.ndarray:
+        """The input, (m,), for a plant that moves elsewhere: in your simulator, or your own loop.
+
+        One call is one period. The input is taken to act from now until the next call, which the label h of this period
+        is made from.
+
+        Args:
+            x: its state now, (d,), in its own units.
+
+        Raises:
+            ValueError: not d finite numbers; nothing has happened then.
+        """
+        state, d = np.array(x, dtype=float), self.plant.d
+        if state.shape != (d,) or not np.isfinite(state).all():
+            raise ValueError(
+                f"x = {np.array2string(state, threshold=20)} is no state of {self.plant.name}: {d} finite numbers "
+                f"({', '.join(self.plant.states)})"
+            )
+        return self._step(state).u
+
+    def start_again(self) -> None:
+        """Another episode: the plant is put back, what was learned is kept, and no label reaches across.
+
+        With `control` the next x is where it begins.
+        """
+        with one_blas_thread():
+            self._lockstep.start_again()
+
+    def run(self, steps: int) -> Result:
+        """So many periods more, or fewer where the plant is lost; what they and those before them came to."""
+        if steps < 1:
+            raise ValueError(f"steps = {steps}: at least 1")
+        self._lost = None
+        with one_blas_thread():
+            try:
+                for _ in range(steps):
+                    self._lockstep.step()
+                self._lockstep.so_far()
+            except PlantError as error:
+                self._lost = f"at step {self._lockstep.taken}: {error}"
+        return self.result
+
+    @property
+    def result(self) -> Result:
+        """All steps so far."""
+        return Result(self._lockstep.so_far(lost=self._lost is not None), self._lost)
+
+    def _step(self, x: np.ndarray | None) -> Step:
+        with one_blas_thread():
+            state, outputs = self._lockstep.step(x)
+        return Step(state.t, np.array(state.x), np.array(outputs.command.u), outputs.result)
+
+
+class Result:
+    """What the steps of a loop came to. n steps, d states, m inputs; NaN where a step has no such figure."""
+
+    def __init__(self, run: Run, lost: str | None = None):
+        self.run = run
+        """Every message, as a log has it."""
+        self.lost = lost
+        """Why the true motion could not be followed any further; None: it could."""
+
+    @cached_property
+    def traces(self) -> Traces:
+        """The arrays below, and what pictures need besides."""
+        return traces(self.run)
+
+    @property
+    def t(self) -> np.ndarray:
+        """(n,) seconds, of the steps."""
+        return self.traces.t
+
+    @property
+    def x(self) -> np.ndarray:
+        """(n + 1, d) the plant's states, the last one behind the last step; (n, d) of a plant that moves elsewhere."""
+        return self.traces.motion.x
+
+    @property
+    def u(self) -> np.ndarray:
+        """(n, m) the inputs."""
+        return self.traces.u
+
+    @property
+    def h(self) -> np.ndarray:
+        """(n, d) x - A x_before - B u_before: what the model missed in the period before each step."""
+        return self.traces.h
+
+    @property
+    def h_hat(self) -> np.ndarray:
+        """(n, d) what the oracle had said of it."""
+        return self.traces.h_hat
+
+    @property
+    def solve_ms(self) -> np.ndarray:
+        """(n,) milliseconds that each solve took."""
+        return self.traces.solve_ms
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Cost, overshoot, constraint violations and more, as `tandem simulate` prints them."""
+        return summarise(self.run)
+
+    def plot(self) -> Figure:
+        """All of it on one page. Needs matplotlib."""
+        from run_log.reporting import plots
+        from run_log.reporting.report import title
+
+        return plots.overview(self.traces, title(self.run))
+
+    def save(self, path: str | Path) -> Path:
+        """Write the log, for `tandem replay` and `tandem report`. Needs mcap.
+
+        Raises:
+            LogError: something is there already, or it cannot be written.
+        """
+        save(self.run, path)
+        return Path(path)
+
+
+def _resolved(
+    config: str | Path | Config | None,
+    settings: Mapping[str, Any],
+    arguments: Mapping[str, tuple[str, Any]],
+) -> Config:
+    """The configuration with the settings in it, and with the arguments that are not None, (key, value) by name."""
+    folder, where = None, "Loop"
+    if isinstance(config, Config):
+        tree = to_tree(config)
+    elif config is None:
+        tree = {}
+    else:
+        file = config_file(config)
+        tree, folder, where = strict.load_tree(file), file.parent, str(config)
+    origins: dict[str, str] = {}
+    _merge(tree, settings, "", origins)
+    for name, (key, value) in arguments.items():
+        if value is not None:
+            table, last = key.split(".")
+            _merge(tree, {table: {last: value}}, "", {})
+            origins[key] = f"Loop({name}=)"
+    return from_tree(tree, where, origins, folder)
+
+
+def _merge(tree: dict[str, Any], changes: Mapping[str, Any], above: str, origins: dict[str, str]) -> None:
+    for name, value in changes.items():
+        key = f"{above}{name}"
+        if isinstance(value, Mapping) and key not in TABLES_OF_NAMES:
+            below = tree.setdefault(name, {})
+            if not isinstance(below, dict):
+                raise ConfigError(f"{key} is a value, not a table")
+            _merge(below, value, f"{key}.", origins)
+        else:
+            tree[name] = value.tolist() if isinstance(value, np.ndarray) else value
+            origins[key] = "Loop"
+
+
+TABLES_OF_NAMES = ("plant.truth", "plant.bounds", "network.options")
+"""Their keys are no settings: a new table replaces the old one."""
+
+
+def _given(config: Config, known: object, truth: Known | Plant | TrueMotion | None) -> GivenPlant | None:
+    """The objects that stand for what the configuration would name. Raises `ConfigError`."""
+    if not isinstance(known, Known | Plant) and truth is None:
+        return None
+    model = known if isinstance(known, Known | Plant) else build_plant(config)
+    if truth is None:
+        return GivenPlant(model, truth=true_plant_of(config, get_plant, model))
+    if isinstance(truth, Description):
+        try:
+            get_plant(truth)
+        except PlantDefinitionError as error:
+            raise ConfigError(f"truth: {error}") from error
+        if (truth.states, truth.inputs) != (model.states, model.inputs):
+            raise ConfigError(
+                f"truth: its states and inputs are {', '.join((*truth.states, *truth.inputs))}, and those of known "
+                f"{', '.join((*model.states, *model.inputs))}; the same names in the same order are needed"
+            )
+    elif not callable(getattr(truth, "step", None)):
+        raise ConfigError(
+            f"truth: {type(truth).__name__} is neither a plant nor an object with step(x, u, dt) that returns the "
+            "state dt seconds later"
+        )
+    return GivenPlant(model, truth=truth)

@@ -1,0 +1,54 @@
+"""What `lbmpc` and `tandem` say is public: there, lazy, and as their docstrings show it."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import lbmpc
+import tandem
+
+
+def test_the_solve_of_the_docstring_gives_an_input() -> None:
+    (block,) = re.findall(r"\n\n((?:    .*\n|\n)+)", lbmpc.__doc__ or "")
+    names: dict[str, object] = {}
+    exec(textwrap.dedent(block), names)
+    np.testing.assert_allclose(np.asarray(names["u"]), [1.1595349], atol=1e-6)
+
+
+@pytest.mark.parametrize("package", [lbmpc, tandem])
+def test_every_public_name_is_there_and_is_the_one_that_type_checkers_see(package: ModuleType) -> None:
+    tree = ast.parse(Path(package.__file__ or "").read_text())
+    (checked,) = [node for node in tree.body if isinstance(node, ast.If)]
+    imported = {
+        alias.name: node.module
+        for node in checked.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert sorted(imported) == sorted(package.__all__)
+    for name, module in imported.items():
+        assert getattr(package, name) is getattr(sys.modules[str(module)], name)
+        assert name in dir(package)
+    with pytest.raises(AttributeError, match="has no attribute 'Lop'"):
+        _ = package.Lop
+
+
+def test_nothing_is_imported_before_it_is_asked_for() -> None:
+    code = (
+        "import sys, lbmpc, tandem\n"
+        "found = {name.split('.')[0] for name in sys.modules} & {'numpy', 'casadi', 'torch', 'matplotlib', 'scipy'}\n"
+        "sys.stdout.write(' '.join(found))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == ""

@@ -1,0 +1,225 @@
+"""`tandem.Loop`: the lock-step in Python, at once or one step at a time, with a plant that moves elsewhere too."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lbmpc.plants import Known, Truth, get_plant
+from node_runtime.config.loading import load
+from node_runtime.config.strict import ConfigError
+from protocol import topics
+from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
+from run_log.run import Run
+from tandem import Loop
+from tandem.experiments.simulation.lockstep import simulate
+
+PLANT = get_plant("moore_greitzer")
+QUICK: dict[str, Any] = {
+    "oracle": "dnn",
+    "controller": {"horizon": 15, "solver": {"compile": "never"}},
+    "network": {"hidden": [8, 8]},
+    "trainer": {"steps": 20},
+    "seed": 3,
+}
+AS_SET = [
+    "controller.horizon=15",
+    "controller.solver.compile=never",
+    "network.hidden=[8, 8]",
+    "trainer.steps=20",
+    "seed=3",
+]
+STEPS = 30
+
+
+class Simulator:
+    """Somebody's own, of the same plant."""
+
+    def __init__(self, fails_after: int = 10_000):
+        self.motion, self.left = Truth(PLANT), fails_after
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        self.left -= 1
+        if self.left < 0:
+            raise RuntimeError("the mesh is torn")
+        return self.motion.step(x, u, dt)
+
+
+def payloads(run: Run) -> dict[str, list[bytes]]:
+    """All that does not depend on the clock."""
+    return {
+        topic.name: [entry.payload for entry in run.entries(topic)]
+        for topic in topics.ALL
+        if topic is not topics.TIMING
+    }
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Run:
+    return simulate(load(None, AS_SET), STEPS)
+
+
+def test_it_is_the_run_of_tandem_simulate_to_the_bit(simulated: Run) -> None:
+    assert any(result.weights_outcome == "adopted" for result in simulated.results)
+    result = Loop(**QUICK).run(STEPS)
+    assert result.lost is None
+    assert payloads(result.run) == payloads(simulated)
+
+
+def test_it_can_be_run_on_and_looked_at_in_between(simulated: Run) -> None:
+    loop = Loop(**QUICK)
+    loop.run(10)
+    step = loop.step()
+    assert (step.t, step.result.seq) == (pytest.approx(10 * 0.05), 10)
+    assert loop.result.x.shape == (12, 4)
+    assert payloads(loop.run(STEPS - 11).run) == payloads(simulated)
+
+
+def test_steps_and_arrays_say_the_same() -> None:
+    loop = Loop(PLANT, **QUICK)
+    steps = [loop.step() for _ in range(STEPS)]
+    result = loop.result
+    np.testing.assert_array_equal([step.x for step in steps], result.x[:-1])
+    np.testing.assert_array_equal([step.u for step in steps], result.u)
+    np.testing.assert_allclose([step.t for step in steps], result.t)
+    assert result.h.shape == result.h_hat.shape == (STEPS, 4)
+    assert np.isnan(result.h[0]).all()
+    model = loop.plant
+    assert model.states == PLANT.states
+    x, u = result.x[4] - model.x_e, result.u[4] - model.u_e
+    core = loop._lockstep.core.controller.model
+    np.testing.assert_allclose(result.h[5], result.x[5] - model.x_e - core.A @ x - core.B @ u, atol=1e-12)
+    assert (result.solve_ms > 0).all()
+    assert result.summary.ticks == STEPS
+
+
+def test_a_plant_that_moves_elsewhere_gets_the_same_inputs_and_labels(simulated: Run) -> None:
+    loop, truth, x = Loop(**QUICK), Truth(PLANT), PLANT.x0
+    for _ in range(STEPS):
+        u = loop.control(x)
+        x = truth.step(x, u, 0.05)
+    ours, theirs = payloads(loop.result.run), payloads(simulated)
+    # Where the last input led nobody has said yet.
+    theirs[topics.PLANT_STATE.name].pop()
+    assert ours == theirs
+
+
+def test_a_state_that_is_none_changes_nothing() -> None:
+    loop, other = (Loop(oracle="linear", config="compressor") for _ in range(2))
+    loop.control(PLANT.x0)
+    for bad in ([1.0, 2.0], [np.nan, 0, 0, 0], 3.0):
+        with pytest.raises(
+            ValueError, match=r"is no state of moore_greitzer: 4 finite numbers \(z, y, r, rdot\)"
+        ):
+            loop.control(bad)
+    other.control(PLANT.x0)
+    np.testing.assert_array_equal(loop.control(PLANT.x0 + 0.01), other.control(PLANT.x0 + 0.01))
+
+
+def test_another_episode_begins_without_a_label_and_with_what_was_learned() -> None:
+    loop = Loop(**QUICK)
+    loop.run(10)
+    learned = loop.result.run.output_weights[-1].K.numpy()
+    loop.start_again()
+    step = loop.step()
+    np.testing.assert_array_equal(step.x, PLANT.x0)
+    assert step.result.h is None
+    np.testing.assert_array_equal(loop.result.run.output_weights[-1].K.numpy(), learned)
+    # By hand too, from wherever it is.
+    loop.start_again()
+    loop.control(PLANT.x_e + 0.01)
+    assert loop.result.run.results[-1].h is None
+    assert loop.result.run.plant_states[-1].x == (PLANT.x_e + 0.01).tolist()
+
+
+@pytest.mark.parametrize("truth", [Simulator(), PLANT])
+def test_objects_are_true_as_well(truth: object, simulated: Run) -> None:
+    assert payloads(Loop(truth=truth, **QUICK).run(STEPS).run) == payloads(simulated)
+
+
+def test_other_parameters_are_those_of_the_configuration() -> None:
+    run = simulate(load(None, [*AS_SET, "plant.truth.beta=1.3"]), STEPS)
+    assert payloads(Loop(truth={"beta": 1.3}, **QUICK).run(STEPS).run) == payloads(run)
+
+
+def test_a_simulator_that_fails_ends_the_run_with_its_cause() -> None:
+    result = Loop(truth=Simulator(fails_after=7), **QUICK).run(STEPS)
+    assert result.lost == "at step 8: Simulator.step: RuntimeError: the mesh is torn"
+    assert result.u.shape == (8, 1)
+
+
+def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
+    cart = Known.from_matrices(
+        [[0.0, 1.0], [0.0, 0.0]],
+        [[0.0], [1.0]],
+        name="cart",
+        states=["s", "v"],
+        inputs=["force"],
+        W=[0.1, 0.5],
+        x_min=[-2, -2],
+        x_max=[2, 2],
+        u_min=[-1],
+        u_max=[1],
+        x0=[1.0, 0.0],
+    )
+
+    class Cart:
+        def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+            force = u[0] - 0.3 * x[1]
+            return np.array([x[0] + dt * x[1] + 0.5 * dt**2 * force, x[1] + dt * force])
+
+    loop = Loop(cart, truth=Cart(), oracle="constant", controller={"solver": {"compile": "never"}})
+    result = loop.run(150)
+    assert np.abs(result.x[-1]).max() < 0.01
+    assert result.summary.constraint_violations == 0
+    log = result.save(tmp_path / "cart.mcap")
+    found = replay(read_run(log))
+    assert found.equal
+    assert found.ticks == 150
+
+
+def test_it_is_drawn_and_saved_as_any_run(tmp_path: Path) -> None:
+    result = Loop(**QUICK).run(STEPS)
+    result.plot().savefig(tmp_path / "run.png")
+    assert replay(read_run(result.save(tmp_path / "run.mcap"))).equal
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"oracle": "dmm"}, "Loop(oracle=): controller.oracle = 'dmm' is not one of constant, dnn"),
+        (
+            {"controller": {"horizn": 3}},
+            "Loop: unknown key 'controller.horizn'; did you mean 'controller.horizon'?",
+        ),
+        ({"controller": 3}, "controller = 3 is a table"),
+        ({"rate": "fast"}, "rate = 'fast' is not a number"),
+        ({"config": "compresor"}, "did you mean 'compressor'?"),
+        ({"known": "gru.py:X"}, "gru.py: no such file"),
+        ({"known": "compressor"}, "no plant is called 'compressor'"),
+        ({"truth": {"B": 1.0}}, "moore_greitzer has no parameter 'B'"),
+        ({"truth": 3}, "truth: int is neither a plant nor an object with step(x, u, dt)"),
+    ],
+)
+def test_a_mistake_is_said_as_in_a_configuration(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        Loop(**given)
+    assert said in str(error.value)
+
+
+def test_without_a_trainer_no_torch_is_imported() -> None:
+    code = (
+        "import sys\nfrom tandem import Loop\n"
+        "Loop(oracle='dnn', train=False, controller={'solver': {'compile': 'never'}, 'horizon': 5}).run(2)\n"
+        "sys.stdout.write(' '.join({name.split('.')[0] for name in sys.modules} & {'torch', 'matplotlib'}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == ""
