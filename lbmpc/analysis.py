@@ -10,29 +10,14 @@ import numpy as np
 
 from lbmpc.model import LARGEST_GROWTH, Model
 
-UNMOVED = 1e-8
-"""Distance to a model whose mode no input moves, relative to this one, below which it is taken for one."""
 STABLE = 1e-9
-"""How far above 1 rounding may leave |eigenvalue|."""
+"""How far above 0 rounding may leave a growth a step."""
 SETTLED = 0.2
 """Half-widths into which the feedback has brought every state from all of X when it counts as settled."""
 MOST_STEPS = 1000
-SHOWN = 0.3
-"""Share of the largest part of a mode from which a state is named."""
 
 Step = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 """(x, u, dt) -> x, in plant units: the true motion."""
-
-
-@dataclass(frozen=True)
-class Mode:
-    """An eigenvalue of A that no input moves."""
-
-    pole: complex
-    """1/s."""
-    states: tuple[str, ...]
-    """Those that it is mostly made of."""
-    decays: bool
 
 
 def poles(matrix: np.ndarray, period: float) -> np.ndarray:
@@ -40,27 +25,6 @@ def poles(matrix: np.ndarray, period: float) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.log(np.linalg.eigvals(matrix).astype(complex)) / period
     return found[np.lexsort((-found.imag, -found.real))]
-
-
-def unmoved_modes(model: Model) -> list[Mode]:
-    """Modes that no input moves, by Hautus' test in half-widths; a stabilisable model has none that does not decay."""
-    x, u = model.plant.x_scale, model.plant.u_scale
-    A, B = model.A * x / x[:, None], model.B * u / x[:, None]
-    found = []
-    for value in np.linalg.eigvals(A):
-        if value.imag < 0.0:
-            continue
-        test = np.hstack([value * np.eye(model.d) - A, B])
-        left, singular, _right = np.linalg.svd(test)
-        # With as many rows as states, the last one says how near a combination of them is to none.
-        if singular[-1] > UNMOVED * np.linalg.norm(np.hstack([A - np.eye(model.d), B]), 2):
-            continue
-        parts = np.abs(left[:, -1])
-        names = [model.plant.states[i] for i in np.flatnonzero(parts > SHOWN * parts.max())]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pole = complex(np.log(complex(value)) / model.period)
-        found.append(Mode(pole, tuple(names), bool(abs(value) < 1.0 - STABLE)))
-    return found
 
 
 def reach(model: Model, steps: int) -> np.ndarray:

@@ -35,6 +35,10 @@ class Identify(Command):
         None
     )
     """Write a plant file, for plant.model=FILE.py:PLANT."""
+    plant: Annotated[
+        str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the logs' numbers)")
+    ] = None
+    """The plant file that the logs were made with, where they do not carry its numbers."""
 
     def run(self) -> int:
         """0, or 2 where the logs do not say what A and B are."""
@@ -70,6 +74,7 @@ class Identify(Command):
 
     def _read(self) -> tuple[Known, float, list[Observed]]:
         """The plant as the first log has it, the period, and what each log saw."""
+        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.reading.transitions import observed
 
@@ -77,6 +82,7 @@ class Identify(Command):
         logs = []
         for file in self.files:
             ran = read_run(file)
+            notes = [] if self.plant is None else name_plant(ran, self.plant)
             model = _model_of(ran)
             if first is None:
                 first = model
@@ -88,8 +94,7 @@ class Identify(Command):
                     "are those of one period"
                 )
             logs.append(observed(ran, model))
-            if ran.note:
-                self.say(ran.note, style="yellow")
+            self.say(*notes, *([ran.note] if ran.note else []), style="yellow")
         if first is None:
             raise Refused("no log is given")
         return first.plant, first.period, logs

@@ -10,7 +10,6 @@ import pytest
 
 from lbmpc.analysis import (
     SETTLED,
-    Mode,
     growth,
     longest_horizon,
     poles,
@@ -18,7 +17,6 @@ from lbmpc.analysis import (
     sample_disturbance,
     settling_steps,
     under_safe_input,
-    unmoved_modes,
 )
 from lbmpc.model import Model, ModelError, build_model, require_horizon
 from lbmpc.plants import PlantError, Truth
@@ -26,13 +24,13 @@ from tests.helpers.plants.pendulum import PENDULUM, pendulum
 from tests.helpers.plants.two_tanks import TWO_TANKS
 
 
-def with_drive(rate: float, pushed: bool) -> Model:
-    """A pendulum beside a state of its own, dz/dt = rate z, which the torque moves or does not."""
+def with_heat() -> Model:
+    """A pendulum beside a state that the torque does not move."""
     beside = replace(
         PENDULUM,
         states=("angle", "rate", "heat"),
         units={**PENDULUM.units, "heat": "K"},
-        rhs=lambda x, u: [x[1], 4.0 * ca.sin(x[0]) + u[0], rate * x[2] + (0.5 * u[0] if pushed else 0.0)],
+        rhs=lambda x, u: [x[1], 4.0 * ca.sin(x[0]) + u[0], -0.7 * x[2]],
         parameters={},
         equations=None,
         x_e=np.zeros(3),
@@ -52,13 +50,6 @@ def test_poles_are_those_of_the_equations() -> None:
     assert poles(np.zeros((1, 1)), 1.0)[0].real == -np.inf
 
 
-def test_a_mode_that_no_input_moves_is_found_with_its_state() -> None:
-    (mode,) = unmoved_modes(with_drive(-0.7, pushed=False))
-    assert mode == Mode(pytest.approx(-0.7), ("heat",), decays=True)
-    assert unmoved_modes(with_drive(-0.7, pushed=True)) == []
-    assert unmoved_modes(pendulum()) == []
-
-
 def test_reach_is_what_full_inputs_do() -> None:
     """By hand: the best input for a state follows the sign of its response."""
     model = pendulum()
@@ -68,7 +59,7 @@ def test_reach_is_what_full_inputs_do() -> None:
         for k in range(20):
             x = model.A @ x + model.B[:, 0] * 3.0 * np.sign(responses[19 - k][i, 0])
         assert reach(model, 20)[i] == pytest.approx(x[i] / model.plant.x_scale[i])
-    assert reach(with_drive(-0.7, pushed=False), 20)[2] == pytest.approx(0.0, abs=1e-12)
+    assert reach(with_heat(), 20)[2] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_growth_and_the_longest_horizon_are_those_that_a_controller_is_held_to() -> None:

@@ -14,13 +14,15 @@ from tandem.commands.base import FROM_CONFIG, Configured
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lbmpc.analysis import SampledDisturbance, Step
+    from lbmpc.analysis import SampledDisturbance
     from lbmpc.model import Model
     from lbmpc.plants import Known, Plant
     from node_runtime.config.sections import Config
     from tandem.commands.model.findings import Finding
 
 SAMPLES = 500
+ROUNDING = 1e-9
+"""Half-widths."""
 MARKS = {"ok": ("ok", "green"), "note": ("look", "yellow"), "fault": ("wrong", "bold red")}
 
 
@@ -73,13 +75,14 @@ class ModelCheck(Configured):
 
     def _look(self, config: Config, model: Model, plant: Known | Plant) -> int:
         from lbmpc.analysis import advised_horizon, poles, reach, sample_disturbance
-        from lbmpc.plants import Known, PlantError
-        from node_runtime.config.plant import initial_state
+        from lbmpc.plants import Known, PlantError, get_plant, true_motion
+        from node_runtime.config.plant import initial_state, true_plant_of
         from tandem.commands.model.findings import disturbance_finding, findings
         from tandem.model_tables import matrix_tables
 
         known, horizon, x0 = model.plant, config.controller.horizon, initial_state(config, plant)
-        step = _true_step(config, plant)
+        true = true_plant_of(config, get_plant)
+        step = true_motion(true).step
         self.say(f"{known.name}: {_kind(plant)}; a sample every {model.period:.6g} s", "")
         self.say("x+ = A x + B u, in deviations from x_e and u_e")
         scales = known.x_scale, np.concatenate([known.x_scale, known.u_scale])
@@ -88,7 +91,8 @@ class ModelCheck(Configured):
         for table in matrix_tables(self.console.width, known.states, names, matrices, scales):
             self.console.print(table)
         sampled = bound = None
-        if step is not None:
+        # Of matrices that are their own truth h is zero.
+        if not isinstance(true, Known):
             with self.console.status("asking the true motion for h"):
                 rng = np.random.default_rng(0)
                 sampled = sample_disturbance(model, step, SAMPLES, rng, PlantError)
@@ -152,15 +156,6 @@ class ModelCheck(Configured):
         return np.abs(box.vertices).max(axis=0) / model.period
 
 
-def _true_step(config: Config, plant: Known | Plant) -> Step | None:
-    """The true motion: of the equations, or what `plant.truth` names; None where numbers are all there is."""
-    from lbmpc.plants import Known, get_plant, true_motion
-    from node_runtime.config.plant import true_plant_of
-
-    true = true_plant_of(config, get_plant)
-    return None if isinstance(true, Known) else true_motion(true).step
-
-
 def _kind(plant: Known | Plant) -> str:
     from lbmpc.plants import Known
 
@@ -169,9 +164,14 @@ def _kind(plant: Known | Plant) -> str:
     return "A and B in continuous time" if plant.period is None else "A and B in discrete time"
 
 
-def _with_unit(known: Known, name: str, value: float, per: str = "") -> str:
-    unit = known.units[name] + per if known.units[name] != "1" else per.replace("/", "1/", 1)
-    return f"{value:.3g} {unit}".rstrip()
+def _with_unit(known: Known, name: str, value: float) -> str:
+    unit = known.units[name]
+    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"
+
+
+def _rounded(value: float, scale: float) -> str:
+    """Four digits; what is rounding beside the half-width is 0."""
+    return f"{0.0 if abs(value) < ROUNDING * scale else value:.4g}"
 
 
 def _state_table(
@@ -190,7 +190,8 @@ def _state_table(
     names += ["largest h found"] * (sampled is not None) + ["h bound"] * (bound is not None)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, state in enumerate(known.states):
-        row = [_with_unit(known, state, known.x_scale[i]), f"{known.x_e[i]:.4g}", f"{x0[i]:.4g}"]
+        scale = known.x_scale[i]
+        row = [_with_unit(known, state, scale), _rounded(known.x_e[i], scale), _rounded(x0[i], scale)]
         row += [f"{moved[i]:.3g}", f"{known.W[i]:.3g}"]
         row += [] if sampled is None else [f"{sampled.largest[i]:.3g}"]
         row += [] if bound is None else [f"{bound[i]:.3g}"]
@@ -206,8 +207,8 @@ def _input_table(known: Known) -> Table:
     names = ("half-width", "u_e", "u_min", "u_max", "safe input")
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, name in enumerate(known.inputs):
-        values = (known.u_e[i], known.u_min[i], known.u_max[i], known.safe_input[i])
-        shown.add_row(name, _with_unit(known, name, known.u_scale[i]), *(f"{value:.4g}" for value in values))
+        values, scale = (known.u_e[i], known.u_min[i], known.u_max[i], known.safe_input[i]), known.u_scale[i]
+        shown.add_row(name, _with_unit(known, name, scale), *(_rounded(value, scale) for value in values))
     return shown
 
 

@@ -19,10 +19,10 @@ from lbmpc.analysis import (
     poles,
     reach,
     under_safe_input,
-    unmoved_modes,
 )
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.plants import PlantError
+from lbmpc.plants.matrices import unmoved_modes
 from tandem.model_tables import percent, poles_text
 
 Verdict = Literal["ok", "note", "fault"]
@@ -41,14 +41,14 @@ class Finding:
     text: str
 
 
-def findings(model: Model, horizon: int, x0: np.ndarray, step: Step | None) -> Iterator[Finding]:
+def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
     """Of a model for which there is a controller.
 
     Args:
         model: at the rate.
         horizon: N of the configuration.
         x0: (d,), plant units.
-        step: the true motion, where one is known.
+        step: the true motion; where none is known, the model's own.
     """
     yield _stability(model)
     yield _inputs(model, horizon)
@@ -95,13 +95,17 @@ def _stability(model: Model) -> Finding:
 
 
 def _inputs(model: Model, horizon: int) -> Finding:
-    unmoved = unmoved_modes(model)
+    plant = model.plant
+    unmoved = [
+        " and ".join(plant.states[i] for i in mode.states)
+        for mode in unmoved_modes(plant.A, plant.B, plant.x_scale, plant.u_scale)
+    ]
     if unmoved:
-        modes = ", ".join(f"{mode.pole:.3g} 1/s in {' and '.join(mode.states)}" for mode in unmoved)
-        return Finding("note", "controllability", f"no input moves the mode at {modes}; it decays by itself")
+        text = f"no input moves {', nor '.join(unmoved)}, which decays by itself"
+        return Finding("note", "controllability", text)
     weak = [
         f"{state} by {percent(moved)}"
-        for state, moved in zip(model.plant.states, reach(model, horizon), strict=True)
+        for state, moved in zip(plant.states, reach(model, horizon), strict=True)
         if moved < WEAK
     ]
     if weak:
@@ -146,9 +150,7 @@ def _start(model: Model, x0: np.ndarray) -> Finding:
     return Finding("ok", "x0", "in X")
 
 
-def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step | None) -> Iterator[Finding]:
-    if step is None:
-        return
+def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
     seconds = max(FOLLOWED, 2.0 * horizon * model.period)
     law = "the safe input" if model.plant.safe_gain is None else "the safe input with its gain"
     for where, start in (("x0", x0), ("x_e", model.plant.x_e)):
