@@ -34,6 +34,8 @@ KNOWN = 0.1
 """Half-widths to which one step from a half-width away must be known, as a standard error."""
 MARGIN = 1.25
 """Of W over the largest held-out residual: of n samples the next one exceeds the largest with a chance of 1 / n."""
+ROUNDING = 1e-9
+"""Half-widths."""
 SHOWN = 0.05
 """Share of the largest coefficient below which a sentence leaves a term out."""
 
@@ -316,7 +318,8 @@ def _combination(variables: Variables, direction: np.ndarray) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %"
+    """With two digits; rounding is 0."""
+    return f"{100.0 * share:.2g} %" if share > ROUNDING else "0 %"
 
 
 def _rounded_up(values: np.ndarray) -> np.ndarray:

@@ -101,8 +101,7 @@ class ModelCheck(Configured):
         moved = reach(model, horizon)
         self.say(
             "",
-            f"moved: by full inputs within the horizon of {horizon * model.period:.3g} s, in half-widths; W and h: "
-            "per second",
+            f"moved: by full inputs in {horizon * model.period:.3g} s, the horizon, half-widths; W, h: per second",
         )
         self.console.print(_state_table(model, x0, moved, sampled, bound))
         self.console.print(_input_table(known))
@@ -151,7 +150,7 @@ class ModelCheck(Configured):
                 task = bar.add_task("bounding h", total=1.0)
                 box = bound_box(model, Region(*sides), progress=lambda done: bar.update(task, completed=done))
         except DisturbanceError as error:
-            self.say(f"h cannot be bounded: {error}", style="yellow")
+            self.console.print(f"h cannot be bounded: {error}", style="yellow")
             return None
         return np.abs(box.vertices).max(axis=0) / model.period
 

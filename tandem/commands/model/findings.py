@@ -72,7 +72,8 @@ def disturbance_finding(model: Model, found: SampledDisturbance) -> Finding:
         for i in np.flatnonzero(found.largest > plant.W * (1 + 1e-9) + 1e-9 * plant.x_scale)
     ]
     if not above:
-        return Finding("ok", "W", f"holds h at {found.samples} points of X and U{lost}")
+        verdict: Verdict = "note" if found.lost else "ok"
+        return Finding(verdict, "W", f"holds h at {found.samples} points of X and U{lost}")
     return Finding(
         "note",
         "W",
