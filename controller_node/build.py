@@ -19,7 +19,7 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -94,7 +94,7 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
     if config.controller.oracle == "constant":
         return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
-        truth = true_plant_of(config, get_plant) if given is None else given.truth
+        truth = true_plant_of(config, get_plant, get_truth) if given is None else given.truth
         if not isinstance(truth, Plant):
             raise ConfigError(
                 "controller.oracle = 'perfect': it needs the equations of the true plant, and there are none"

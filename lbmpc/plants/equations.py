@@ -6,7 +6,7 @@ Bring your own plant as one file: give `rhs` in CasADi operations and fill in a 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -47,6 +47,16 @@ class Plant(Description):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "positive", as_tuple(self.positive))
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Plant:
+        """As that of a description; of x_e and u_e alone, about the nearest rest. Raises `PlantDefinitionError` too."""
+        there = super().changed(bounds, x_e, u_e)
+        return there if (x_e is None) == (u_e is None) else there.resting_near()
 
     def known(self) -> Known:
         """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""

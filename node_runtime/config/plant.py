@@ -92,8 +92,14 @@ def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P
     return found
 
 
-def true_plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P | Motion:
+def true_plant_of(
+    config: Config, find: Find[P], find_truth: Callable[[Any], P], plant: Described | None = None
+) -> P | Motion:
     """The plant as it really moves: `plant_of` with the parameters of `plant.truth`, or what that names.
+
+    Args:
+        find, plant: as for `plant_of`.
+        find_truth: `lbmpc.plants.get_truth`.
 
     Raises:
         ConfigError: as `plant_of`; `plant.truth` names nothing that moves, or a plant with other states or inputs.
@@ -105,7 +111,7 @@ def true_plant_of(config: Config, find: Find[P], plant: Described | None = None)
         found = load(truth, _moves, "plant or object with step") if is_reference(truth) else truth
         if hasattr(found, "step"):
             return found
-        true = find(found, lambda plant: plant)
+        true = find_truth(found)
     except ConfigError as error:
         raise ConfigError(f"plant.truth: {error}") from error
     except LookupError as error:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import msgspec
 
 from node_runtime import provenance
+from node_runtime.config.plant import files_of
 from node_runtime.config.sections import Config
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.study.declaration import Resolved
@@ -39,8 +40,9 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def key(self) -> str:
-        """Of everything that its result depends on: settings and code."""
-        return hashlib.sha256(msgspec.json.encode(self) + code_version().encode()).hexdigest()[:24]
+        """Of everything that its result depends on: settings and code, a plant file's too."""
+        files = msgspec.json.encode(files_of(self.config))
+        return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
 
 
 class RowPlan(NamedTuple):

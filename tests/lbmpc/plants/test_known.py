@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lbmpc.model import ModelError, build_model
-from lbmpc.plants import PLANTS, Known, PlantDefinitionError, Truth, get_plant, true_motion
+from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, Truth, get_plant, true_motion
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
@@ -179,6 +179,10 @@ WITHOUT_MOTION = {
         [[0.9, 0.5, 0.0], [0.0, 1e-9, 1.0], [0.0, 1e-9, 1e-9]],
         [[0.0], [0.0], [1.0]],
     ),
+    "one with a motion of rounding": (
+        [[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, -1e-6, 0.0]],
+        [[0.0], [0.0], [1.0]],
+    ),
     "a sign that alternates": ([[-0.4, 0.1], [0.0, 0.8]], [[1.0], [1.0]]),
 }
 
@@ -255,8 +259,30 @@ def test_numbers_rest_elsewhere_too() -> None:
     moved = numbers().resting_near(x_e=[0.5, 0.0])
     np.testing.assert_allclose(moved.x_e, [0.5, 0.0], atol=1e-14)
     np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
-    again = moved.resting_near()
-    assert (again.x_e.tolist(), again.u_e.tolist()) == (moved.x_e.tolist(), moved.u_e.tolist())
+
+
+@pytest.mark.parametrize("plant", [TWO_TANKS, TWO_TANKS.known()], ids=["equations", "numbers"])
+def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
+    there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
+    assert there.u_max.tolist() == [25.0]
+    assert np.abs(there.x_e - [9.0, 14.0]).max() < 1.0
+    assert faults(there) == ()
+    # What is shown of it can be given, and is the same to the bit.
+    again = plant.changed({"q": (0.0, 25.0)}, there.x_e.tolist(), there.u_e.tolist())
+    assert (again.x_e.tolist(), again.u_e.tolist()) == (there.x_e.tolist(), there.u_e.tolist())
+
+
+def test_what_cannot_be_changed_is_looked_at_first() -> None:
+    broken = replace(PENDULUM, rhs=lambda x, u: [x[1], 1 / 0], equations=None, parameters={})
+    for bad in (broken, replace(PENDULUM.known(), A=np.eye(3)), replace(numbers(), W=[NAN, 1.0])):
+        with pytest.raises(PlantDefinitionError, match=r"ZeroDivisionError|A has the shape|W of x1 is nan"):
+            get_plant(bad, lambda plant: plant.changed({}, x_e=[0.1, 0.0]))
+    inside = get_plant(
+        numbers(), lambda plant: plant.changed({"x1": (2.0, 4.0), "u1": (-9.0, 9.0)}, x_e=[3.0, 0.0])
+    )
+    np.testing.assert_allclose(inside.u_e, [6.0])
+    with pytest.raises(PlantDefinitionError, match="u_e of u1 is 6, but u_min of u1 is -3"):
+        get_plant(numbers(), lambda plant: plant.changed({"x1": (2.0, 4.0)}, x_e=[3.0, 0.0]))
 
 
 def test_equations_rest_where_a_known_wind_lets_them() -> None:
@@ -303,6 +329,8 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         else:
             assert its == ours
             assert type(its) is type(ours)
+    # A real pole stays real: its exponential is another function.
+    assert [type(pole) for pole in again.poles or ()] == [type(pole) for pole in known.poles or ()]
     for name in ("A", "B", "K", "P"):
         period = known.period or 0.05
         np.testing.assert_array_equal(

@@ -401,7 +401,7 @@ def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
 def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
     """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
     fast = replace(
-        two_inputs().plant,
+        two_inputs().equations,
         name="fast",
         rhs=lambda x, u: [-1000.0 * x[0] + u[0], x[1] + u[1]],
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from msgspec import inspect
 
-from lbmpc.plants import get_plant
+from lbmpc.plants import get_plant, get_truth
 from node_runtime.config.loading import from_json, from_tree, load, override, to_json, to_toml, to_tree
 from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
@@ -181,11 +181,11 @@ def test_what_the_plant_does_not_have(given: str, expected: str):
 
 def test_a_wrong_model_has_a_true_plant_beside_it():
     config = override(Config(), ["plant.truth.slope=1.4"])
-    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
     assert model is get_plant("moore_greitzer")
     assert truth.parameters == {**model.parameters, "slope": 1.4}
     assert (truth.x_e == model.x_e).all()
-    assert true_plant_of(Config(), get_plant) is model
+    assert true_plant_of(Config(), get_plant, get_truth) is model
 
 
 def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
