@@ -110,6 +110,29 @@ def test_a_plant_that_is_only_fed_back_is_refused_with_its_feedback() -> None:
     assert "several x0" in said
 
 
+def test_what_a_nonlinear_plant_does_along_one_path_is_not_taken_for_an_effect_of_the_input() -> None:
+    """A cart with drag comes home ten times on the same way, under one feedback that is not quite linear."""
+    T, gain = 0.05, 0.7
+    cart = Variables(("position", "speed"), ("force",), np.ones(2), np.array([3.0]), np.zeros(2), np.zeros(1))
+    rng, runs = RNG(0), []
+    for _ in range(10):
+        x, u = np.zeros((101, 2)), np.zeros((100, 1))
+        x[0] = -0.8, 0.0
+        for k in range(100):
+            u[k] = -0.98 * x[k, 0] - 1.46 * x[k, 1] + 0.4 * x[k, 0] ** 3 + 1e-4 * rng.standard_normal()
+            slope = gain * u[k, 0] - 0.4 * x[k, 1] - 0.5 * x[k, 1] * abs(x[k, 1])
+            x[k + 1] = x[k] + T * np.array([x[k, 1], slope])
+        runs.append(Transitions(x[:-1], u, x[1:]))
+    samples = runs[0]
+    for later in runs[1:]:
+        samples = samples.then(later)
+    found = identify(samples, T, cart)
+    assert abs(found.B[1, 0] - gain * T) < 2.0 * found.B_error[1, 0]
+    # More of the same does not make it better known.
+    once = identify(runs[0], T, cart)
+    assert found.B_error[1, 0] > 0.4 * once.B_error[1, 0]
+
+
 def test_a_constant_input_is_named() -> None:
     said = refused(moved(400, noise=0.05, push=0.0))
     assert "pump hardly moves: by 0 % of its half-width (RMS)" in said
