@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -19,7 +20,7 @@ class Motion:
 
     def __init__(self, truth: TrueMotion, x0: np.ndarray, period: float):
         """x0: (d,), plant units."""
-        self._truth = truth
+        self.truth = truth
         self._x = np.array(x0, dtype=float)
         self._period = period
         self._t = -math.inf
@@ -29,7 +30,7 @@ class Motion:
 
     def change(self, truth: TrueMotion) -> None:
         """From the last call on the motion is another: an experiment with a plant that drifts."""
-        self._truth, self._ahead = truth, None
+        self.truth, self._ahead = truth, None
 
     def read(self, due: float) -> np.ndarray:
         """x at that time, (d,). Raises `PlantError`: the motion cannot be followed to there."""
@@ -67,7 +68,7 @@ class Motion:
             return self._ahead[1]
         # Differences of large times are not exact; the period is.
         dt = self._period if math.isclose(t - self._t, self._period, rel_tol=1e-6) else t - self._t
-        x = np.asarray(self._truth.step(self._x, self._u, dt), dtype=float)
+        x = np.asarray(self.truth.step(self._x, self._u, dt), dtype=float)
         if x.shape != self._x.shape or not np.isfinite(x).all():
             raise PlantError(
                 f"the true motion leads from {self._x.tolist()} to {x.tolist()}, which is no state"
@@ -107,6 +108,12 @@ class PlantSim:
     def backup(self, backup: Backup) -> Verdict:
         """See `Shield.backup`."""
         return self._shield.backup(backup)
+
+    def look(self, t: float) -> PlantState:
+        """What `sample` would say at t; nothing changes. Raises as `sample` does."""
+        # Shared are the two that keep nothing.
+        shared = {id(one): one for one in (self._shield.plant, self._motion.truth)}
+        return copy.deepcopy(self, shared).sample(t)
 
     def sample(self, t: float) -> PlantState:
         """See `Shield.sample`. Raises `PlantError`: the true motion cannot be followed to t."""

@@ -57,7 +57,8 @@ def _named(run: Run, reference: str) -> tuple[Known | Plant, list[str]]:
         raise ConfigError(
             f"{reference}: no plant of that name comes with Tandem; a file is written tanks.py:TANKS"
         )
-    sha256, theirs = sha256_of(whole), sorted(run.files.values())
+    sha256 = sha256_of(whole)
+    theirs = sorted(text for key, text in run.files.items() if key.startswith("plant."))
     if not theirs or sha256 is None or sha256 in theirs:
         return named, []
     logged = " and ".join(text[:12] for text in theirs)

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+TABLES_OF_NAMES = ("plant.truth", "plant.bounds", "network.options")
+"""Their keys are no settings: a new table replaces the old one."""
+
+
 class Step(NamedTuple):
     """One period."""
 
@@ -136,30 +140,41 @@ class Loop:
         With `control` the next x is where it begins.
         """
         with one_blas_thread():
-            self._lockstep.start_again()
+            try:
+                self._lockstep.start_again()
+            except PlantError:
+                self._lockstep.start_again(lost=True)
+        self._lost = None
 
     def run(self, steps: int) -> Result:
         """So many periods more, or fewer where the plant is lost; what they and those before them came to."""
         if steps < 1:
             raise ValueError(f"steps = {steps}: at least 1")
-        self._lost = None
         with one_blas_thread():
             try:
                 for _ in range(steps):
                     self._lockstep.step()
-                self._lockstep.so_far()
             except PlantError as error:
-                self._lost = f"at step {self._lockstep.taken}: {error}"
+                self._lose(error)
         return self.result
 
     @property
     def result(self) -> Result:
         """All steps so far."""
-        return Result(self._lockstep.so_far(lost=self._lost is not None), self._lost)
+        if self._lost is None:
+            try:
+                return Result(self._lockstep.so_far())
+            except PlantError as error:
+                self._lose(error)
+        return Result(self._lockstep.so_far(lost=True), self._lost)
+
+    def _lose(self, error: PlantError) -> None:
+        self._lost = f"at step {self._lockstep.taken}: {error}"
 
     def _step(self, x: np.ndarray | None) -> Step:
         with one_blas_thread():
             state, outputs = self._lockstep.step(x)
+        self._lost = None
         return Step(state.t, np.array(state.x), np.array(outputs.command.u), outputs.result)
 
 
@@ -262,12 +277,8 @@ def _merge(tree: dict[str, Any], changes: Mapping[str, Any], above: str, origins
                 raise ConfigError(f"{key} is a value, not a table")
             _merge(below, value, f"{key}.", origins)
         else:
-            tree[name] = value.tolist() if isinstance(value, np.ndarray) else value
+            tree[name] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
             origins[key] = "Loop"
-
-
-TABLES_OF_NAMES = ("plant.truth", "plant.bounds", "network.options")
-"""Their keys are no settings: a new table replaces the old one."""
 
 
 def _given(config: Config, known: object, truth: Known | Plant | TrueMotion | None) -> GivenPlant | None:

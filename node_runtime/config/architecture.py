@@ -9,6 +9,7 @@ from network_model.operations import Architecture
 from network_model.registry import register
 from node_runtime.config.reference import is_reference, loaded
 from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 
 
 class OwnArchitecture(NamedTuple):
@@ -33,5 +34,10 @@ def register_architecture(config: Config) -> None:
         ConfigError: it names a file in which there is no such architecture.
     """
     reference = config.network.architecture
-    if is_reference(reference):
-        register(reference, *load_architecture(reference))
+    if not is_reference(reference):
+        return
+    try:
+        own = load_architecture(reference)
+    except ConfigError as error:
+        raise ConfigError(f"network.architecture: {error}") from error
+    register(reference, *own)

@@ -15,12 +15,16 @@ import pytest
 
 import lbmpc
 import tandem
+from tests.helpers.paths import DOCS
 
 
-def test_the_solve_of_the_docstring_gives_an_input() -> None:
+def test_the_solve_of_the_docstring_and_of_the_page_gives_an_input() -> None:
     (block,) = re.findall(r"\n\n((?:    .*\n|\n)+)", lbmpc.__doc__ or "")
+    code = textwrap.dedent(block)
+    page = (DOCS / "python.md").read_text()
+    assert f"```python\n{code.strip()}\n```" in page
     names: dict[str, object] = {}
-    exec(textwrap.dedent(block), names)
+    exec(code, names)
     np.testing.assert_allclose(np.asarray(names["u"]), [1.1595349], atol=1e-6)
 
 

@@ -21,7 +21,9 @@ from run_log.replaying.replay import replay
 from run_log.run import Run
 from run_log.writing.save import save
 from tandem.cli import main
+from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import simulate
+from tandem.experiments.study.plan import Job
 from tests.helpers.paths import DOCS, ROOT
 
 EXAMPLE = ROOT / "examples" / "architecture" / "gru.py"
@@ -178,6 +180,29 @@ def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert "virtual machine" not in runs[0].run_infos[0].versions["kernels"]
     u, v = ([command.u for command in run.commands] for run in runs)
     np.testing.assert_allclose(u, v, atol=1e-7)
+
+
+@pytest.mark.parametrize("process", ["controller", "trainer", "run"])
+def test_a_process_that_needs_the_file_says_that_it_is_not_there(
+    process: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([process, "--set", "network.architecture=absent.py:GRU"]) == 2
+    said = capsys.readouterr().err + caplog.text
+    assert f"network.architecture: {tmp_path / 'absent.py'}: no such file" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_experiment_runs_again_when_the_text_is_another(tmp_path: Path) -> None:
+    config = load(None, [f"network.architecture={own(tmp_path)}"])
+    job = Job(config=config, steps=1, episodes=1, faults=Faults())
+    before = job.key
+    own(tmp_path, ("GRU = Gru()", "GRU = Gru()  # mine"))
+    assert job.key != before
 
 
 # -- tandem architecture check ---------------------------------------------------------------------------------

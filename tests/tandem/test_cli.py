@@ -33,6 +33,8 @@ KEYS = {
         "iteration_limit_ticks",
         "fallback_ticks",
         "soft_ticks",
+        "unreached_ticks",
+        "target_distance",
     ),
     *(
         "episodes",
@@ -43,6 +45,7 @@ KEYS = {
         "overshoot",
         "settled_s",
         "settled_by_state_s",
+        "offset",
         "solve_ms",
         "tick_ms",
         "prediction_error",

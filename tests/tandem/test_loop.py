@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lbmpc.plants import Known, Truth, get_plant
+from lbmpc.plants import Truth, get_plant
 from node_runtime.config.loading import load
 from node_runtime.config.strict import ConfigError
 from protocol import topics
@@ -19,7 +20,9 @@ from run_log.replaying.replay import replay
 from run_log.run import Run
 from tandem import Loop
 from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.paths import DOCS
 
+PAGE = DOCS / "python.md"
 PLANT = get_plant("moore_greitzer")
 QUICK: dict[str, Any] = {
     "oracle": "dnn",
@@ -154,27 +157,30 @@ def test_a_simulator_that_fails_ends_the_run_with_its_cause() -> None:
     assert result.u.shape == (8, 1)
 
 
+def test_a_plant_that_was_lost_can_be_started_again() -> None:
+    simulator = Simulator(fails_after=3)
+    loop = Loop(truth=simulator, **QUICK)
+    assert loop.run(10).lost is not None
+    simulator.left = 100
+    loop.start_again()
+    result = loop.run(5)
+    assert result.lost is None
+    assert result.u.shape == (9, 1)
+    assert replay(result.run).equal
+
+
 def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
-    cart = Known.from_matrices(
-        [[0.0, 1.0], [0.0, 0.0]],
-        [[0.0], [1.0]],
-        name="cart",
-        states=["s", "v"],
-        inputs=["force"],
-        W=[0.1, 0.5],
-        x_min=[-2, -2],
-        x_max=[2, 2],
-        u_min=[-1],
-        u_max=[1],
-        x0=[1.0, 0.0],
-    )
+    # The plant of docs/python.md.
+    (block,) = re.findall(r"matrices\n\n```python\n(.*?)result = Loop\(cart", PAGE.read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(block, names)
 
     class Cart:
         def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
             force = u[0] - 0.3 * x[1]
             return np.array([x[0] + dt * x[1] + 0.5 * dt**2 * force, x[1] + dt * force])
 
-    loop = Loop(cart, truth=Cart(), oracle="constant", controller={"solver": {"compile": "never"}})
+    loop = Loop(names["cart"], truth=Cart(), oracle="constant", controller={"solver": {"compile": "never"}})
     result = loop.run(150)
     assert np.abs(result.x[-1]).max() < 0.01
     assert result.summary.constraint_violations == 0

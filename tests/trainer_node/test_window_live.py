@@ -1,4 +1,4 @@
-"""A recurrent network in the real processes: samples with their past reach the trainer, its weights come back."""
+"""A recurrent network of a file in the real processes: its samples reach the trainer, and weights come back."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from node_runtime.config.architecture import load_architecture
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
+from tests.helpers.paths import ROOT
 from tests.tandem.live.test_supervisor import launched, small
+
+GRU = f"{ROOT / 'examples' / 'architecture' / 'gru.py'}:GRU"
 
 
 @pytest.mark.live
 def test_a_recurrent_network_learns_live_and_its_log_replays(tmp_path: Path) -> None:
-    with launched(tmp_path, "--seconds", "5", *small(**{"network.architecture": "rnn"})) as run:
+    with launched(tmp_path, "--seconds", "5", *small(**{"network.architecture": GRU})) as run:
         code, result = run.ends()
     assert code == 0, run.said
     assert result["weights_adopted"] >= 1
@@ -21,4 +25,4 @@ def test_a_recurrent_network_learns_live_and_its_log_replays(tmp_path: Path) -> 
     assert {len(sample.past) for sample in log.samples} == {4}
     # Slots are counted by the clock, the ones that a busy machine made the controller miss included.
     assert 90 <= log.ticks[-1].slot <= 200
-    assert replay(log).equal
+    assert replay(log, architecture=load_architecture(GRU)).equal

@@ -8,7 +8,6 @@ Each episode is a plant that was started again at x0; controller and trainer go 
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -209,9 +208,9 @@ class LockStep:
         run.plant, run.truth, run.files = self.core.plant, self.first_true, files_of(self.config)
         return run
 
-    def start_again(self) -> None:
-        """Another episode: the plant is at x0 again. Raises `PlantError` as `so_far` does."""
-        self.log += self._end()
+    def start_again(self, lost: bool = False) -> None:
+        """Another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
+        self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
 
@@ -219,8 +218,7 @@ class LockStep:
         """Where the last command has led the plant; of one that moves elsewhere that is not known."""
         if self.elsewhere:
             return []
-        # A sample of a copy: the plant's own next one must say what acted in the last period.
-        end = copy.copy(self.plant).sample(self.taken * self.config.period)
+        end = self.plant.look(self.taken * self.config.period)
         return [self._noted(topics.PLANT_STATE, end, self.taken)]
 
     def step(self, x: np.ndarray | None = None) -> tuple[m.PlantState, Outputs]:

@@ -40,7 +40,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def key(self) -> str:
-        """Of everything that its result depends on: settings and code, a plant file's too."""
+        """Of everything that its result depends on: settings and code, somebody's own files too."""
         files = msgspec.json.encode(files_of(self.config))
         return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
 

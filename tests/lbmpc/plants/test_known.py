@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.quadrotor.quadrotor import QUADROTOR
+from examples.tanks.tanks import TANKS
 from lbmpc.model import ModelError, build_model
 from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, Truth, get_plant, true_motion
 from lbmpc.plants.inspection import faults
@@ -16,8 +18,6 @@ from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from tests.helpers.plants.integrator import INTEGRATOR
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.helpers.plants.quadrotor import QUADROTOR
-from tests.helpers.plants.two_tanks import TWO_TANKS
 
 INF, NAN = float("inf"), float("nan")
 A, B = [[0.0, 1.0], [-2.0, -0.3]], [[0.0], [1.0]]
@@ -261,7 +261,7 @@ def test_numbers_rest_elsewhere_too() -> None:
     np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
 
 
-@pytest.mark.parametrize("plant", [TWO_TANKS, TWO_TANKS.known()], ids=["equations", "numbers"])
+@pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
 def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
     there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
     assert there.u_max.tolist() == [25.0]
@@ -306,7 +306,7 @@ def test_equations_rest_where_a_known_wind_lets_them() -> None:
 
 
 def test_another_level_is_held_by_another_inflow() -> None:
-    other = TWO_TANKS.resting_near(x_e=[9.0, 14.0])
+    other = TANKS.resting_near(x_e=[9.0, 14.0])
     np.testing.assert_allclose(np.array(other.function()(other.x_e, other.u_e)), np.zeros((2, 1)), atol=1e-9)
     assert np.abs(other.x_e - [9.0, 14.0]).max() < 1.0
     with pytest.raises(PlantDefinitionError, match="at the nearest rest: u_e of torque is"):
