@@ -197,7 +197,7 @@ class _Blockwise:
 
     def __init__(self, z: np.ndarray, y: np.ndarray):
         blocks = np.array_split(np.arange(len(z)), BLOCKS)
-        factors = [np.linalg.qr(np.hstack([z[block], y[block]]), mode="r") for block in blocks]
+        factors = [_triangular(np.hstack([z[block], y[block]])) for block in blocks]
         p = z.shape[1]
         self.whole = _solved(factors, p)
         self._without = [_solved(factors[:k] + factors[k + 1 :], p) for k in range(BLOCKS)]
@@ -208,6 +208,11 @@ class _Blockwise:
         """The jackknife's standard error of what `of` makes of the coefficients (p, d)."""
         each = np.array([of(theta) for theta in self._without])
         return np.sqrt((BLOCKS - 1) / BLOCKS * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
+
+
+def _triangular(matrix: np.ndarray) -> np.ndarray:
+    """R of its QR factorisation."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"))
 
 
 def _solved(factors: Sequence[np.ndarray], p: int) -> np.ndarray:
@@ -226,8 +231,7 @@ def _persistent(residual: np.ndarray) -> np.ndarray:
 
 def _principal(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """RMS motion in the principal directions, (p,), the least last, and the directions, one a row, (p, p)."""
-    triangular = np.linalg.qr(z, mode="r")
-    _left, singular, directions = np.linalg.svd(triangular)
+    _left, singular, directions = np.linalg.svd(_triangular(z))
     return singular / np.sqrt(len(z)), directions
 
 

@@ -6,8 +6,6 @@
 Below is the same cart twice: as PLANT by its equations, and as MATRICES by numbers alone. Keep the one that you need.
 """
 
-from typing import Any
-
 import casadi as ca
 
 from lbmpc.plants import Known, Plant
@@ -16,10 +14,10 @@ PARAMETERS = {"mass": 1.5, "friction": 0.6, "drag": 0.8}
 """kg, N s/m, N s^2/m^2. A true plant may have others: tandem run --set plant.truth.drag=1.2"""
 
 
-def equations(mass: float, friction: float, drag: float) -> Any:
+def equations(mass, friction, drag):
     """dx/dt of a cart with these parameters, in CasADi's operations: ca.sin, not math.sin, and ca.if_else, not if."""
 
-    def rhs(x: Any, u: Any) -> list[Any]:
+    def rhs(x, u):
         speed, force = x[1], u[0]
         # Drag has no slope at rest: the linear model does not know it, and the network learns it.
         return [speed, (force - friction * speed - drag * speed * ca.fabs(speed)) / mass]

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from examples.tanks.tanks import TANKS
 from lbmpc.analysis import (
     SETTLED,
     growth,
@@ -21,7 +22,6 @@ from lbmpc.analysis import (
 from lbmpc.model import Model, ModelError, build_model, require_horizon
 from lbmpc.plants import PlantError, Truth
 from tests.helpers.plants.pendulum import PENDULUM, pendulum
-from tests.helpers.plants.two_tanks import TWO_TANKS
 
 
 def with_heat() -> Model:
@@ -70,8 +70,8 @@ def test_growth_and_the_longest_horizon_are_those_that_a_controller_is_held_to()
     require_horizon(model, most)
     with pytest.raises(ModelError):
         require_horizon(model, most + 1)
-    assert longest_horizon(build_model(TWO_TANKS, 5.0)) is None
-    assert growth(build_model(TWO_TANKS, 5.0), 100) == 1.0
+    assert longest_horizon(build_model(TANKS, 5.0)) is None
+    assert growth(build_model(TANKS, 5.0), 100) == 1.0
 
 
 def test_after_the_settling_time_every_corner_is_near_rest_and_before_it_one_is_not() -> None:
@@ -98,9 +98,9 @@ def test_the_largest_disturbance_is_found_at_the_corners() -> None:
 
 
 def test_states_outside_the_equations_domain_are_counted() -> None:
-    deep = replace(TWO_TANKS, x_min=np.array([-2.0, 1.0]))
+    deep = replace(TANKS, x_min=np.array([-2.0, 1.0]))
     found = sample_disturbance(
-        build_model(TWO_TANKS, 5.0), Truth(TWO_TANKS).step, 50, np.random.default_rng(0), PlantError
+        build_model(TANKS, 5.0), Truth(TANKS).step, 50, np.random.default_rng(0), PlantError
     )
     assert found.lost == 0
     model = build_model(deep, 5.0)
@@ -108,8 +108,8 @@ def test_states_outside_the_equations_domain_are_counted() -> None:
 
 
 def test_the_safe_input_keeps_tanks_and_drops_a_pendulum() -> None:
-    tanks = build_model(TWO_TANKS, 5.0)
-    assert under_safe_input(tanks, Truth(TWO_TANKS).step, TWO_TANKS.x0, 100.0, PlantError).left == ""
+    tanks = build_model(TANKS, 5.0)
+    assert under_safe_input(tanks, Truth(TANKS).step, TANKS.x0, 100.0, PlantError).left == ""
     kept = under_safe_input(pendulum(), Truth(PENDULUM).step, PENDULUM.x0, 5.0, PlantError)
     assert kept.left == "angle"
     # th grows as 0.5 cosh 2t: beyond 1 rad between 0.6 and 0.7 s, sine taken into account.
@@ -120,8 +120,6 @@ def test_the_safe_input_keeps_tanks_and_drops_a_pendulum() -> None:
 
 
 def test_where_the_motion_cannot_be_followed_the_reason_is_given() -> None:
-    dry = replace(
-        TWO_TANKS, safe_input=np.zeros(1), x_min=np.array([-5.0, -5.0]), positive=TWO_TANKS.positive
-    )
-    kept = under_safe_input(build_model(dry, 5.0), Truth(dry).step, TWO_TANKS.x0, 5000.0, PlantError)
+    dry = replace(TANKS, safe_input=np.zeros(1), x_min=np.array([-5.0, -5.0]), positive=TANKS.positive)
+    kept = under_safe_input(build_model(dry, 5.0), Truth(dry).step, TANKS.x0, 5000.0, PlantError)
     assert "upper level h1" in kept.left

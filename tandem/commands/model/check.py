@@ -61,8 +61,8 @@ class ModelCheck(Configured):
             config, _ = replace(self, rate=1.0 / plant.period).resolve()
         settings = config.controller
         try:
-            weights = (None if w is None else np.array(w) for w in (settings.Q, settings.R))
-            model = build_model(plant, config.period, *weights, settings.terminal)
+            Q, R = (None if weights is None else np.array(weights) for weights in (settings.Q, settings.R))
+            model = build_model(plant, config.period, Q, R, settings.terminal)
         except ModelError as error:
             return self._refuse(str(error))
         return self._look(config, model, plant)
@@ -75,13 +75,13 @@ class ModelCheck(Configured):
 
     def _look(self, config: Config, model: Model, plant: Known | Plant) -> int:
         from lbmpc.analysis import advised_horizon, poles, reach, sample_disturbance
-        from lbmpc.plants import Known, PlantError, get_plant, true_motion
+        from lbmpc.plants import Known, PlantError, get_plant, get_truth, true_motion
         from node_runtime.config.plant import initial_state, true_plant_of
         from tandem.commands.model.findings import disturbance_finding, findings
         from tandem.model_tables import matrix_tables
 
         known, horizon, x0 = model.plant, config.controller.horizon, initial_state(config, plant)
-        true = true_plant_of(config, get_plant)
+        true = true_plant_of(config, get_plant, get_truth)
         step = true_motion(true).step
         self.say(f"{known.name}: {_kind(plant)}; a sample every {model.period:.6g} s", "")
         self.say("x+ = A x + B u, in deviations from x_e and u_e")

@@ -12,13 +12,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from examples.tanks.tanks import TANKS
 from lbmpc.plants import PLANTS, Known, Plant
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
 from tandem.cli import main
 from tests.helpers.plants.integrator import INTEGRATOR
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.helpers.plants.two_tanks import TWO_TANKS
 from tests.lbmpc.plants.test_inspection import FAULTY
 from tests.lbmpc.plants.test_known import FAULTY as FAULTY_NUMBERS
 
@@ -55,10 +55,10 @@ def said(capsys: Capture, *words: str) -> tuple[int, str]:
 
 
 def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> None:
-    mine(TWO_TANKS)
+    mine(TANKS)
     code, text = said(capsys, "mine", "--rate", "0.2", "--set", "controller.horizon_seconds=120")
     assert code == 0
-    assert "two_tanks: equations, linearised at (x_e, u_e); a sample every 5 s" in text
+    assert "tanks: equations, linearised at (x_e, u_e); a sample every 5 s" in text
     assert "poles, 1/s: -0.0125, -0.0221; by itself it comes back" in text
     assert "the inputs move every state" in text
     assert "24 steps (120 s); advised:" in text
@@ -144,7 +144,7 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "under the safe input angle leaves X after 0.7 s",
     ),
     "a safe input that leads out of the equations": (
-        replace(TWO_TANKS, safe_input=np.zeros(1), x_min=np.array([-9.0, -9.0])),
+        replace(TANKS, safe_input=np.zeros(1), x_min=np.array([-9.0, -9.0])),
         ("--rate", "0.2"),
         "safe from x_e",
         "under the safe input, after .* upper level h1 is",
@@ -156,19 +156,19 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "no input moves heat, which decays by itself",
     ),
     "a state that is hardly moved": (
-        replace(TWO_TANKS, u_min=TWO_TANKS.u_e - 0.1, u_max=TWO_TANKS.u_e + 0.1),
+        replace(TANKS, u_min=TANKS.u_e - 0.1, u_max=TANKS.u_e + 0.1),
         ("--rate", "0.2", "--set", "controller.horizon=2"),
         "controllability",
         "full inputs hardly move h1 by .* h2 by .* a longer one would help",
     ),
     "a short horizon": (
-        TWO_TANKS,
+        TANKS,
         ("--rate", "0.2", "--set", "controller.horizon=2"),
         "horizon",
         r"2 steps \(10 s\); advised: \d+ steps",
     ),
     "states from which nothing can be followed": (
-        replace(TWO_TANKS, x_min=np.array([-9.0, 1.0])),
+        replace(TANKS, x_min=np.array([-9.0, 1.0])),
         ("--rate", "0.2"),
         "W",
         r"from \d+ of 500 states the motion cannot be followed",
