@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from run_log.reading.transitions import Observed
 
 SAME_PERIOD = 1e-9
+LEARNING = {"dnn", "l2nw", "perfect"}
+"""Oracles whose h_hat is a function of x and u."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +81,8 @@ class Identify(Command):
         from run_log.reading.transitions import observed
 
         first: Model | None = None
-        logs = []
+        logs: list[Observed] = []
+        oracles: set[str] = set()
         for file in self.files:
             ran = read_run(file)
             notes = [] if self.plant is None else name_plant(ran, self.plant)
@@ -95,8 +98,15 @@ class Identify(Command):
                 )
             logs.append(observed(ran, model))
             self.say(*notes, *([ran.note] if ran.note else []), style="yellow")
+            oracles.add(ran.config.controller.oracle)
         if first is None:
             raise Refused("no log is given")
+        if learned := sorted(oracles & LEARNING):
+            self.say(
+                f"the oracle {' and '.join(learned)} answers with u to what a linear model leaves out, and A and B may "
+                "take its answer for the plant's: logs with controller.oracle=linear say more",
+                style="yellow",
+            )
         return first.plant, first.period, logs
 
     def _show(self, known: Known, found: Identified, own: Quality) -> None:
