@@ -19,13 +19,14 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
+from lbmpc.targets import TargetSelector
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture, name_of
 from node_runtime.config.plant import plant_of, true_plant_of
@@ -94,7 +95,7 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
     if config.controller.oracle == "constant":
         return ConstantOracle(plant.d, plant.m, config.constant.gain)
     if config.controller.oracle == "perfect":
-        truth = true_plant_of(config, get_plant) if given is None else given.truth
+        truth = true_plant_of(config, get_plant, get_truth) if given is None else given.truth
         if not isinstance(truth, Plant):
             raise ConfigError(
                 "controller.oracle = 'perfect': it needs the equations of the true plant, and there are none"
@@ -246,11 +247,28 @@ def build_controller(
     problem.oracle.compile(realise)
     seconds = 1e-3 * (settings.input_delay_ms or 0.0)
     try:
-        controller = Controller(problem, solver, real_time=chosen.mode == "real_time", input_delay=seconds)
+        controller = Controller(
+            problem,
+            solver,
+            real_time=chosen.mode == "real_time",
+            input_delay=seconds,
+            targets=build_targets(config, problem, realise),
+        )
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
     _warm_up(controller, solver, config.seed)
     return controller, solver
+
+
+def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:
+    """What finds the targets of the configuration's reference; None where it has none: plans aim at (x_e, u_e)."""
+    outputs, plant = config.reference.outputs, problem.model.plant
+    if outputs is None:
+        return None
+    indices = [plant.states.index(name) for name in outputs]
+    at_equilibrium = plant.x_e[indices]
+    values = at_equilibrium if config.reference.values is None else np.array(config.reference.values)
+    return TargetSelector(problem, indices, values - at_equilibrium, realise)
 
 
 def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:

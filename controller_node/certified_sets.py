@@ -166,6 +166,7 @@ class Work:
             given = over_any_delay(model, model.plant.W * model.period if W is None else W).tolist()
         base = {
             "model": hashes(model_of(model)),
+            "equations": _equations(model, kind),
             "kind": "hull" if kind == "regions" else kind,
             "W": given,
             "slack": slack,
@@ -178,6 +179,13 @@ class Work:
         """Into the cache, for this user alone. Raises `OSError`."""
         make_private(self.sets.parent)
         write_sets(sets, self.sets, 0o600)
+
+
+def _equations(model: Model, kind: Kind) -> str | None:
+    """Hash of those that h is bounded by: two plants may have one linear model."""
+    if kind == "given" or model.equations is None:
+        return None
+    return hashlib.sha256(model.equations.function().serialize().encode()).hexdigest()
 
 
 def why_not_believed(work: Work) -> str | None:

@@ -43,7 +43,11 @@ def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     inside = f"x0 is inside, {margin:.2g} from the boundary"
     if margin < 0:
         inside = "x0 is OUTSIDE of them, from where nothing is guaranteed"
-    trust = "W is given, not proved" if certificate.source_of_W == "given" else "W is proved"
+    trust = "W is proved"
+    if certificate.source_of_W == "given":
+        trust = (
+            "W is given, not proved, and the states are those that the linear model predicts over the delay"
+        )
     sets_are = f"{count} certified {'set' if count == 1 else 'sets'} ({certificate.kind}, "
     sets_are += f"{100 * found.volume_fraction:.1f} % of X, margin {found.invariance_margin:.2g}, "
     return (

@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from lbmpc.controller.backup_policy import Policy
 from lbmpc.controller.signals import Observation, StepResult
 from lbmpc.oracles.base import HiddenSet, LearnedNetwork
 from lbmpc.plants import Description
+from lbmpc.targets import SteadyState
 from protocol import messages as m
 from protocol.codec import encode
 
@@ -139,7 +141,20 @@ class Translation:
             set_margin=result.first.margin if result.first else None,
             set_piece=result.first.piece if result.first else -1,
             weights_rolled_back=result.rolled_back,
+            **self._target(result.target),
         )
+
+    def _target(self, target: SteadyState | None) -> dict[str, Any]:
+        """The fields of a `TickResult` that tell of it."""
+        if target is None:
+            return {}
+        x, u = target.xu[: self.plant.d] + self.plant.x_e, target.xu[self.plant.d :] + self.plant.u_e
+        return {
+            "target_status": target.status,
+            "target_x": x.tolist(),
+            "target_u": u.tolist(),
+            "target_distance": target.distance,
+        }
 
     def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:
         label = result.label

@@ -126,9 +126,8 @@ class Gateway:
 
     def act(self, now):
         """Write what has to act from now on: the command's input, later its plan's, in the end the safe one."""
-        periods = (
-            now - self.arrived
-        ) / PERIOD + 1e-6  # a switching time that rounding put off counts as reached
+        # A hair more: a switching time that rounding put off counts as reached.
+        periods = (now - self.arrived) / PERIOD + 1e-6
         entry, until = int(periods), int(periods) + 1
         if periods < PATIENCE:
             u, self.source, until = self.plan[0], "command", PATIENCE

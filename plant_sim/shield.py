@@ -45,9 +45,8 @@ class _Acting:
 class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
-    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` closes a period and
-    `renew` opens the next one. The same calls give the same numbers, for a simulated plant in virtual time as for a
-    real one.
+    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
+    begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
     def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
@@ -159,8 +158,8 @@ class Shield:
         self._written = False
 
     def rest(self) -> np.ndarray | None:
-        """The input, (m,), to leave a machine with; None: none, it stands still as it is."""
-        return None if self._held and self._orders is None else within(self.plant, self.plant.safe_input)
+        """The input, (m,), to leave a machine with; None: one that stood still before its first command needs none."""
+        return None if self._held else within(self.plant, self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
         orders = self._orders

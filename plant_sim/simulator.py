@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from lbmpc.plants import Description, TrueMotion
+from lbmpc.plants import Description, PlantError, TrueMotion
 from plant_sim.shield import Shield, Verdict
 from protocol.messages import Backup, Command, PlantState
 
@@ -68,7 +68,12 @@ class Motion:
             return self._ahead[1]
         # Differences of large times are not exact; the period is.
         dt = self._period if math.isclose(t - self._t, self._period, rel_tol=1e-6) else t - self._t
-        return self.truth.step(self._x, self._u, dt)
+        x = np.asarray(self.truth.step(self._x, self._u, dt), dtype=float)
+        if x.shape != self._x.shape or not np.isfinite(x).all():
+            raise PlantError(
+                f"the true motion leads from {self._x.tolist()} to {x.tolist()}, which is no state"
+            )
+        return x
 
 
 class PlantSim:

@@ -30,6 +30,7 @@ InputSource = Literal["hold", "command", "plan", "safe"]
 CommandMode = Literal["solver", "shifted_plan", "feedback"]
 StateVerdict = Literal["fresh", "stale", "missing"]
 WeightsOutcome = Literal["none", "adopted", "refused"]
+TargetStatus = Literal["none", "reached", "nearest", "no rest"]
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
 
 
@@ -196,6 +197,14 @@ class TickResult(Message, frozen=True):
     """Which of the certified sets the state is in; -1: none."""
     weights_rolled_back: str = ""
     """Why the hidden weights and K from before came back in this tick; empty where they did not."""
+    target_status: TargetStatus = "none"
+    """Of the target: whether its outputs are where they should be, as near as a rest allows, or no rest was found.
+    none: the configuration has no reference, and the plan aims at the equilibrium."""
+    target_x: list[float] = []
+    """x of the target; empty where there is none."""
+    target_u: list[float] = []
+    target_distance: float | None = None
+    """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from controller_node.build import GivenPlant
-from lbmpc.plants import Known, Plant, get_plant
+from lbmpc.plants import PLANTS, Known, Plant, get_plant, get_truth
 from node_runtime.config.plant import load_plant, plant_of, true_plant_of
 from node_runtime.config.reference import absolute, is_reference, sha256_of
 from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from run_log.run import Run, as_logged, equations_of, recorded_plant
 
 
@@ -23,22 +24,53 @@ def name_plant(run: Run, reference: str) -> list[str]:
         reference: "tanks.py:TANKS", relative to the current folder, or the name of a plant that comes with Tandem.
 
     Raises:
-        ConfigError: there is no such plant, or it does not fit the log's configuration.
+        ConfigError: there is no such plant, or it does not fit the log.
     """
-    whole = absolute(reference, Path.cwd())
-    named = load_plant(whole) if is_reference(whole) else get_plant(whole)
+    named, notes = _named(run, reference)
     here = plant_of(run.config, get_plant, named)
+    _require_names(run, reference, here)
     run.named = named
-    notes = []
-    sha256, theirs = sha256_of(whole), sorted(run.files.values())
-    if theirs and sha256 is not None and sha256 not in theirs:
-        logged = " and ".join(text[:12] for text in theirs)
-        notes.append(
-            f"{reference} is not the file of the log: its sha256 is {sha256[:12]}, the log's {logged}"
-        )
     if run.plant is not None and (other := _other(run.plant, here)):
         notes.append(f"{reference} differs from the log in {', '.join(other)}; the log's numbers are used")
     return notes
+
+
+def name_truth(run: Run, reference: str) -> list[str]:
+    """`name_plant`, for the equations that moved in the run. Where the log names a truth of its own it gets `truth`."""
+    if not isinstance(run.config.plant.truth, str):
+        return name_plant(run, reference)
+    named, notes = _named(run, reference)
+    try:
+        truth = get_truth(named)
+    except LookupError as error:
+        raise ConfigError(f"{reference}: {error.args[0]}") from error
+    _require_names(run, reference, truth)
+    run.truth = truth
+    return notes
+
+
+def _named(run: Run, reference: str) -> tuple[Known | Plant, list[str]]:
+    """The plant, and in words whether its file is another than the log's."""
+    whole = absolute(reference, Path.cwd())
+    named = load_plant(whole) if is_reference(whole) else PLANTS.get(whole)
+    if named is None:
+        raise ConfigError(
+            f"{reference}: no plant of that name comes with Tandem; a file is written tanks.py:TANKS"
+        )
+    sha256 = sha256_of(whole)
+    theirs = sorted(text for key, text in run.files.items() if key.startswith("plant."))
+    if not theirs or sha256 is None or sha256 in theirs:
+        return named, []
+    logged = " and ".join(text[:12] for text in theirs)
+    return named, [f"{reference} is not the file of the log: its sha256 is {sha256[:12]}, the log's {logged}"]
+
+
+def _require_names(run: Run, reference: str, here: Known | Plant) -> None:
+    if run.plant is not None and (run.plant.states, run.plant.inputs) != (here.states, here.inputs):
+        names = (*run.plant.states, *run.plant.inputs)
+        raise ConfigError(
+            f"{reference}: is about {', '.join((*here.states, *here.inputs))}, and the log about {', '.join(names)}"
+        )
 
 
 def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
@@ -57,14 +89,14 @@ def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
         known = plant_of(config, get_plant)
         equations = known if isinstance(known, Plant) else None
     else:
-        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run))
+        known = plant_of(as_logged(run, config, changed), get_plant, recorded_plant(run, config))
         equations = equations_of(run, config)
     truth, of_the_log = config.plant.truth, not changed & {"plant", "plant.truth"}
     if config.controller.oracle != "perfect" or equations is None:
         return GivenPlant(known, equations)
     if isinstance(truth, str) and is_reference(truth) and of_the_log:
         return GivenPlant(known, equations)
-    return GivenPlant(known, equations, true_plant_of(config, get_plant, equations))
+    return GivenPlant(known, equations, true_plant_of(config, get_plant, get_truth, equations))
 
 
 def _other(logged: Known, plant: Known | Plant) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 import node_runtime.config.plant
-from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant
+from lbmpc.plants import PLANTS, Known, Plant, TrueMotion, get_plant, get_truth
 from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config, PlantConfig
 from node_runtime.config.strict import ConfigError
@@ -139,13 +139,15 @@ def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], pat
     return run
 
 
-def recorded_plant(run: Run) -> Known | Plant | None:
+def recorded_plant(run: Run, config: Config) -> Known | Plant | None:
     """Its numbers, or what somebody has named beside it; None: it is a plant that comes with Tandem, by its name.
+
+    config: the log's, or that of one of its controllers.
 
     Raises:
         LogError: it is none of these.
     """
-    known, model = run.plant or run.named, run.config.plant.model
+    known, model = run.plant or run.named, config.plant.model
     if known is None and is_reference(model):
         raise LogError(
             f"{run.path}: its plant, {model}, is not in the log, and nothing is loaded because a log names it; if you "
@@ -174,7 +176,7 @@ def plant_of(run: Run) -> Known | Plant:
     Raises:
         LogError: the log does not carry its plant, and this Tandem does not have it or cannot use it.
     """
-    known = recorded_plant(run)
+    known = recorded_plant(run, run.config)
     try:
         return node_runtime.config.plant.plant_of(as_logged(run, run.config), get_plant, known)
     except ConfigError as error:
@@ -210,8 +212,7 @@ def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
     try:
         equations = equations_of(run, run.config)
         if equations is None or isinstance(run.config.plant.truth, str):
-            # Where the log names another plant as the true one, whoever names a plant says what moved.
-            return None if run.named is None else equations
-        return node_runtime.config.plant.true_plant_of(run.config, get_plant, equations)
+            return None
+        return node_runtime.config.plant.true_plant_of(run.config, get_plant, get_truth, equations)
     except ConfigError as error:
         raise LogError(f"{run.path}: {error}") from error

@@ -22,10 +22,11 @@ from lbmpc.plants import (
     PlantError,
     TrueMotion,
     get_plant,
+    get_truth,
 )
 from node_runtime.config import strict
 from node_runtime.config.loading import from_tree, to_tree
-from node_runtime.config.plant import true_plant_of
+from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError
@@ -284,12 +285,13 @@ def _given(config: Config, known: object, truth: Known | Plant | TrueMotion | No
     """The objects that stand for what the configuration would name. Raises `ConfigError`."""
     if not isinstance(known, Known | Plant) and truth is None:
         return None
-    model = known if isinstance(known, Known | Plant) else build_plant(config)
+    own = known if isinstance(known, Known | Plant) else None
+    model = build_plant(config) if own is None else plant_of(config, get_plant, own)
     if truth is None:
-        return GivenPlant(model, truth=true_plant_of(config, get_plant, model))
+        return GivenPlant(model, truth=true_plant_of(config, get_plant, get_truth, own))
     if isinstance(truth, Description):
         try:
-            get_plant(truth)
+            get_truth(truth)
         except PlantDefinitionError as error:
             raise ConfigError(f"truth: {error}") from error
         if (truth.states, truth.inputs) != (model.states, model.inputs):

@@ -24,6 +24,8 @@ MEANING = {
     "iteration_limit_ticks": "the solver stopped before it had converged",
     "soft_ticks": "a soft state constraint gave way",
     "fallback_ticks": "input not from the solver",
+    "unreached_ticks": "no rest has the outputs where they should be, or none was found",
+    "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
     "J": "sum of the stage costs, Q and R per second",
     "deviation": "integral of the performance states' squared deviations",
@@ -32,6 +34,7 @@ MEANING = {
     "settled_by_state_s": "each of them",
     "constraint_violations": "at samples: true state or applied input outside X or U",
     "excess_between_samples": "largest distance of the true motion from X, of a half-width",
+    "offset": "of the outputs in the last second, of their half-widths",
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
     "prediction_error": "first / last second",
@@ -41,7 +44,7 @@ MEANING = {
 }
 ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
 """What null means, where it is more than that there is no such figure."""
-OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s"}
+OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s", "offset": "share"}
 """Which figure of each performance state these are."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (

@@ -60,7 +60,8 @@ class LyingSolver:
         x: np.ndarray,
         oracle_parameters: np.ndarray,
         warm_start: np.ndarray,
-        *,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
         first: Box | None = None,
     ) -> Solution:
         plant, m = self._model.plant, self._model.m
@@ -71,7 +72,14 @@ class LyingSolver:
             Status.CONVERGED, v, warm_start, v, np.zeros((len(v), self._model.d)), 0.0, 0, 0.0, ""
         )
 
-    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
+    def prepare(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> None:
         """Never asked."""
 
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:

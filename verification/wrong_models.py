@@ -1,6 +1,6 @@
 """What each oracle costs where the nominal model is wrong: `python -m verification.wrong_models`.
 
-Lock-step runs in episodes of the compressor with other parameters than its model's, and of two plants of the tests, at
+Lock-step runs in episodes of the compressor with other parameters than its model's, and of two of the examples, at
 several horizons. What is asked: where `perfect`, which knows the true plant, keeps X, the network is within 2 % of the
 better of it and the best constant h_hat from the second episode on, and within 10 % in the first.
 """
@@ -13,20 +13,20 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
 from multiprocessing import get_context
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import tyro
 from rich.console import Console
 
-from lbmpc.plants import PLANTS, get_plant
 from node_runtime.config.loading import load
 from node_runtime.config.shipped import config_file
 from run_log.reporting.summary import summarise
-from run_log.run import Run
+from run_log.run import Run, plant_of
 from tandem.experiments.simulation.lockstep import follow
-from tests.helpers.plants import quadrotor, two_tanks
 
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 LATER, FIRST = 1.02, 1.10
 """What the network's J may be of the better of `perfect`'s and the best constant's."""
 ROWS = {
@@ -43,7 +43,7 @@ class Wrong:
     """A plant whose model is wrong."""
 
     config: str
-    """A shipped configuration."""
+    """A shipped configuration, or a file."""
     settings: list[str]
     steps: int = 200
     """Of an episode."""
@@ -65,16 +65,8 @@ def _compressors() -> Iterator[tuple[str, Wrong]]:
 
 WRONG = {
     **dict(_compressors()),
-    "tanks": Wrong(
-        "compressor",
-        ["plant.model=two_tanks", *two_tanks.SETTINGS, *_truth(two_tanks.TRUTH)],
-        second=60.0,
-    ),
-    "quadrotor": Wrong(
-        "compressor",
-        ["plant.model=quadrotor", *quadrotor.SETTINGS, *_truth(quadrotor.TRUTH)],
-        steps=250,
-    ),
+    "tanks": Wrong(str(EXAMPLES / "tanks" / "tanks.toml"), [], second=60.0),
+    "quadrotor": Wrong(str(EXAMPLES / "quadrotor" / "quadrotor.toml"), [], steps=250),
 }
 
 
@@ -106,7 +98,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[str]) -> Row:
-    """One run, deterministic; its plant is among `lbmpc.plants.PLANTS`."""
+    """One run, deterministic."""
     wrong = WRONG[plant]
     seconds = f"controller.horizon_seconds={horizon * wrong.second}"
     config = load(config_file(wrong.config), [*wrong.settings, *ROWS[oracle], *more, seconds])
@@ -129,14 +121,9 @@ def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[s
     )
 
 
-def _know_the_plants() -> None:
-    """In a process of the pool: plants of the tests are not shipped."""
-    PLANTS.update({one.name: one for one in (two_tanks.TWO_TANKS, quadrotor.QUADROTOR)})
-
-
 def _chatter(run: Run, last: int) -> float:
     u = np.array([command.u for command in run.commands])[-last:]
-    turns = np.abs(np.diff(u, 2, axis=0)) / get_plant(run.config.plant.model).u_scale
+    turns = np.abs(np.diff(u, 2, axis=0)) / plant_of(run).u_scale
     return float(turns.max(initial=0.0))
 
 
@@ -201,7 +188,7 @@ def main(
         json: rows as JSON instead of a table.
     """
     wanted = [(plant, horizon, oracle) for plant in plants for horizon in horizons for oracle in oracles]
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _know_the_plants) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         futures = [pool.submit(run_one, *one, episodes, list(set)) for one in wanted]
         rows = [future.result() for future in futures]
     if json:

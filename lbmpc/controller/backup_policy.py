@@ -4,22 +4,23 @@ The plan of (e:LBMPC) keeps the constraints of the *nominal* model, step after s
 and each new sample mends what h did. Followed blindly it is no more than a guess. So besides it there is a second
 problem, solved where there is time, with the same cost and the learned states in the place of the nominal ones:
 
-    min over v      |z_N|_P^2 + sum_i |z_i|_Q^2 + |v_i|_R^2
+    min over v      |z_N - x^r|_P^2 + sum_i |z_i - x^r|_Q^2 + |v_i - u^r|_R^2
     subject to      z_{i+1} = A z_i + B v_i + h_hat(z_i, v_i),
                     v_i in U,   z_{i+1} in (1 - margin) X                                    i = 0 .. N-1
 
-from z_0, the state to which the command that was just given leads. Its solution is followed with feedback,
+from z_0, the state to which the command that was just given leads, to the target of that command's plan. Its solution
+is followed with feedback,
 
     u_i = v_i + K (x_i - z_i),
 
 which takes no more than the plant's own sensors. K is stiffer than the model's: what the plan does not know must not
 add up. Nothing of this is certified: h_hat is what was learned so far.
 
-The margin is room for what h_hat does not know, and where the way to x = 0 leads along a bound it can cost the way
-itself. So where the plan touches its margin and does not lead back, |z_N|_P >= 0.9 |z_0|_P, the problem is solved
-again without one, and if that costs less a third time, with as much of it as should lead back. What a plan costs is the
-cost above and the penalty for what leaves X itself. Where it ends would not tell: of two plans that are lost, the one
-that leaves X at once may end as near as the one that stays at its edge.
+The margin is room for what h_hat does not know, and where the way to x^r leads along a bound it can cost the way
+itself. So where the plan touches its margin and does not lead back, |z_N - x^r|_P >= 0.9 |z_0 - x^r|_P, the problem is
+solved again without one, and if that costs less a third time, with as much of it as should lead back. What a plan costs
+is the cost above and the penalty for what leaves X itself. Where it ends would not tell: of two plans that are lost,
+the one that leaves X at once may end as near as the one that stays at its edge.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ STEPS = 2
 RAMP = 4
 """Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
 NEARER = 0.9
-"""Of |z_0|_P: where a plan that leads back ends at most."""
+"""Of |z_0 - x^r|_P: where a plan that leads back ends at most."""
 CHEAPER = 0.9
 """Of the cost with all of the margin: what a plan without one costs at most, to be better."""
 TOUCHES = 1e-3
@@ -101,58 +102,64 @@ class BackupPlanner:
         self._subproblem = Subproblem(sweep, move)
         self._gain = tracking_gain(model)
 
-    def policy(self, s: np.ndarray, theta: np.ndarray, plan: np.ndarray) -> Policy | None:
+    def policy(
+        self,
+        s: np.ndarray,
+        theta: np.ndarray,
+        plan: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> Policy | None:
         """The policy from the predicted state s, (D,), on.
 
         Args:
             s: where the command that was just given leads, with its past where the oracle looks back.
             theta: the oracle's parameters.
             plan: the nominal plan from there on, (N, m).
+            xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`, the same at every step.
 
         Returns:
             None when the numbers are unusable.
         """
         with np.errstate(all="ignore"):
-            kept = self._best(self._kept, s, theta, np.asarray(plan, dtype=float), STEPS)
+            self._subproblem.load(s, theta, xr, ur)
+            kept = self._best(self._kept, np.asarray(plan, dtype=float), STEPS)
             if kept is None:
                 return None
-            share, found = self._less(s, theta, kept) if self._is_in_the_way(s, kept) else (1.0, kept)
+            share, found = self._less(kept) if self._is_in_the_way(kept) else (1.0, kept)
         return self._with_feedback(s, found, share * self._margin)
 
-    def _is_in_the_way(self, s: np.ndarray, kept: Rollout) -> bool:
-        return self._end(s, kept) >= NEARER and _touches(self._kept, kept)
+    def _is_in_the_way(self, kept: Rollout) -> bool:
+        return self._end(kept) >= NEARER and _touches(self._kept, kept)
 
-    def _less(self, s: np.ndarray, theta: np.ndarray, kept: Rollout) -> tuple[float, Rollout]:
+    def _less(self, kept: Rollout) -> tuple[float, Rollout]:
         """The share of the margin, and the plan, that leads back, or else what costs less, if anything does.
 
         Where a plan ends is taken for linear in the margin.
         """
-        free = self._best(self._plain, s, theta, kept.v, 1)
+        free = self._best(self._plain, kept.v, 1)
         if free is None or _price(self._plain, free) >= CHEAPER * _price(self._plain, kept):
             return 1.0, kept
-        if (end := self._end(s, free)) >= NEARER:
+        if (end := self._end(free)) >= NEARER:
             return 0.0, free
-        share = (NEARER - end) / (self._end(s, kept) - end)
-        between = self._best(_between(self._plain, self._kept, share), s, theta, free.v, 1)
+        share = (NEARER - end) / (self._end(kept) - end)
+        between = self._best(_between(self._plain, self._kept, share), free.v, 1)
         return (0.0, free) if between is None else (share, between)
 
-    def _end(self, s: np.ndarray, rollout: Rollout) -> float:
-        """|z_N|_P of |z_0|_P."""
-        return self._distance(rollout.z[-1]) / max(self._distance(s), np.finfo(float).tiny)
+    def _end(self, rollout: Rollout) -> float:
+        """|z_N|_P of |z_0|_P, both from the target."""
+        inputs, d = self._subproblem.sweep.inputs, self.problem.model.d
+        start, target = inputs["x"][:d, 0], inputs["xr"][:, -1]
+        return self._norm(rollout.z[-1] - target) / max(self._norm(start - target), np.finfo(float).tiny)
 
-    def _distance(self, s: np.ndarray) -> float:
-        """|x|_P of a state, with its past or without."""
-        model = self.problem.model
-        x = s[: model.d]
-        return float(np.sqrt(x @ model.P @ x))
+    def _norm(self, x: np.ndarray) -> float:
+        """|x|_P of x (d,)."""
+        return float(np.sqrt(x @ self.problem.model.P @ x))
 
-    def _best(
-        self, rows: Rows, s: np.ndarray, theta: np.ndarray, v: np.ndarray, steps: int
-    ) -> Rollout | None:
+    def _best(self, rows: Rows, v: np.ndarray, steps: int) -> Rollout | None:
         """The best of what the steps from v, (N, m), pass; None when its numbers are unusable."""
         best, least = None, np.inf
         subproblem, v = self._subproblem, rows.clip(v)
-        subproblem.load(s, theta)
         for step in range(steps + 1):
             cost = subproblem.linearise(v)
             rollout = Rollout(v, subproblem.sweep.outputs["z"].T.copy(), cost)

@@ -21,7 +21,7 @@ class Plan:
 
 
 def empty_plan(horizon: int, m: int) -> Plan:
-    """No solution yet: zeros, none of which may be followed."""
+    """No solution yet: zeros, of which none is left to be followed."""
     return Plan(np.zeros((horizon, m)), np.zeros((horizon, m)), 0)
 
 
@@ -31,10 +31,12 @@ def shift(plan: Plan) -> Plan:
     return Plan(np.concatenate([plan.u[1:], plan.u[-1:]]), c, max(plan.left - 1, 0))
 
 
-def feedback_plan(model: Model, x: np.ndarray, horizon: int) -> np.ndarray:
-    """K x clipped to U, along the nominal prediction from x, (N, m)."""
+def feedback_plan(
+    model: Model, x: np.ndarray, horizon: int, xs: np.ndarray | float = 0.0, us: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """us + K (x - xs) clipped to U, along the nominal prediction from x, (N, m); xs (d,) and us (m,): the target."""
     plant, inputs = model.plant, np.zeros((horizon, model.m))
     for i in range(horizon):
-        inputs[i] = np.clip(model.K @ x, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
+        inputs[i] = np.clip(us + model.K @ (x - xs), plant.u_min - plant.u_e, plant.u_max - plant.u_e)
         x = model.A @ x + model.B @ inputs[i]
     return inputs

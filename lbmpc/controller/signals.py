@@ -12,6 +12,7 @@ from lbmpc.oracles.base import HiddenSet, Verdict
 from lbmpc.plants.linear_motion import Pieces
 from lbmpc.sets.guard import FirstInputs
 from lbmpc.solver.solution import Solution
+from lbmpc.targets import SteadyState
 
 Mode = Literal["solver", "shifted_plan", "feedback"]
 
@@ -64,6 +65,8 @@ class StepResult:
     """Seconds for which the sample was predicted ahead, to when the command acts."""
     first: FirstInputs | None
     """What is certified of v_0; None where there are no certified sets, or no state."""
+    target: SteadyState | None
+    """Where the plan aims; None without a reference: at the equilibrium."""
 
     @property
     def new_network(self) -> bool:

@@ -25,6 +25,8 @@ class ControllerState:
     delay: float
     """Seconds from a sample until the command that answers it acts: smoothed, or as configured until there is one."""
     oracle: OracleState
+    target: np.ndarray
+    """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -35,6 +37,7 @@ class ControllerState:
             "pending": np.array(self.pending, dtype=np.int64),
             "predicted": self.predicted,
             "delay": np.array([self.delay]),
+            **({"target": self.target} if self.target.size else {}),
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -54,4 +57,5 @@ class ControllerState:
             arrays["predicted"],
             float(arrays["delay"][0]),
             oracle,
+            arrays.get("target", np.zeros(0)),
         )

@@ -23,6 +23,7 @@ from lbmpc.sets.guard import FirstInputs
 from lbmpc.sets.motion import LATEST, motion_of
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
+from lbmpc.targets import SteadyState, TargetSelector
 
 DELAY_GAIN = 0.2
 """Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
@@ -36,11 +37,19 @@ class Solves(Protocol):
         x: np.ndarray,
         oracle_parameters: np.ndarray,
         warm_start: np.ndarray,
-        *,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
         first: Box | None = None,
     ) -> Solution: ...
 
-    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None: ...
+    def prepare(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> None: ...
 
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
 
@@ -58,11 +67,21 @@ class Controller:
         solver: solves it.
         real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
         input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
+        targets: finds where plans aim; None: at the equilibrium.
     """
 
-    def __init__(self, problem: Problem, solver: Solves, real_time: bool = False, input_delay: float = 0.0):
+    def __init__(
+        self,
+        problem: Problem,
+        solver: Solves,
+        real_time: bool = False,
+        input_delay: float = 0.0,
+        targets: TargetSelector | None = None,
+    ):
         self.problem, self._solver, self.real_time = problem, solver, real_time
+        self._targets = targets
         self._prepared_for: ControllerState | None = None
+        self._prepared_target: SteadyState | None = None
         self.model: Model = problem.model
         self._first_delay = self._acceptable(input_delay)
         guard = problem.guard
@@ -76,7 +95,8 @@ class Controller:
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
         s = self._with_past(oracle, nothing)
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle)
+        target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
+        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -84,15 +104,19 @@ class Controller:
         For the time between two samples. Never needed for the result: a step that finds nothing prepared prepares
         by itself, with the same numbers.
         """
-        if self.real_time and state.plan.left > 0 and self._prepared_for is not state:
-            self._solver.prepare(state.predicted, self.oracle.theta(state.oracle), state.plan.c)
+        if self._prepares(state) and self._prepared_for is not state:
+            theta = self.oracle.theta(state.oracle)
+            self._prepared_target = target = self._find_target(state, theta)
+            references = self._references(_aim(target))
+            self._solver.prepare(state.predicted, theta, state.plan.c, *references)
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
         """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
         if state.plan.left == 0:
             return None
-        return planner.policy(state.predicted, self.oracle.theta(state.oracle), state.plan.u)
+        theta, references = self.oracle.theta(state.oracle), self._references(state.target)
+        return planner.policy(state.predicted, theta, state.plan.u, *references)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
@@ -110,15 +134,16 @@ class Controller:
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
-        plan, mode, solution = self._plan(state, oracle, start, first)
+        target = self._target(state, oracle)
+        plan, mode, solution = self._plan(state, oracle, start, first, target)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         s = self._with_past(oracle, start) if start is not None else state.predicted
         x, u = s[: self.model.d], plan.u[0]
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        after = ControllerState(shift(plan), pending_x, pending, predicted, delay, oracle)
-        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first)
+        after = ControllerState(shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target))
+        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
@@ -171,35 +196,66 @@ class Controller:
         drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
         return self.model.ahead(seen.x, acting, delay) + drift
 
+    def _prepares(self, state: ControllerState) -> bool:
+        """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
+        return self.real_time and state.plan.left > 0
+
+    def _target(self, state: ControllerState, oracle: OracleState) -> SteadyState | None:
+        """Where the step's plan aims; a prepared one by what was known when it was prepared."""
+        if self._targets is None:
+            return None
+        if self._prepares(state):
+            self.prepare(state)
+            return self._prepared_target
+        return self._find_target(state, self.oracle.theta(oracle))
+
+    def _find_target(self, state: ControllerState, theta: np.ndarray) -> SteadyState | None:
+        return None if self._targets is None else self._targets.find(theta, state.target)
+
+    def _references(self, target: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """x^r (N + 1, d) and u^r (N, m) of a plan to `target`, (d + m,), or (0,) for the equilibrium: None."""
+        if not target.size:
+            return None, None
+        n, d, m = self.problem.horizon, self.model.d, self.model.m
+        return np.broadcast_to(target[:d], (n + 1, d)), np.broadcast_to(target[d:], (n, m))
+
     def _plan(
         self,
         state: ControllerState,
         oracle: OracleState,
         x: np.ndarray | None,
         certified: FirstInputs | None,
+        target: SteadyState | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
         if x is not None:
-            solution = self._solve(state, oracle, x, first)
+            solution = self._solve(state, oracle, x, first, target)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
             return _begun_within(plan, first), "shifted_plan", solution
+        nothing, d = empty_plan(horizon, self.model.m), self.model.d
+        xs, us = (0.0, 0.0) if target is None else (target.xu[:d], target.xu[d:])
         if x is None:
-            # Neither a plan nor a state: the equilibrium input is all that is left.
-            return empty_plan(horizon, self.model.m), "feedback", solution
-        fed_back = Plan(feedback_plan(self.model, x, horizon), np.zeros((horizon, self.model.m)), 0)
+            # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
+            return replace(nothing, u=nothing.u + us), "feedback", solution
+        fed_back = replace(nothing, u=feedback_plan(self.model, x, horizon, xs, us))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
-        self, state: ControllerState, oracle: OracleState, x: np.ndarray, first: Box | None
+        self,
+        state: ControllerState,
+        oracle: OracleState,
+        x: np.ndarray,
+        first: Box | None,
+        target: SteadyState | None,
     ) -> Solution:
         s = self._with_past(oracle, x)
-        if not self.real_time or state.plan.left == 0:
-            # Without a plan to start from, one step is not enough.
-            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.c, first=first)
+        if not self._prepares(state):
+            references = self._references(_aim(target))
+            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.c, *references, first=first)
         self.prepare(state)
         self._prepared_for = None
         return self._solver.feedback(s, first)
@@ -212,6 +268,11 @@ class Controller:
 def _acting(seen: Observation) -> np.ndarray | None:
     """The input that the plant has when it is seen, (m,)."""
     return seen.pieces[-1][1] if seen.pieces else seen.applied
+
+
+def _aim(target: SteadyState | None) -> np.ndarray:
+    """x and u, (d + m,); (0,) without a reference."""
+    return np.zeros(0) if target is None else target.xu
 
 
 def _box(first: FirstInputs | None) -> Box | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from lbmpc.plants.description import Description, PlantDefinitionError, PlantError
 from lbmpc.plants.equations import Domain, Plant, Rhs
-from lbmpc.plants.inspection import require_names, require_sound
+from lbmpc.plants.inspection import has_form, require_equations, require_sound
 from lbmpc.plants.known import Known
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from lbmpc.plants.truth import TrueMotion, Truth, true_motion
@@ -26,6 +26,7 @@ __all__ = [
     "TrueMotion",
     "Truth",
     "get_plant",
+    "get_truth",
     "true_motion",
 ]
 
@@ -37,18 +38,28 @@ def get_plant(
 
     Args:
         which: its name, or somebody's own.
-        change: what is to be otherwise; the plant is looked at as it is then. Its names are right before.
+        change: what is to be otherwise; the plant is looked at as it is then. It has a form before, `has_form`.
 
     Raises:
         LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with what is wrong with it.
     """
-    try:
-        plant = PLANTS[which] if isinstance(which, str) else which
-    except KeyError:
-        near = difflib.get_close_matches(str(which), PLANTS, n=1, cutoff=0.0)
-        raise KeyError(f"no plant is called {which!r}; did you mean {near[0]!r}?") from None
-    require_names(plant)
-    if change is not None:
+    plant = _named(which)
+    if change is not None and has_form(plant):
         plant = change(plant)
     require_sound(plant)
     return plant
+
+
+def get_truth(which: str | Known | Plant) -> Known | Plant:
+    """The same for what only moves: it may rest nowhere, and nothing else of it is looked at. Raises as `get_plant`."""
+    plant = _named(which)
+    require_equations(plant)
+    return plant
+
+
+def _named(which: str | Known | Plant) -> Known | Plant:
+    try:
+        return PLANTS[which] if isinstance(which, str) else which
+    except KeyError:
+        near = difflib.get_close_matches(str(which), PLANTS, n=1, cutoff=0.0)
+        raise KeyError(f"no plant is called {which!r}; did you mean {near[0]!r}?") from None

@@ -6,7 +6,7 @@ Bring your own plant as one file: give `rhs` in CasADi operations and fill in a 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.description import Description, PlantError, as_tuple
-from lbmpc.plants.faults import bound_faults, name_faults, number_faults, refuse, unusable
+from lbmpc.plants.faults import bound_faults, choice_faults, name_faults, number_faults, refuse, unusable
 from lbmpc.plants.known import Known
 from lbmpc.plants.rest import nearest_rest
 
@@ -47,6 +47,16 @@ class Plant(Description):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "positive", as_tuple(self.positive))
+
+    def changed(
+        self,
+        bounds: Mapping[str, Sequence[float | None]],
+        x_e: Sequence[float] | None = None,
+        u_e: Sequence[float] | None = None,
+    ) -> Plant:
+        """As that of a description; of x_e and u_e alone, about the nearest rest. Raises `PlantDefinitionError` too."""
+        there = super().changed(bounds, x_e, u_e)
+        return there if (x_e is None) == (u_e is None) else there.resting_near()
 
     def known(self) -> Known:
         """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""
@@ -102,7 +112,10 @@ class Plant(Description):
         Raises:
             PlantDefinitionError: there is none nearby, or it is outside of X or U.
         """
-        refuse(self.name, name_faults(self) or tuple(number_faults(self)) or tuple(bound_faults(self)))
+        refuse(
+            self.name,
+            name_faults(self) or tuple(number_faults(self)) or (*bound_faults(self), *choice_faults(self)),
+        )
         near_x = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
         near_u = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
         slopes, x, u = self._slopes(), near_x, near_u
@@ -111,7 +124,7 @@ class Plant(Description):
             if not all(np.isfinite(values).all() for values in (residual, a, b)):
                 break
             drift = residual + a @ (near_x - x) + b @ (near_u - u)
-            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale)
+            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale, self.performance)
             if moved is None:
                 break
             last, x, u = (x, u), near_x + moved[0], near_u + moved[1]

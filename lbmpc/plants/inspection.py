@@ -23,7 +23,7 @@ from lbmpc.plants.faults import (
     pole_faults,
     refuse,
 )
-from lbmpc.plants.known import Known, known_faults
+from lbmpc.plants.known import Known, form_faults, known_faults
 from lbmpc.plants.matrices import mode_faults
 
 REST = 1e-5
@@ -38,9 +38,20 @@ def require_sound(plant: Known | Plant) -> None:
     refuse(plant.name, faults(plant), _where(plant))
 
 
-def require_names(plant: Known | Plant) -> None:
-    """Raise `PlantDefinitionError` with what is wrong with the names, without which nothing else can be said."""
-    refuse(plant.name, name_faults(plant), _where(plant))
+def has_form(plant: Known | Plant) -> bool:
+    """Whether names, shapes and numbers are right, and equations can be written down: whether it can be changed."""
+    if name_faults(plant):
+        return False
+    found = form_faults(plant) if isinstance(plant, Known) else [*number_faults(plant), *_equations(plant)]
+    return not found
+
+
+def require_equations(plant: Known | Plant) -> None:
+    """Raise `PlantDefinitionError` where the names or the equations cannot be used; it may rest nowhere."""
+    found = name_faults(plant) or (
+        tuple(_equations(plant)) if isinstance(plant, Plant) else known_faults(plant)
+    )
+    refuse(plant.name, found, _where(plant))
 
 
 def require_model(plant: Known | Plant) -> None:

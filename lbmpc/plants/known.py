@@ -22,6 +22,9 @@ from lbmpc.plants.matrices import matrix_faults, mode_faults, pair_faults
 from lbmpc.plants.rest import nearest_rest
 from lbmpc.plants.written import read, written
 
+ROUNDING = 1e-12
+"""In half-widths: a rest that is this near is there, so that one that was found stays, to the bit."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known(Description):
@@ -67,11 +70,11 @@ class Known(Description):
         u_e: Sequence[float] | None = None,
     ) -> Known:
         """As that of a description; about the rest nearest to (x_e, u_e). Raises `PlantDefinitionError` as well."""
-        bounded = super().changed(bounds)
+        there = super().changed(bounds, x_e, u_e)
         if x_e is None and u_e is None:
-            return bounded
-        refuse(self.name, known_faults(bounded))
-        return bounded.resting_near(x_e, u_e)
+            return there
+        refuse(self.name, all_faults(there))
+        return replace(there, x_e=self.x_e, u_e=self.u_e).resting_near(there.x_e, there.u_e)
 
     def to_builtins(self) -> dict[str, Any]:
         """What JSON can hold, and `from_builtins` makes the same plant of, bit for bit; infinities are words."""
@@ -187,12 +190,14 @@ def all_faults(known: Known) -> tuple[str, ...]:
 
 def known_faults(known: Known) -> tuple[str, ...]:
     """What is wrong with the numbers of which a model is made; names are right."""
-    numbers = [
-        *number_faults(known),
-        *matrix_faults(known.A, known.B, known.period, known.states, known.inputs),
-    ]
-    found = numbers or [*bound_faults(known), *pole_faults(known)]
+    found = form_faults(known) or [*bound_faults(known), *pole_faults(known)]
     return tuple(found or mode_faults(known.A, known.B, known.period, known))
+
+
+def form_faults(known: Known) -> list[str]:
+    """What is wrong with shapes, and with numbers that are none."""
+    matrices = matrix_faults(known.A, known.B, known.period, known.states, known.inputs)
+    return [*number_faults(known), *matrices]
 
 
 def _offset(known: Known, offset: Any) -> np.ndarray:
@@ -206,10 +211,13 @@ def _offset(known: Known, offset: Any) -> np.ndarray:
 
 def _at_rest(known: Known, x_e: np.ndarray, u_e: np.ndarray, drift: np.ndarray) -> Known:
     """The model about the rest nearest to (x_e, u_e), at which it drifts."""
-    moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale)
-    if moved is None:
-        text = f"at x_e = {x_e.tolist()} it drifts by {drift.tolist()}, and no input holds it there or nearby"
-        raise unusable(known.name, text)
-    found = replace(known, x_e=x_e + moved[0], u_e=u_e + moved[1])
+    rounding = ROUNDING * (np.abs(known.slope_x) @ known.x_scale + np.abs(known.B) @ known.u_scale)
+    if (np.abs(drift) > rounding).any():
+        moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale, known.performance)
+        if moved is None:
+            text = f"at x_e = {x_e.tolist()} it drifts by {drift.tolist()}, and no input holds it there or nearby"
+            raise unusable(known.name, text)
+        x_e, u_e = x_e + moved[0], u_e + moved[1]
+    found = replace(known, x_e=x_e, u_e=u_e)
     refuse(found.name, tuple(bound_faults(found)), " at the nearest rest")
     return found

@@ -136,7 +136,14 @@ class Solver:
 
     # -- real-time iteration --------------------------------------------------------------------------------
 
-    def prepare(self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray) -> None:
+    def prepare(
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> None:
         """Linearise ahead of the sample, about a predicted state x, (D,); everything that needs no x_t is done here.
 
         Arguments as for `solve`. One Gauss-Newton step is left for `feedback`.
@@ -152,7 +159,7 @@ class Solver:
                 (self._learned, oracle_parameters, Status.REAL_TIME),
                 (self._nominal, np.zeros(0), Status.ORACLE_REFUSED),
             ):
-                subproblem.load(x, theta)
+                subproblem.load(x, theta, xr, ur)
                 cost = subproblem.linearise(v)
                 if isfinite(cost) and finite(subproblem.sweep.outputs["zs"]):
                     status = trusted

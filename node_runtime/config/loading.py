@@ -55,6 +55,7 @@ def from_tree(
     where: str = "configuration",
     origins: Mapping[str, str] | None = None,
     folder: Path | None = None,
+    origins_folder: Path | None = None,
 ) -> Config:
     """Convert a plain tree to a `Config`. Raises `ConfigError`.
 
@@ -63,12 +64,14 @@ def from_tree(
     Args:
         tree: tables as TOML gives them.
         where: the file, for messages.
-        origins: for keys that come from elsewhere (`trainer.batch`), from where; there a reference is relative to the
-            current folder.
-        folder: where the other references are relative to; None: they stay as they are.
+        origins: for keys that come from elsewhere (`trainer.batch`), from where.
+        folder: where a reference is relative to; None: it stays as it is.
+        origins_folder: the same for the keys from elsewhere; None: the current folder.
     """
     fail = strict.failing(where, origins)
-    return _written_out(_at_home(_checked(tree, where, origins), fail), fail, origins or {}, folder)
+    config = _at_home(_checked(tree, where, origins), fail)
+    places = {**dict.fromkeys(origins or {}, origins_folder or Path.cwd()), "": folder}
+    return _written_out(config, fail, places)
 
 
 def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
@@ -165,12 +168,14 @@ def _at_home(config: Config, fail: Fail) -> Config:
     return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
 
 
-def _written_out(config: Config, fail: Fail, origins: Mapping[str, str], folder: Path | None) -> Config:
-    """With whole paths in the references, so that every process of a run finds the same file from anywhere."""
+def _written_out(config: Config, fail: Fail, places: Mapping[str, Path | None]) -> Config:
+    """With whole paths in the references, so that every process of a run finds the same file from anywhere.
+
+    places: by key, or "" for all others, what is relative to where.
+    """
 
     def found(key: str, reference: str) -> str:
-        given = any(f"{key}.".startswith(f"{name}.") for name in origins)
-        base = Path.cwd() if given else folder
+        base = next(folder for name, folder in places.items() if not name or f"{key}.".startswith(f"{name}."))
         if not is_reference(reference) or base is None:
             return reference
         try:

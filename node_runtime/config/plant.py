@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from node_runtime.config.reference import is_reference, load, sha256_of
-from node_runtime.config.sections import Config
+from node_runtime.config.sections import Config, ReferenceConfig
 from node_runtime.config.strict import ConfigError, did_you_mean
 
 
@@ -89,11 +89,18 @@ def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P
         raise ConfigError(f"plant.model = {named!r}: {error.args[0]}") from error
     if plant is None:
         _with_parameters(config, found)
+    _check_reference(config.reference, found)
     return found
 
 
-def true_plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P | Motion:
+def true_plant_of(
+    config: Config, find: Find[P], find_truth: Callable[[Any], P], plant: Described | None = None
+) -> P | Motion:
     """The plant as it really moves: `plant_of` with the parameters of `plant.truth`, or what that names.
+
+    Args:
+        find, plant: as for `plant_of`.
+        find_truth: `lbmpc.plants.get_truth`.
 
     Raises:
         ConfigError: as `plant_of`; `plant.truth` names nothing that moves, or a plant with other states or inputs.
@@ -105,7 +112,7 @@ def true_plant_of(config: Config, find: Find[P], plant: Described | None = None)
         found = load(truth, _moves, "plant or object with step") if is_reference(truth) else truth
         if hasattr(found, "step"):
             return found
-        true = find(found, lambda plant: plant)
+        true = find_truth(found)
     except ConfigError as error:
         raise ConfigError(f"plant.truth: {error}") from error
     except LookupError as error:
@@ -128,8 +135,12 @@ def load_plant(reference: str) -> Any:
 
 
 def files_of(config: Config) -> dict[str, str]:
-    """The sha256 of the files that the plant of `config` comes from, as far as they are here, by key."""
-    named = {"plant.model": config.plant.model, "plant.truth": config.plant.truth}
+    """The sha256 of somebody's own files that `config` names, as far as they are here, by key."""
+    named = {
+        "plant.model": config.plant.model,
+        "plant.truth": config.plant.truth,
+        "network.architecture": config.network.architecture,
+    }
     references = {key: text for key, text in named.items() if isinstance(text, str) and is_reference(text)}
     return {key: found for key, text in references.items() if (found := sha256_of(text)) is not None}
 
@@ -200,6 +211,31 @@ def _as_configured(config: Config, plant: P) -> P:
             hint = did_you_mean(name, known, f"it has {', '.join(known)}")
             raise ConfigError(f"plant.bounds: {plant.name} has no state or input {name!r}; {hint}")
     return plant.changed(config.plant.bounds, config.plant.x_e, config.plant.u_e)
+
+
+def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
+    outputs, values = reference.outputs or [], reference.values
+    for i, name in enumerate(outputs):
+        if name not in plant.states:
+            hint = did_you_mean(name, plant.states, f"it has {', '.join(plant.states)}")
+            raise ConfigError(f"reference.outputs: {plant.name} has no state {name!r}; {hint}")
+        if name in outputs[:i]:
+            raise ConfigError(f"reference.outputs: {name!r} is there twice")
+    if values is None:
+        return
+    if len(values) != len(outputs):
+        there = (
+            f"reference.outputs has {len(outputs)} ({', '.join(outputs)})"
+            if outputs
+            else "no reference.outputs"
+        )
+        raise ConfigError(f"reference.values has {len(values)} entries; {there}: give one for each output")
+    for name, value in zip(outputs, values, strict=True):
+        i = list(plant.states).index(name)
+        if not plant.x_min[i] <= value <= plant.x_max[i]:
+            raise ConfigError(
+                f"reference.values: {name} = {value:g} is outside of X, {plant.x_min[i]:g} to {plant.x_max[i]:g}"
+            )
 
 
 def _with_parameters(config: Config, plant: P) -> P:

@@ -118,6 +118,15 @@ class ControllerConfig(Section, frozen=True):
     backup: BackupConfig = BackupConfig()
 
 
+class ReferenceConfig(Section, frozen=True):
+    """Where the plans lead: to the equilibrium, or to a rest of the plant as it has been learned."""
+
+    outputs: list[str] | None = None
+    """States that shall be at `values`; []: the rest that costs least; None: the plant's equilibrium, rest or not."""
+    values: list[float] | None = None
+    """One for each output, in the plant's own units; None: those of the equilibrium."""
+
+
 class NetworkConfig(Section, frozen=True):
     architecture: str = "mlp"
     """How the hidden layers act on the window: mlp, rnn, cnn, or a file of your own, "gru.py:GRU"."""
@@ -285,6 +294,7 @@ class Config(Section, frozen=True):
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
     plant: PlantConfig = PlantConfig()
     controller: ControllerConfig = ControllerConfig()
+    reference: ReferenceConfig = ReferenceConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
     constant: ConstantConfig = ConstantConfig()

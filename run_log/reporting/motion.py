@@ -98,7 +98,8 @@ def motion(episodes: list[list[PlantState]], plant: Description, period: float) 
 
 def _after_the_hold(states: list[PlantState]) -> list[PlantState]:
     """From the sample that the first command answers on; nothing where none came."""
-    moving = next((i for i, s in enumerate(states) if s.source != "hold"), None)
+    # A machine that cannot be held waits under its safe input.
+    moving = next((i for i, s in enumerate(states) if s.source != "hold" and s.command_seq >= 0), None)
     return [] if moving is None else states[max(moving - 1, 0) :]
 
 

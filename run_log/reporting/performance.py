@@ -22,14 +22,16 @@ FARTHEST = 1e100
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names.
+    """Figures of a true motion, or of a part of it. Performance states are named by the plant's own names; they are the
+    outputs of the reference where it has any, and "equilibrium" is then where they should be.
 
     Of several episodes: the mean of J and of the deviation, the sum of the violations, of all else the worst.
     """
 
     J: float
     """Sum of the stage costs, dx' Q dx + du' R du times the period, with the densities Q and R of the configuration
-    and the mean input that was applied; an input that the log does not know counts nothing."""
+    and the mean input that was applied; an input that the log does not know counts nothing. dx is from `goal`, du from
+    u_e: the same for every oracle, wherever what it has learned lets it aim."""
     deviation: float
     """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
     overshoot: dict[str, float | None]
@@ -46,6 +48,9 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     excess_between_samples: float | None
     """Largest distance of the true motion from X, between samples too, as a share of the state's half-width; null
     where the equations of the truth do not lead from sample to sample."""
+    offset: dict[str, float] = {}
+    """Per output of the reference: its mean distance from where it should be in the last second, at least in the last
+    sample, as a share of its half-width; empty without outputs."""
 
 
 def performance(motion: Trajectory, plant: Description, config: Config, truth: object) -> Performance:
@@ -57,11 +62,11 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         config: the weights and the rate.
         truth: the plant whose motion this is, as of `excess`.
     """
-    names = [plant.states[i] for i in plant.performance]
-    own = list(plant.performance)
+    names = config.reference.outputs or [plant.states[i] for i in plant.performance]
+    own = [plant.states.index(name) for name in names]
     dx, du = (
         np.clip(off, -FARTHEST, FARTHEST)
-        for off in (motion.x - plant.x_e, np.nan_to_num(motion.applied[1:] - plant.u_e))
+        for off in (motion.x - goal(plant, config), np.nan_to_num(motion.applied[1:] - plant.u_e))
     )
     q, r = (
         np.ones(n) if w is None else np.array(w)
@@ -84,7 +89,16 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
         excess_between_samples=excess(motion, plant, truth),
+        offset=_offset(motion, dx, plant, config),
     )
+
+
+def goal(plant: Description, config: Config) -> np.ndarray:
+    """Where the states should be, (d,), plant units: x_e, but for the outputs that the reference gives a value."""
+    wanted, reference = plant.x_e.copy(), config.reference
+    if reference.outputs and reference.values is not None:
+        wanted[[plant.states.index(name) for name in reference.outputs]] = reference.values
+    return wanted
 
 
 def of_episodes(every: Sequence[Performance]) -> Performance:
@@ -101,6 +115,7 @@ def of_episodes(every: Sequence[Performance]) -> Performance:
         },
         constraint_violations=sum(one.constraint_violations for one in every),
         excess_between_samples=_largest([one.excess_between_samples for one in every]),
+        offset={name: max(one.offset[name] for one in every) for name in every[0].offset},
     )
 
 
@@ -117,6 +132,12 @@ def _largest(values: list[float | None]) -> float | None:
     """None where one of them is."""
     known = [value for value in values if value is not None]
     return max(known) if len(known) == len(values) else None
+
+
+def _offset(motion: Trajectory, dx: np.ndarray, plant: Description, config: Config) -> dict[str, float]:
+    late = dx[motion.step > motion.step[-1] - max(1.0, config.rate)]
+    columns = {name: plant.states.index(name) for name in config.reference.outputs or []}
+    return {name: float(np.abs(late[:, i]).mean() / plant.x_scale[i]) for name, i in columns.items()}
 
 
 def _overshoot(dx: np.ndarray, began_off: bool) -> float | None:

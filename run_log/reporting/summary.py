@@ -54,6 +54,10 @@ class Summary(Performance, frozen=True, kw_only=True):
     """Ticks that needed slack in a soft state constraint, above 1e-9."""
     fallback_ticks: int
     """Ticks whose input did not come from the solver."""
+    unreached_ticks: int | None
+    """Ticks whose target's outputs are not where they should be, or that found no rest; null without a reference."""
+    target_distance: float | None
+    """How far the outputs of the last tick's target are from there, the largest share of an output's half-width."""
     solve_ms: Spread | None
     tick_ms: Spread | None
     prediction_error: PredictionError
@@ -71,6 +75,7 @@ def summarise(run: Run) -> Summary:
     ticks = [tick for tick in run.ticks if tick.run_id in controllers]
     results = [r for r in run.results if r.run_id in controllers]
     margins = [r.set_margin for r in results if r.set_margin is not None]
+    aimed = [r for r in results if r.target_status != "none"]
     timings = [timing for timing in run.timings if timing.run_id in controllers]
     episodes = [performance(one, plant, run.config, truth) for one in trajectory(run, plant).episodes()]
     return Summary(
@@ -86,6 +91,8 @@ def summarise(run: Run) -> Summary:
         iteration_limit_ticks=sum(r.status == Status.ITERATION_LIMIT for r in results),
         soft_ticks=sum(r.slack > SOFT for r in results),
         fallback_ticks=sum(r.mode != "solver" for r in results),
+        unreached_ticks=sum(r.target_status != "reached" for r in aimed) if aimed else None,
+        target_distance=aimed[-1].target_distance if aimed else None,
         solve_ms=_spread([timing.solve_ms for timing in timings]),
         tick_ms=_spread([timing.tick_ms for timing in timings]),
         prediction_error=_prediction_error(run.config.period, ticks, results),

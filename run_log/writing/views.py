@@ -22,9 +22,9 @@ from protocol.topics import Topic
 
 Json = dict[str, Any]
 Vector = list[float]
-NAMED_AFTER = dict.fromkeys(("x", "h", "h_hat", "oracle_norms", "column_norms"), "states") | dict.fromkeys(
-    ("u", "applied"), "inputs"
-)
+NAMED_AFTER = dict.fromkeys(
+    ("x", "h", "h_hat", "oracle_norms", "column_norms", "target_x"), "states"
+) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
 """Of each vector, the plant's attribute that has the names of its entries."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
@@ -47,7 +47,15 @@ def _of_tick(tick: m.Tick) -> Json:
 
 def _of_result(result: m.TickResult) -> Json:
     piece = None if result.set_margin is None else result.set_piece
-    return {"x": result.x or None, "oracle_norms": result.oracle_norms or None, "set_piece": piece}
+    aimed = None if result.target_status == "none" else result.target_status
+    return {
+        "x": result.x or None,
+        "oracle_norms": result.oracle_norms or None,
+        "set_piece": piece,
+        "target_status": aimed,
+        "target_x": result.target_x or None,
+        "target_u": result.target_u or None,
+    }
 
 
 def _of_samples(samples: m.Samples) -> Json:
@@ -89,9 +97,13 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance",
         _of_result,
-        {"x": Vector | None, "oracle_norms": Vector | None, "set_piece": int | None},
+        {
+            **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
+            "set_piece": int | None,
+            "target_status": m.TargetStatus | None,
+        },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),
     m.Samples: Shown(

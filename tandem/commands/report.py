@@ -32,7 +32,7 @@ class Report(Command):
         """0, or 1 when a picture cannot be drawn or written."""
         import msgspec
 
-        from run_log.named_plant import name_plant
+        from run_log.named_plant import name_truth
         from run_log.reading.reader import read_run
         from run_log.reporting.report import report
         from run_log.reporting.summary import summarise
@@ -41,7 +41,7 @@ class Report(Command):
 
         require("matplotlib")
         ran = read_run(self.file)
-        notes = [] if self.plant is None else name_plant(ran, self.plant)
+        notes = [] if self.plant is None else name_truth(ran, self.plant)
         summary = summarise(ran)
         self.console.print(summary_table.table(summary))
         with self.console.status("drawing"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -150,9 +151,10 @@ class Run(Configured):
         Raises:
             Impatient: the figures are not waited for.
         """
-        from node_runtime.config.reference import is_reference
+        from lbmpc.plants import get_plant, get_truth
+        from node_runtime.config.plant import true_plant_of
+        from node_runtime.config.strict import ConfigError
         from run_log.errors import LogError
-        from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.reporting import report
         from run_log.reporting.canvas import PictureError
@@ -173,8 +175,9 @@ class Run(Configured):
             with self.console.status("reading the log"):
                 parts = existing_parts(files.log)
                 ran = read_run(parts[0] if parts else files.log)
-                if is_reference(config.plant.model):
-                    name_plant(ran, config.plant.model)
+                # A file may have changed since, and then nothing is said of the motion between samples.
+                with suppress(ConfigError):
+                    ran.truth = true_plant_of(config, get_plant, get_truth)
                 summary = summarise(ran)
             result = summary_table.of(summary)
             self.console.print(summary_table.table(summary))

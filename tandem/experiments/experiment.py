@@ -105,7 +105,7 @@ def run(
 
 def settings(declared: Declaration, where: str) -> Config:
     """The configuration that no case has changed. Raises `ConfigError`."""
-    return config_of([declared], {}, where)
+    return config_of([declared], {}, where, Path(where).parent)
 
 
 def overview(declared: Declaration) -> dict[str, Any]:

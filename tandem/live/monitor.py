@@ -17,11 +17,10 @@ from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.reporting.summary import SOFT
+from tandem.live.presence import SILENT_S, Presence
 
 RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
-# Health comes twice a second, and a plant's states once a period.
-SILENT_S, SILENT_PERIODS = 2.0, 3.0
 TREND_SECONDS = 40
 EVENTS = 10
 
@@ -130,10 +129,7 @@ class Monitor:
         """Of the controller, up to its newest tick."""
         self._seen = Snapshot(config, plant, seconds)
         self._followers: dict[str, Follower] = {}
-        self._plant: tuple[str, float] | None = None
-        """The plant's run, and when its newest state came."""
-        self._missed_at: float | None = None
-        """The same moment once it has been said that nothing came after it; None: nothing is missed."""
+        self._plant = Presence(config.period)
         self._x: list[float] | None = None
         self._u: list[float] | None = None
         self._health: dict[str, tuple[m.Health, float]] = {}
@@ -187,7 +183,8 @@ class Monitor:
         seen = self._seen
         match message:
             case m.PlantState():
-                self._take_plant(message.run_id, now)
+                if text := self._plant.came(message.run_id, now):
+                    self.say(text, now, "good")
                 self._x, seen.source = message.x, message.source
             case m.Command():
                 if self.first_command is None:
@@ -212,25 +209,10 @@ class Monitor:
             case m.Health():
                 self._take_health(message, now)
 
-    def _take_plant(self, run_id: str, now: float) -> None:
-        away = "" if self._missed_at is None else f" after {now - self._missed_at:.1f} s"
-        if self._plant is not None and run_id != self._plant[0]:
-            self.say(f"the plant was started again{away}, as {run_id}: a new episode", now, "good")
-        elif away:
-            self.say(f"the plant is back{away}", now, "good")
-        self._plant, self._missed_at = (run_id, now), None
-
     def miss_plant(self, now: float) -> None:
         """Say it, once, when a plant that was there is silent."""
-        if self._plant is not None and self._missed_at is None and self._silent(now):
-            self._missed_at = self._plant[1]
-            self.say(f"the plant is silent: no state for {now - self._missed_at:.1f} s", now, "bad")
-
-    def _silent(self, now: float) -> bool:
-        """Whether there is no plant: none of its states came for a while, or ever."""
-        return self._plant is None or now - self._plant[1] > max(
-            SILENT_S, SILENT_PERIODS * self.config.period
-        )
+        if text := self._plant.miss(now):
+            self.say(text, now, "bad")
 
     def _take_result(self, result: m.TickResult, now: float) -> None:
         seen, tick = self._seen, f"tick {result.seq}:"
@@ -322,7 +304,7 @@ class Monitor:
 
     def snapshot(self, now: float) -> Snapshot:
         """What there is to see at `now`, seconds on the monotonic clock."""
-        plant, silent = self.plant, self._silent(now)
+        plant, silent = self.plant, self._plant.silent(now)
         x, u = (None, None) if silent else (self._x, self._u)
         recent = [error for at, error in self._errors if at > now - 1.0]
         return replace(
@@ -342,15 +324,16 @@ class Monitor:
         )
 
     def _row(self, name: str, now: float) -> ProcessRow:
-        if name not in self._health:
-            if name == "plant" and self._plant is not None and name not in self._ended:
-                return ProcessRow(
-                    name, "silent" if self._silent(now) else "running", "says only its states", {}
-                )
-            return ProcessRow(name, "ended" if name in self._ended else "not heard of", "", {})
-        health, at = self._health[name]
-        status = "ended" if name in self._ended else "silent" if now - at > SILENT_S else health.status
-        return ProcessRow(name, status, health.note, health.counters)
+        health, at = self._health.get(name, (None, now))
+        note, counters = ("", {}) if health is None else (health.note, health.counters)
+        if name in self._ended:
+            return ProcessRow(name, "ended", note, counters)
+        if health is not None and now - at <= SILENT_S:
+            return ProcessRow(name, health.status, note, counters)
+        if name == "plant" and not self._plant.silent(now):
+            return ProcessRow(name, "running", "says only its states", {})
+        known = health is not None or (name == "plant" and self._plant.known)
+        return ProcessRow(name, "silent" if known else "not heard of", note, counters)
 
 
 def _gauges(

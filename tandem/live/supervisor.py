@@ -214,7 +214,8 @@ class Supervisor:
         slots = max(1.0, self.monitor.seconds * self.config.rate)
         waiting_since = time.monotonic()
         if "plant" not in self.children and self.monitor.first_command is None:
-            self.monitor.say(self._what_a_plant_needs(), waiting_since)
+            for text in self._what_a_plant_needs():
+                self.monitor.say(text, waiting_since)
         while not self.wish.stop:
             first = self.monitor.first_command
             # The last slot says it exactly, the clock in any case.
@@ -233,13 +234,13 @@ class Supervisor:
             self._listen()
         return None
 
-    def _what_a_plant_needs(self) -> str:
+    def _what_a_plant_needs(self) -> tuple[str, str]:
         """For whoever starts it elsewhere, or looks why nothing comes."""
         plant, bus = self.monitor.plant, self.config.bus
         places = " or ".join(filter(None, (bus.endpoint, bus.remote)))
-        what = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
+        states = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
         key = topics.PLANT_STATE.key(self.config.name)
-        return f"waiting for the plant: {what} as {key}, by the router at {places}"
+        return f"waiting for the plant: its router is at {places}", f"it publishes {states} as {key}"
 
     def _died(self, child: Child) -> str | None:
         """What to do about a process that has ended: text that ends the run, or None to go on."""

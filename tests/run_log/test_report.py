@@ -20,6 +20,7 @@ from lbmpc.plants import get_plant
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from protocol import topics
+from protocol.messages import InputSource
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
@@ -75,10 +76,16 @@ def moved(messages: list[Logged], **changes: Any) -> list[Logged]:
     ]
 
 
-def test_summary_counts_after_the_hold_and_ignores_strangers(config: Config, messages: list[Logged]) -> None:
+@pytest.mark.parametrize("waits", ["hold", "safe"])
+def test_summary_counts_after_the_hold_and_ignores_strangers(
+    config: Config, messages: list[Logged], waits: InputSource
+) -> None:
     plain = summarise(gather(config, messages))
     first = next(message for topic, message, _ in messages if topic is topics.PLANT_STATE)
-    held = [(topics.PLANT_STATE, msgspec.structs.replace(first, seq=i, t=90.0 + i), i) for i in range(5)]
+    held = [
+        (topics.PLANT_STATE, msgspec.structs.replace(first, seq=i, t=90.0 + i, source=waits), i)
+        for i in range(5)
+    ]
     later = moved(messages, seq=lambda s: s.seq + 5)
     liar = (
         topics.PLANT_STATE,

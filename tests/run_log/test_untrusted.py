@@ -16,11 +16,12 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from lbmpc.plants import get_plant
-from node_runtime.config.loading import override
+from node_runtime.config.loading import override, to_json
 from node_runtime.config.sections import Config
 from protocol import codec, topics
+from run_log import plant_record
 from run_log.errors import LogError
-from run_log.file_format import CONFIG, LIBRARY, PROFILE
+from run_log.file_format import CONFIG, LIBRARY, PLANT, PROFILE
 from run_log.reading import mcap_scan
 from run_log.reading.gaps import lost_ticks
 from run_log.reading.reader import read_run
@@ -28,6 +29,7 @@ from run_log.reading.recover import recover
 from run_log.replaying.replay import replay
 from run_log.reporting.report import report
 from run_log.reporting.summary import summarise
+from run_log.run import gather
 from run_log.writing.writer import LogWriter
 from tests.helpers.paths import ROOT
 from tests.helpers.run_log_samples import synthetic, write
@@ -129,7 +131,6 @@ def configured(path: Path, **changes: dict[str, object]) -> Path:
         ({"adaptation": {"refit": {"window": 10**12}}}, "adaptation.refit.window"),
         ({"network": {"window": 10**9}}, "network.window"),
         ({"network": {"hidden": [10**9]}}, "network.hidden"),
-        ({"network": {"architecture": "../../os"}}, "no architecture is called"),
         ({"network": {"architecture": "os"}}, "no architecture is called"),
     ],
 )
@@ -139,6 +140,75 @@ def test_sizes_and_names_in_a_logs_configuration_have_limits(
     with pytest.raises(LogError) as caught:
         read_run(configured(tmp_path / "run.mcap", **changes))
     assert said in str(caught.value)
+
+
+def with_plant(path: Path, data: bytes) -> Path:
+    """A log with this attachment and a configuration, and nothing else."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile=PROFILE, library=LIBRARY)
+        writer.add_attachment(0, 0, CONFIG, "application/json", b"{}")
+        writer.add_attachment(0, 0, PLANT, "application/json", data)
+        writer.finish()
+    return path
+
+
+def hostile(**changes: object) -> bytes:
+    """The plant of a log, with these of its fields."""
+    tree = json.loads(plant_record.encode(get_plant("moore_greitzer"), {}))
+    tree["known"] |= changes
+    return json.dumps(tree).encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"{}", "missing required field `known`"),
+        (b"not JSON", "JSON is malformed"),
+        (b'{"known": {}, "files": {}}', "missing required field"),
+        (b" " * 1_000_001, "1000001 bytes, and 1000000 is the most"),
+        (hostile(A=[[float("nan")] * 4] * 4), "malformed"),
+        (hostile(A=[[1e999] * 4] * 4), "malformed"),
+        (hostile(A=[[0.0] * 3] * 4), "A "),
+        (hostile(x_min=["-inf"] * 5), "x_min"),
+        (hostile(W=[-1.0] * 4), "W of z is -1"),
+        (hostile(states=["z"] * 4), "are called 'z'"),
+        (hostile(rhs="import os"), "unknown field"),
+    ],
+)
+def test_a_hostile_plant_in_a_log_is_refused_by_name(data: bytes, said: str, tmp_path: Path) -> None:
+    with pytest.raises(LogError) as caught:
+        read_run(with_plant(tmp_path / "run.mcap", data))
+    assert f"{PLANT}: " in str(caught.value)
+    assert said in str(caught.value)
+
+
+def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path) -> None:
+    mark = tmp_path / "loaded"
+    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w')\nPLANT = 1\n")
+    config = override(
+        Config(), [f"plant.model={tmp_path}/evil.py:PLANT", f"plant.truth={tmp_path}/evil.py:PLANT"]
+    )
+    messages = synthetic(Config(), 20)[1]
+    run = gather(config, messages, tmp_path / "run.mcap")
+    for read in (summarise, lambda run: report(run, tmp_path)):
+        with pytest.raises(LogError, match="nothing is loaded because a log names it"):
+            read(run)
+    # What a controller has said of itself is in the log as well.
+    told = [
+        (
+            topic,
+            msgspec.structs.replace(message, config=to_json(config))
+            if topic == topics.RUN_INFO["controller"]
+            else message,
+            at,
+        )
+        for topic, message, at in messages
+    ]
+    run = gather(Config(), told, tmp_path / "run.mcap")
+    with pytest.raises(LogError, match="nothing is loaded because a log names it"):
+        replay(run)
+    assert not mark.exists()
 
 
 def test_a_network_that_no_message_could_carry_is_not_built(tmp_path: Path) -> None:

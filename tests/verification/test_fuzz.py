@@ -54,6 +54,7 @@ def test_twenty_thousand_bad_payloads(tmp_path: Path) -> None:
         ("certified sets, forged", 150),
         ("a control step with certified sets", 300),
         ("configuration of a log, its controller", 25),
+        ("plant of a log, its model", 200),
     ],
 )
 def test_what_somebody_made_up_is_refused_or_borne(readers: dict[str, Target], name: str, count: int) -> None:

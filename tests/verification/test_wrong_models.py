@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from lbmpc.plants import PLANTS
-from tests.helpers.plants.two_tanks import TWO_TANKS
 from verification.wrong_models import Row, run_one, verdict
 
 
@@ -44,8 +42,7 @@ def test_nothing_is_asked_where_perfect_does_not_keep_X() -> None:
     assert not verdict([*rows, row("perfect", 1.0, 1.0)])[0]
 
 
-def test_a_run_is_of_the_true_plant_in_episodes_that_begin_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLANTS, "two_tanks", TWO_TANKS)
+def test_a_run_is_of_the_true_plant_in_episodes_that_begin_alike() -> None:
     more = ["controller.solver.compile=never"]
     costs = {oracle: run_one("tanks", 0.25, oracle, 2, more).J for oracle in ("linear", "perfect")}
     assert costs["linear"][0] == pytest.approx(costs["linear"][1], rel=1e-9)

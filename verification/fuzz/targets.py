@@ -12,11 +12,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from controller_node.build import build_model
+from controller_node.build import build_model, build_plant
 from controller_node.certified_sets import CertifiedSets, Found
 from controller_node.codegen.compiler import SEAL, is_sealed, sealed
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
+from lbmpc.model import ModelError
+from lbmpc.model import build_model as nominal_model
 from lbmpc.sets.certificate import CertificateError, encode
 from network_model.description import NetworkDescription
 from node_runtime.bus.batches import unbatch
@@ -29,8 +31,11 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
 from protocol.topics import Topic
+from run_log import plant_record
 from run_log.errors import LogError
+from run_log.named_plant import given_plant
 from run_log.reading.reader import read_run
+from run_log.run import Run
 from run_log.writing.writer import LogWriter
 from verification.fuzz import certified, mutate
 from verification.fuzz.mutate import Mutator, Reteller
@@ -97,6 +102,10 @@ def targets(seed: int, folder: Path) -> list[Target]:
     found.append(Target("a control step with certified sets", certified.asked(small), states, 0.05))
     retold = Reteller(to_json(settings).encode(), seed * 1000 + len(found))
     found.append(Target("configuration of a log, its controller", _building, retold, 0.2 * SHARE_OF_SLOW))
+    plant = plant_record.encode(build_plant(settings), {"plant.model": "0" * 64}).encode()
+    add("plant of a log", _knowing, [plant], 0.02, textual=True)
+    retold = Reteller(plant, seed * 1000 + len(found))
+    found.append(Target("plant of a log, its model", _modelling, retold, 2.0 * SHARE_OF_SLOW))
     log = _log(settings, payloads, folder)
     add("log file", _logging(folder / f"fuzzed-{seed}.mcap"), [log], SHARE_OF_SLOW)
     return found
@@ -215,12 +224,33 @@ def _building(payload: bytes) -> str:
     """As far as a replay goes: the controller of a recorded configuration, where that is a small one."""
     try:
         said = from_json(payload.decode(errors="replace"))
-        build_model(said)
+        given = given_plant(Run(Path("fuzzed.mcap"), said), said, set())
+        build_model(said, given)
         if said.controller.horizon > 20 or said.controller.solver.compile != "never":
             return "accepted"
-        ControllerCore(said, "controller-1")
-    except ConfigError:
+        ControllerCore(said, "controller-1", given=given)
+    except (ConfigError, LogError):
         return "refused"
+    return "accepted"
+
+
+def _knowing(payload: bytes) -> str:
+    try:
+        plant_record.decode(payload)
+    except plant_record.PlantRecordError:
+        return "refused"
+    return "accepted"
+
+
+def _modelling(payload: bytes) -> str:
+    """As far as the model of the numbers that a log holds."""
+    try:
+        known, _files = plant_record.decode(payload)
+        nominal_model(known, 0.05)
+    except plant_record.PlantRecordError:
+        return "refused"
+    except ModelError:
+        return "no model"
     return "accepted"
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from controller_node.build import GivenPlant
 from controller_node.core import ControllerCore, Outputs
-from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, true_motion
+from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth, true_motion
 from node_runtime.config.architecture import register_architecture
 from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
@@ -136,7 +136,7 @@ class LockStep:
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER, given=given)
         truth = None if given is None else given.truth
-        self.true = self.first_true = true_plant_of(config, get_plant) if truth is None else truth
+        self.true = self.first_true = true_plant_of(config, get_plant, get_truth) if truth is None else truth
         self.motion = self._motion(self.true)
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         self.plant = self._started_plant(initial_state(config, self.core.plant))

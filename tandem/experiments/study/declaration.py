@@ -173,8 +173,10 @@ def resolve(declared: Declaration, plant: Description, where: str, quick: bool =
     return resolved
 
 
-def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str) -> Config:
+def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str, folder: Path) -> Config:
     """The configuration of an experiment, of a group or of a case, with what varies on top.
+
+    where: for messages; folder: the experiment's, to which its references are relative.
 
     Raises:
         ConfigError: there is no such configuration to start from, or the changes do not fit it.
@@ -184,10 +186,12 @@ def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str) -> 
     for change in (*(level.set for level in levels), *(_below(key, value) for key, value in varied.items())):
         changes = _merged(changes, change)
     try:
-        tree = {} if name is None else load_tree(config_file(name))
+        file = None if name is None else config_file(name)
+        tree = {} if file is None else load_tree(file)
     except ConfigError as error:
         raise ConfigError(f"{where}: config: {error}") from error
-    return from_tree(_merged(tree, changes), where, dict.fromkeys(_keys(changes), where))
+    origins = dict.fromkeys(_keys(changes), where)
+    return from_tree(_merged(tree, changes), where, origins, file and file.parent, folder)
 
 
 def _resolve(
@@ -209,7 +213,7 @@ def _resolve(
     made = []
     for values in itertools.product(*vary.values()):
         varied = dict(zip(vary, values, strict=True))
-        config = config_of(levels, varied, f"{where}: case {case.name!r}")
+        config = config_of(levels, varied, f"{where}: case {case.name!r}", Path(where).parent)
         names = ", ".join(f"{key.rpartition('.')[2]} = {_shown(value)}" for key, value in varied.items())
         words = {key: _words(key, value) for key, value in varied.items()}
         made.append(

@@ -12,7 +12,6 @@ import msgspec
 
 from node_runtime import provenance
 from node_runtime.config.plant import files_of
-from node_runtime.config.reference import sha256_of
 from node_runtime.config.sections import Config
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.study.declaration import Resolved
@@ -42,8 +41,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def key(self) -> str:
         """Of everything that its result depends on: settings and code, somebody's own files too."""
-        own = f"{files_of(self.config)} {sha256_of(self.config.network.architecture)}"
-        return hashlib.sha256(msgspec.json.encode(self) + f"{code_version()} {own}".encode()).hexdigest()[:24]
+        files = msgspec.json.encode(files_of(self.config))
+        return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
 
 
 class RowPlan(NamedTuple):

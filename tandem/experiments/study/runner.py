@@ -153,7 +153,10 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
-    plant = PlantConfig(model=config.plant.model)
+    given = config.plant
+    plant = PlantConfig(model=given.model, x_e=given.x_e, u_e=given.u_e, bounds=given.bounds)
+    if isinstance(given.truth, str):
+        plant = msgspec.structs.replace(plant, truth=given.truth)
     config = msgspec.structs.replace(
         config, seed=seed, plant=plant, controller=controller, constant=Config().constant
     )

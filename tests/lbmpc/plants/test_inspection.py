@@ -9,6 +9,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from examples.quadrotor.quadrotor import QUADROTOR
+from examples.tanks.tanks import TANKS
 from lbmpc.model import ModelError, build_model
 from lbmpc.plants import PLANTS, Plant, PlantDefinitionError, get_plant
 from lbmpc.plants.equations import Domain
@@ -17,8 +19,6 @@ from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from tests.helpers.plants.integrator import INTEGRATOR
 from tests.helpers.plants.pendulum import PENDULUM, inverted
 from tests.helpers.plants.pendulum import equations as pendulum_of
-from tests.helpers.plants.quadrotor import QUADROTOR
-from tests.helpers.plants.two_tanks import TWO_TANKS
 from tests.helpers.plants.unstable import unstable
 
 INF, NAN = float("inf"), float("nan")
@@ -174,7 +174,7 @@ def test_a_model_of_a_faulty_plant_is_refused_as_well() -> None:
 
 
 SOUND = [
-    *(MOORE_GREITZER, PENDULUM, INTEGRATOR, TWO_TANKS, QUADROTOR, one_state()),
+    *(MOORE_GREITZER, PENDULUM, INTEGRATOR, TANKS, QUADROTOR, one_state()),
     *(unstable(12.0), inverted(1.0), inverted(0.1)),
 ]
 

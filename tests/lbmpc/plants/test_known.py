@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from examples.quadrotor.quadrotor import QUADROTOR
+from examples.tanks.tanks import TANKS
 from lbmpc.model import ModelError, build_model
-from lbmpc.plants import PLANTS, Known, PlantDefinitionError, Truth, get_plant, true_motion
+from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, PlantError, Truth, get_plant, true_motion
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from tests.helpers.plants.integrator import INTEGRATOR
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.helpers.plants.quadrotor import QUADROTOR
-from tests.helpers.plants.two_tanks import TWO_TANKS
 
 INF, NAN = float("inf"), float("nan")
 A, B = [[0.0, 1.0], [-2.0, -0.3]], [[0.0], [1.0]]
@@ -179,6 +179,10 @@ WITHOUT_MOTION = {
         [[0.9, 0.5, 0.0], [0.0, 1e-9, 1.0], [0.0, 1e-9, 1e-9]],
         [[0.0], [0.0], [1.0]],
     ),
+    "one with a motion of rounding": (
+        [[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, -1e-6, 0.0]],
+        [[0.0], [0.0], [1.0]],
+    ),
     "a sign that alternates": ([[-0.4, 0.1], [0.0, 0.8]], [[1.0], [1.0]]),
 }
 
@@ -219,6 +223,18 @@ def test_numbers_move_as_their_model_says(known: Known) -> None:
     np.testing.assert_allclose(halfway, after, atol=1e-12)
 
 
+def test_without_a_motion_within_a_period_numbers_are_a_truth_of_whole_periods() -> None:
+    a, b = WITHOUT_MOTION["a dead time"]
+    known = numbers(a, b, period=0.1)
+    truth, x, u = true_motion(known), np.array([0.3, -0.5]), np.array([-0.7])
+    np.testing.assert_allclose(truth.step(x, u, 0.1), known.A @ x + known.B @ u)
+    np.testing.assert_allclose(
+        truth.step(x, u, 0.3), truth.step(truth.step(truth.step(x, u, 0.1), u, 0.1), u, 0.1)
+    )
+    with pytest.raises(PlantError, match=r"no motion between two samples.*plant\.truth"):
+        truth.step(x, u, 0.04)
+
+
 # -- rest -------------------------------------------------------------------------------------
 
 
@@ -239,6 +255,16 @@ def test_the_state_gives_way_where_no_input_holds_an_offset() -> None:
     np.testing.assert_allclose(known.x_e, [0.1, -0.3], atol=1e-14)
 
 
+def test_what_the_plant_is_for_moves_last() -> None:
+    """An actuator that is a period late: it holds the offset, where the first state could give way as well."""
+    a, b = [[1.05, 0.1], [0.0, 0.0]], [[0.0], [1.0]]
+    held = numbers(a, b, period=0.1, offset=[0.01, 0.0], performance=(0,))
+    np.testing.assert_allclose([*held.x_e, *held.u_e], [0.0, -0.1, -0.1], atol=1e-14)
+    shared = numbers(a, b, period=0.1, offset=[0.01, 0.0])
+    assert np.linalg.norm(shared.x_e / [1.0, 2.0]) < np.linalg.norm(held.x_e / [1.0, 2.0])
+    np.testing.assert_allclose(0.05 * shared.x_e[0] + 0.1 * shared.x_e[1], -0.01, atol=1e-14)
+
+
 def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
     known = sampled(offset=[0.01, 0.02])
     there = known.A @ -known.x_e + known.B @ -known.u_e + known.x_e + [0.01, 0.02]
@@ -255,8 +281,30 @@ def test_numbers_rest_elsewhere_too() -> None:
     moved = numbers().resting_near(x_e=[0.5, 0.0])
     np.testing.assert_allclose(moved.x_e, [0.5, 0.0], atol=1e-14)
     np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
-    again = moved.resting_near()
-    assert (again.x_e.tolist(), again.u_e.tolist()) == (moved.x_e.tolist(), moved.u_e.tolist())
+
+
+@pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
+def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
+    there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
+    assert there.u_max.tolist() == [25.0]
+    assert np.abs(there.x_e - [9.0, 14.0]).max() < 1.0
+    assert faults(there) == ()
+    # What is shown of it can be given, and is the same to the bit.
+    again = plant.changed({"q": (0.0, 25.0)}, there.x_e.tolist(), there.u_e.tolist())
+    assert (again.x_e.tolist(), again.u_e.tolist()) == (there.x_e.tolist(), there.u_e.tolist())
+
+
+def test_what_cannot_be_changed_is_looked_at_first() -> None:
+    broken = replace(PENDULUM, rhs=lambda x, u: [x[1], 1 / 0], equations=None, parameters={})
+    for bad in (broken, replace(PENDULUM.known(), A=np.eye(3)), replace(numbers(), W=[NAN, 1.0])):
+        with pytest.raises(PlantDefinitionError, match=r"ZeroDivisionError|A has the shape|W of x1 is nan"):
+            get_plant(bad, lambda plant: plant.changed({}, x_e=[0.1, 0.0]))
+    inside = get_plant(
+        numbers(), lambda plant: plant.changed({"x1": (2.0, 4.0), "u1": (-9.0, 9.0)}, x_e=[3.0, 0.0])
+    )
+    np.testing.assert_allclose(inside.u_e, [6.0])
+    with pytest.raises(PlantDefinitionError, match="u_e of u1 is 6, but u_min of u1 is -3"):
+        get_plant(numbers(), lambda plant: plant.changed({"x1": (2.0, 4.0)}, x_e=[3.0, 0.0]))
 
 
 def test_equations_rest_where_a_known_wind_lets_them() -> None:
@@ -280,7 +328,7 @@ def test_equations_rest_where_a_known_wind_lets_them() -> None:
 
 
 def test_another_level_is_held_by_another_inflow() -> None:
-    other = TWO_TANKS.resting_near(x_e=[9.0, 14.0])
+    other = TANKS.resting_near(x_e=[9.0, 14.0])
     np.testing.assert_allclose(np.array(other.function()(other.x_e, other.u_e)), np.zeros((2, 1)), atol=1e-9)
     assert np.abs(other.x_e - [9.0, 14.0]).max() < 1.0
     with pytest.raises(PlantDefinitionError, match="at the nearest rest: u_e of torque is"):
@@ -303,6 +351,8 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         else:
             assert its == ours
             assert type(its) is type(ours)
+    # A real pole stays real: its exponential is another function.
+    assert [type(pole) for pole in again.poles or ()] == [type(pole) for pole in known.poles or ()]
     for name in ("A", "B", "K", "P"):
         period = known.period or 0.05
         np.testing.assert_array_equal(

@@ -332,13 +332,26 @@ class Failing:
         self.real, self.good = real, good
 
     def solve(
-        self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray, *, first: Box | None = None
+        self,
+        x: np.ndarray,
+        theta: np.ndarray,
+        warm: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+        first: Box | None = None,
     ) -> Solution:
         self.good -= 1
-        found = self.real.solve(x, theta, warm, first=first)
+        found = self.real.solve(x, theta, warm, xr, ur, first=first)
         return found if self.good >= 0 else replace(found, status=Status.NUMERICAL)
 
-    def prepare(self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray) -> None: ...
+    def prepare(
+        self,
+        x: np.ndarray,
+        theta: np.ndarray,
+        warm: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> None: ...
 
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         raise AssertionError("not in this mode")
@@ -401,7 +414,7 @@ def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
 def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
     """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
     fast = replace(
-        two_inputs().plant,
+        two_inputs().equations,
         name="fast",
         rhs=lambda x, u: [-1000.0 * x[0] + u[0], x[1] + u[1]],
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from msgspec import inspect
 
-from lbmpc.plants import get_plant
+from lbmpc.plants import get_plant, get_truth
 from node_runtime.config.loading import from_json, from_tree, load, override, to_json, to_toml, to_tree
 from node_runtime.config.plant import plant_of, true_plant_of
 from node_runtime.config.sections import Config
@@ -170,6 +170,21 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
             "plant.truth.slop=1.4",
             "plant.truth: moore_greitzer has no parameter 'slop'; did you mean 'slope'?",
         ),
+        (
+            'reference.outputs=["q"]',
+            "reference.outputs: moore_greitzer has no state 'q'; it has z, y, r, rdot",
+        ),
+        ('reference.outputs=["u"]', "reference.outputs: moore_greitzer has no state 'u'"),
+        ('reference.outputs=["y", "y"]', "reference.outputs: 'y' is there twice"),
+        ("reference.values=[1.0]", "reference.values has 1 entries; no reference.outputs"),
+        (
+            'reference={outputs=["y"], values=[1.7, 1]}',
+            "reference.values has 2 entries; reference.outputs has 1",
+        ),
+        (
+            'reference={outputs=["y"], values=[2.2]}',
+            "reference.values: y = 2.2 is outside of X, 1.1875 to 2.1875",
+        ),
         ("plant.truth.mass=1.4", "no parameter 'mass'; it has beta, z_c, slope"),
         ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),
     ],
@@ -181,11 +196,11 @@ def test_what_the_plant_does_not_have(given: str, expected: str):
 
 def test_a_wrong_model_has_a_true_plant_beside_it():
     config = override(Config(), ["plant.truth.slope=1.4"])
-    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant)
+    model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
     assert model is get_plant("moore_greitzer")
     assert truth.parameters == {**model.parameters, "slope": 1.4}
     assert (truth.x_e == model.x_e).all()
-    assert true_plant_of(Config(), get_plant) is model
+    assert true_plant_of(Config(), get_plant, get_truth) is model
 
 
 def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -236,6 +251,7 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "x_e",
         "u_e",
         "bounds",
+        "values",
         "truth",
         "options",
         "output_scale",

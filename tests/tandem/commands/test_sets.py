@@ -8,6 +8,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -40,7 +41,8 @@ from run_log.replaying.replay import replay
 from run_log.reporting.summary import summarise
 from run_log.writing.save import save
 from tandem.cli import main
-from tandem.experiments.simulation.lockstep import simulate
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow, simulate
 from tandem.live.monitor import Monitor
 from tests.helpers.plants.pendulum import PENDULUM, pendulum
 from tests.helpers.science import compressor
@@ -149,6 +151,26 @@ def test_a_given_w_that_the_plant_leaves_is_said(cached: Path, capsys: pytest.Ca
     assert "Warning: the plant's own equations leave that W" in capsys.readouterr().out
     assert main(["sets", "check", "given.json", *OPTIONS]) == 3
     assert "its W does not hold for the true plant: in piece C, from x =" in capsys.readouterr().err
+
+
+def test_numbers_alone_have_sets_of_a_given_w(
+    cached: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(PLANTS, "pendulum", PENDULUM.known())
+    options = [*OPTIONS, "--set", "controller.W=[0.02,0.4]", "--set", "plant.x0=[0.3,0.0]"]
+    assert main(["sets", "compute", *options, "--out", "box.json", "--kind", "box"]) == 3
+    assert "numbers alone" in capsys.readouterr().err
+    assert main(["sets", "compute", *options, "--out", "given.json", "--kind", "given"]) == 0
+    assert "There are no equations to hold it against." in capsys.readouterr().out
+    assert main(["sets", "check", "given.json", *options, "--json"]) == 0
+    assert told(capsys)["W"].startswith("not looked at: the plant is numbers alone")
+    # In force, with the pendulum's equations as the truth, replayed from numbers.
+    monkeypatch.setitem(PLANTS, "rod", replace(PENDULUM, name="rod"))
+    config = invariant("controller.sets=given.json", "plant.truth=rod", "plant.x0=[0.3,0.0]")
+    ran = follow(config, 30, Faults(command_seconds=0.03)).run
+    assert summarise(ran).outside_ticks == 0
+    save(ran, cached / "run.mcap")
+    assert replay(read_run(cached / "run.mcap")).equal
 
 
 def test_a_whole_file_passes(cached: Path, capsys: pytest.CaptureFixture[str]):

@@ -39,7 +39,8 @@ def test_a_plant_of_others_comes_and_goes_and_another_one_comes(tmp_path: Path) 
     at = config.bus.endpoint
     there = ("--set", f"bus.endpoint={at}")
     with launched(tmp_path, "--no-plant", "--oracle", "constant", *there, *small()) as run:
-        run.hears(f"4 states (z, y, r, rdot) at 20 Hz as tandem/jet1/plant/state, by the router at {at}")
+        run.hears(f"waiting for the plant: its router is at {at}")
+        run.hears("it publishes 4 states (z, y, r, rdot) at 20 Hz as tandem/jet1/plant/state")
         with running("examples/gateway_without_tandem.py", at) as gateway:
             run.hears(" ticks, ", times=2)
             with Bus(config, "controller", "hostile") as bus:

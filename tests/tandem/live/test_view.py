@@ -271,7 +271,13 @@ def test_a_plant_that_says_only_its_states_runs_while_they_come() -> None:
     assert plant_row(seen.snapshot(START)) == ("not heard of", "")
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
     assert plant_row(seen.snapshot(START + 1.0)) == ("running", "says only its states")
-    assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "says only its states")
+    assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "")
+    # One that was chatty may be followed by one that is not.
+    seen.feed(delivery(topics.HEALTH["plant"], health("plant", {}, "as usual"), START + 3.0))
+    assert plant_row(seen.snapshot(START + 3.0)) == ("running", "as usual")
+    assert plant_row(seen.snapshot(START + 6.0)) == ("silent", "as usual")
+    seen.feed(delivery(topics.PLANT_STATE, state(99), START + 6.0))
+    assert plant_row(seen.snapshot(START + 6.0)) == ("running", "says only its states")
 
 
 def test_a_plant_that_falls_silent_is_missed_and_its_return_is_said() -> None:

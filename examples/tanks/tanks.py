@@ -5,7 +5,7 @@
 
 What leaks from the upper tank is lost.
 
-| parameter | model | `TRUTH` | source |
+| parameter | model | truth, in `tanks.toml` | source |
 | --- | --- | --- | --- |
 | area_1, cm^2 | 28 | the same | Johansson (2000), The quadruple-tank process, A1 |
 | area_2, cm^2 | 32 | the same | the same, A2 |
@@ -21,20 +21,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.equations import Domain, Plant, Rhs
+from lbmpc.plants import Domain, Plant, Rhs
 
 GRAVITY = 981.0
 PARAMETERS = {"area_1": 28.0, "area_2": 32.0, "outlet_1": 0.071, "outlet_2": 0.057, "leak": 0.0}
-TRUTH = {"outlet_1": 1.25 * 0.071, "outlet_2": 1.25 * 0.057, "leak": 0.01}
-SETTINGS = [
-    *("rate=0.2", "controller.horizon_seconds=120"),
-    # The lower level is what matters; half of the pump's range costs as much as 1 cm there.
-    *("controller.Q=[0.1, 1.0]", "controller.R=[0.01]"),
-    # Levels move by a hundredth of their half-width a second, and a trial reaches back 80 samples.
-    *("network.output_scale=0.02", "adaptation.column_bound=0.1", "adaptation.initial_scale=6e-4"),
-    *("adaptation.trial.seconds=400", "adaptation.trial.confirm=100"),
-]
-"""A sample every 5 s and a horizon of two minutes, twice the time constant of a tank."""
 
 
 def equations(area_1: float, area_2: float, outlet_1: float, outlet_2: float, leak: float) -> Rhs:
@@ -53,8 +43,8 @@ def equations(area_1: float, area_2: float, outlet_1: float, outlet_2: float, le
 LEVEL = 10.0
 Q_E = PARAMETERS["outlet_2"] * np.sqrt(2 * GRAVITY * LEVEL)
 
-TWO_TANKS = Plant(
-    name="two_tanks",
+TANKS = Plant(
+    name="tanks",
     states=("h1", "h2"),
     inputs=("q",),
     units={"h1": "cm", "h2": "cm", "q": "cm^3/s", "t": "s"},

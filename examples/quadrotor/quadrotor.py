@@ -4,7 +4,7 @@
     mass z''   =  efficiency (left + right) cos phi - drag z' |z'| - mass g
     inertia phi'' = efficiency arm (right - left)
 
-| parameter | model | `TRUTH` | source |
+| parameter | model | truth, in `quadrotor.toml` | source |
 | --- | --- | --- | --- |
 | mass, kg | 0.486 | the same | Tedrake, Underactuated Robotics, Quadrotor2D |
 | inertia, kg m^2 | 0.00383 | the same | the same |
@@ -21,17 +21,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from lbmpc.plants.equations import Plant, Rhs
+from lbmpc.plants import Plant, Rhs
 
 GRAVITY = 9.81
 PARAMETERS = {"mass": 0.486, "inertia": 0.00383, "arm": 0.25, "drag": 0.1, "wind": 0.0, "efficiency": 1.0}
-TRUTH = {"wind": 2.0, "efficiency": 0.93}
-SETTINGS = [
-    *("rate=50", "controller.horizon_seconds=1"),
-    # By Bryson's rule: 0.2 m, 0.3 rad, 1 m/s, 3 rad/s and half of the thrust at rest cost the same.
-    *("controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"),
-]
-"""A sample every 20 ms and a horizon of a second, in which it crosses half of its space."""
 
 
 def equations(mass: float, inertia: float, arm: float, drag: float, wind: float, efficiency: float) -> Rhs:

@@ -1,0 +1,190 @@
+"""The rest that a plan aims at: the target selector of offset-free MPC, with what was learned.
+
+    min over x, u   |C x - r|^2 + SECOND (|x|_Q^2 + |u|_R^2)
+    subject to      (A - I) x + B u + h_hat(x, u) = 0,   x in Z,   u in V
+
+in deviation coordinates, everything in half-widths. Q and R are those of the cost, Z and V the tightened X and U of the
+problem. So the outputs C x come first: they meet r where the learned model has such a rest, and are as near as they can
+be where it has none. Of all rests that do as well the target costs least about the equilibrium, and without outputs it
+costs least of all rests (Muske and Rawlings 1993; Pannocchia and Rawlings 2003).
+
+A few Newton steps from the last target solve it, always as many at most, and never by the clock. Each is an equality
+constrained least-squares problem; where its solution is outside the rows, a QP with as many variables as inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from lbmpc.casadi_buffers import Bound
+from lbmpc.oracles.base import Oracle
+from lbmpc.problem import Problem
+from lbmpc.sets.geometry.polytope import row_ranges
+from lbmpc.solver.least_distance import Penalty, least_distance, violation
+
+STEPS = 5
+"""Newton steps in one search at most. The next search goes on from where this one ends."""
+ARRIVED = 1e-5
+"""Half-widths: a step that is shorter leaves an error of its square."""
+INSIDE = 1e-6
+"""Of a row's range: how far outside Z or V a rest may be, as far as a QP's tolerance lets it."""
+REACHED = 1e-4
+"""Half-widths: outputs that are so near to r count as there."""
+SECOND = 1e-8
+"""Weight of the cost beside that of the outputs: small enough to move them by less than anybody sees."""
+LEAST = 1e-6
+"""Of the largest weight: what a state or input counts at least, so that there is one nearest rest."""
+PENALTY = 1e6
+"""Of the rows, so that there is a solution of the QP where no rest is inside."""
+
+TargetStatus = Literal["reached", "nearest", "no rest"]
+"""nearest: a rest, but not where the outputs are at r; no rest: none was found inside Z and V."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyState:
+    """A target, in deviation coordinates, inside the plant's X and U whatever its status."""
+
+    xu: np.ndarray
+    """x_s, then u_s, (d + m,)."""
+    status: TargetStatus
+    distance: float
+    """Largest distance of an output from r, as a share of its half-width."""
+
+
+class TargetSelector:
+    """Finds targets of one problem, for one parameter theta of its oracle after another.
+
+    Args:
+        problem: its model, oracle, cost, X and U.
+        outputs: indices of the states that are outputs, (p,); more than there are inputs meet their r in part.
+        r: where they should be, (p,), deviations.
+        realise: what turns a CasADi function into the one that is called.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        outputs: Sequence[int] = (),
+        r: np.ndarray | Sequence[float] = (),
+        realise: Callable[[ca.Function], ca.Function] = lambda function: function,
+    ):
+        model, plant = problem.model, problem.model.plant
+        self._d, self._outputs = model.d, list(outputs)
+        self._scale = np.concatenate([plant.x_scale, plant.u_scale])
+        self._r = np.asarray(r, dtype=float) / plant.x_scale[self._outputs]
+        weights = np.concatenate([np.diag(model.Q), np.diag(model.R)]) * self._scale**2
+        weights = np.maximum(weights / weights.max(), LEAST)
+        if self._outputs:
+            weights *= SECOND
+            weights[self._outputs] += 1.0
+        self._per_weight = 1.0 / np.sqrt(weights)
+        wanted = np.zeros_like(weights)
+        wanted[self._outputs] = self._r
+        self._newton = Bound(realise(build_newton(problem, self._scale, weights, wanted)))
+        self._rows, self._lower, self._upper = _rows(problem, self._scale)
+        soft = np.ones(len(self._rows), dtype=bool)
+        self._penalty = Penalty(soft, row_ranges(self._rows, 1.0), PENALTY)
+        low, high = np.concatenate([plant.x_min, plant.u_min]), np.concatenate([plant.x_max, plant.u_max])
+        equilibrium = np.concatenate([plant.x_e, plant.u_e])
+        self._low, self._high = (low - equilibrium) / self._scale, (high - equilibrium) / self._scale
+
+    def find(self, theta: np.ndarray, start: np.ndarray) -> SteadyState:
+        """The target under the oracle's parameters theta, from `start`, (d + m,): x and u of the last one.
+
+        Never raises for numbers; where they cannot be used it is the equilibrium, with the status `no rest`.
+        """
+        w, rests = start / self._scale, False
+        self._newton.inputs["theta"][:, 0] = theta
+        with np.errstate(all="ignore"):
+            for _ in range(STEPS):
+                free = self._step(w)
+                if free is None:
+                    w, rests = np.zeros_like(w), False
+                    break
+                arrived = bool(np.abs(free - w).max() < ARRIVED)
+                w = np.minimum(np.maximum(free, self._low), self._high)
+                rests = arrived and self._are_inside(free)
+                if arrived:
+                    break
+        off = np.abs(w[self._outputs] - self._r)
+        distance = float(off.max()) if self._outputs else 0.0
+        status: TargetStatus = "no rest" if not rests else "reached" if distance < REACHED else "nearest"
+        return SteadyState(w * self._scale, status, distance)
+
+    def _step(self, w: np.ndarray) -> np.ndarray | None:
+        """One Newton step from w, (d + m,), in half-widths; None when its numbers are unusable."""
+        newton = self._newton
+        newton.inputs["w"][:, 0] = w
+        newton()
+        matrix, n = newton.outputs["matrix"], len(w)
+        try:
+            free = np.linalg.solve(matrix, newton.outputs["right"][:, 0])[:n]
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(free).all():
+            return None
+        if self._are_inside(free):
+            return free
+        # w = free + moves q with |q|^2 / 2 more cost, along the linearised rests.
+        basis = np.linalg.qr((matrix[n:, :n] * self._per_weight).T, mode="complete")[0][:, self._d :]
+        moves = self._per_weight[:, None] * basis
+        values, slopes = self._rows @ free, self._rows @ moves
+        nearest = least_distance(values, slopes, self._lower, self._upper, self._penalty)
+        return None if nearest is None else free + moves @ nearest.w
+
+    def _are_inside(self, w: np.ndarray) -> bool:
+        outside = violation(self._rows @ w, self._lower, self._upper)
+        return bool((outside <= INSIDE * self._penalty.scale).all())
+
+
+def build_newton(problem: Problem, scale: np.ndarray, weights: np.ndarray, wanted: np.ndarray) -> ca.Function:
+    """(w, theta) -> (matrix, right): matrix (w+, multipliers) = right for one Newton step from w to w+, (d + m,).
+
+    In units of `scale`, (d + m,): w+ minimises w'diag(weights) w / 2 - wanted'w on the rests of the model linearised
+    at w.
+    """
+    model, oracle, d = problem.model, problem.oracle, problem.model.d
+    w, theta = ca.MX.sym("w", d + model.m), ca.MX.sym("theta", oracle.parameters)
+    linear = ca.DM(np.hstack([model.A - np.eye(d), model.B]))
+    h, slopes = _h_at_rest(oracle, w * scale, theta)
+    motion = (linear @ (w * scale) + h) / scale[:d]
+    jacobian = (linear + slopes) * (scale / scale[:d, None])
+    matrix = ca.vertcat(
+        ca.horzcat(ca.DM(np.diag(weights)), jacobian.T), ca.horzcat(jacobian, ca.DM.zeros(d, d))
+    )
+    right = ca.vertcat(wanted, jacobian @ w - motion)
+    outputs = [ca.densify(matrix), ca.densify(right)]
+    return ca.Function("newton", [w, theta], outputs, ["w", "theta"], ["matrix", "right"])
+
+
+def _h_at_rest(oracle: Oracle, xu: ca.MX, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """h_hat (d,) and its slopes (d, d + m) at (x, u) where that was the pair before as well, and all before it."""
+    d, before = oracle.d, oracle.pairs - 1
+    point, parts = ca.vertcat(xu[:d], *[xu] * before, xu[d:]), oracle.split(theta)
+    (jacobian,) = oracle.jacobians(point, parts)
+    slopes = ca.horzcat(jacobian[:, :d], jacobian[:, -oracle.m :])
+    for i in range(before):
+        slopes += jacobian[:, d + i * xu.shape[0] : d + (i + 1) * xu.shape[0]]
+    return oracle.value(point, parts), slopes
+
+
+def _rows(problem: Problem, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of (x, u) in units of `scale`, (rows, d + m), and their bounds: the first step's, and the last one's.
+
+    Of the steps between, a tightening to a tube is no thicker than at the end, and any other is plain X and U.
+    """
+    first, last, inputs = problem.states[0], problem.states[-1], problem.inputs[-1]
+    parts = [first] if last is first else [first, last]
+    states = np.vstack([part.F for part in parts])
+    m, d = inputs.dimension, first.dimension
+    rows = np.vstack(
+        [np.hstack([states, np.zeros((len(states), m))]), np.hstack([np.zeros((len(inputs.F), d)), inputs.F])]
+    )
+    parts = [*parts, inputs]
+    return rows * scale, np.concatenate([p.lower for p in parts]), np.concatenate([p.upper for p in parts])

@@ -1,0 +1,130 @@
+"""Two functions that fail in every way: the loop that calls them is told, and goes on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lbmpc.plants import PlantError
+from node_runtime.realtime import clock
+from plant_sim import machine
+from plant_sim.machine import Guarded
+from tests.helpers.live import wait_for
+
+
+def guarded(
+    read: Callable[[], object] = lambda: [1.0, 2.0],
+    write: Callable[[np.ndarray], object] = lambda u: None,
+    period: float = 10.0,
+    simulated: bool = False,
+) -> Guarded:
+    return Guarded(read, write, 2, period, simulated)  # type: ignore[arg-type]
+
+
+def raising(error: BaseException) -> Callable[..., None]:
+    def function(*_: object) -> None:
+        raise error
+
+    return function
+
+
+def test_what_is_read_is_a_copy_and_may_be_any_two_numbers() -> None:
+    mine = np.array([1, 2])
+    x = guarded(lambda: mine).read(3.0)
+    assert x is not None
+    mine[0] = 9
+    assert x.tolist() == [1.0, 2.0]
+
+
+def test_what_is_done_with_an_input_does_not_change_what_acted() -> None:
+    u = np.array([0.5])
+    since = guarded(write=lambda given: given.fill(9.0)).write(u, 3.0)
+    assert since is not None
+    assert u.tolist() == [0.5]
+
+
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [
+        (raising(OSError("no such device")), "read failed: OSError: no such device"),
+        (lambda: [1.0], "x has the shape (1,), the plant has 2 states"),
+        (lambda: [[1.0], [2.0]], "x has the shape (2, 1), the plant has 2 states"),
+        (lambda: [1.0, float("nan")], "x is not finite"),
+        (lambda: [1.0, float("inf")], "x is not finite"),
+        (lambda: None, "shape ()"),
+        (lambda: "flow", "could not convert"),
+    ],
+)
+def test_what_is_no_measurement_is_none(
+    read: Callable[[], object], said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    one = guarded(read)
+    for _ in range(3):
+        assert one.read(0.0) is None
+    assert one.counts["reads failed"] == 3
+    assert said in one.trouble()
+    # Once for a person, however many there are.
+    assert len(caplog.records) == 1
+
+
+def test_an_input_that_could_not_be_written_is_not_known_to_act() -> None:
+    one = guarded(write=raising(TimeoutError("bus")))
+    assert one.write(np.zeros(1), 0.0) is None
+    assert one.counts["writes failed"] == 1
+    assert one.trouble() == "write failed: TimeoutError: bus"
+
+
+def test_a_trouble_is_over_when_it_does_not_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(clock, "now", lambda: now)
+    one = guarded(raising(OSError("a")))
+    one.read(0.0)
+    now += machine.REMEMBERED_S + 0.1
+    assert one.trouble() == ""
+
+
+def test_what_says_that_the_machine_is_lost_ends_it() -> None:
+    with pytest.raises(PlantError, match="gone"):
+        guarded(raising(PlantError("gone"))).read(0.0)
+
+
+def test_an_error_in_a_simulation_is_an_error() -> None:
+    with pytest.raises(ZeroDivisionError):
+        guarded(raising(ZeroDivisionError("dt")), simulated=True).read(0.0)
+
+
+def test_a_call_takes_effect_when_it_is_made_and_a_simulated_one_when_it_was_due() -> None:
+    for simulated in (False, True):
+        one = guarded(simulated=simulated)
+        before = clock.now()
+        one.read(3.0)
+        since = one.write(np.zeros(1), 4.0)
+        assert since is not None
+        assert (
+            (one.measured, since) == (3.0, 4.0)
+            if simulated
+            else before <= one.measured <= since <= clock.now()
+        )
+
+
+def test_a_slow_call_is_counted() -> None:
+    one = guarded(write=lambda u: clock.sleep_until(clock.now() + 0.02), period=0.01)
+    one.write(np.zeros(1), 0.0)
+    assert (one.counts["writes slow"], one.counts["reads slow"]) == (1, 0)
+
+
+def test_a_call_that_does_not_return_is_a_trouble_that_others_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "HANGS_S", 0.05)
+    go_on = threading.Event()
+    one = guarded(lambda: [go_on.wait(60.0), 1.0])
+    calling = threading.Thread(target=one.read, args=(0.0,))
+    calling.start()
+    try:
+        wait_for(lambda: "read has not returned" in one.trouble())
+    finally:
+        go_on.set()
+        calling.join()
+    assert one.trouble() == ""
