@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.description import Description, PlantError, as_tuple
-from lbmpc.plants.faults import bound_faults, name_faults, number_faults, refuse, unusable
+from lbmpc.plants.faults import bound_faults, choice_faults, name_faults, number_faults, refuse, unusable
 from lbmpc.plants.known import Known
 from lbmpc.plants.rest import nearest_rest
 
@@ -112,7 +112,10 @@ class Plant(Description):
         Raises:
             PlantDefinitionError: there is none nearby, or it is outside of X or U.
         """
-        refuse(self.name, name_faults(self) or tuple(number_faults(self)) or tuple(bound_faults(self)))
+        refuse(
+            self.name,
+            name_faults(self) or tuple(number_faults(self)) or (*bound_faults(self), *choice_faults(self)),
+        )
         near_x = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
         near_u = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
         slopes, x, u = self._slopes(), near_x, near_u
@@ -121,7 +124,7 @@ class Plant(Description):
             if not all(np.isfinite(values).all() for values in (residual, a, b)):
                 break
             drift = residual + a @ (near_x - x) + b @ (near_u - u)
-            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale)
+            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale, self.performance)
             if moved is None:
                 break
             last, x, u = (x, u), near_x + moved[0], near_u + moved[1]

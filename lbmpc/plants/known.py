@@ -73,7 +73,7 @@ class Known(Description):
         there = super().changed(bounds, x_e, u_e)
         if x_e is None and u_e is None:
             return there
-        refuse(self.name, known_faults(there))
+        refuse(self.name, all_faults(there))
         return replace(there, x_e=self.x_e, u_e=self.u_e).resting_near(there.x_e, there.u_e)
 
     def to_builtins(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ def _at_rest(known: Known, x_e: np.ndarray, u_e: np.ndarray, drift: np.ndarray) 
     """The model about the rest nearest to (x_e, u_e), at which it drifts."""
     rounding = ROUNDING * (np.abs(known.slope_x) @ known.x_scale + np.abs(known.B) @ known.u_scale)
     if (np.abs(drift) > rounding).any():
-        moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale)
+        moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale, known.performance)
         if moved is None:
             text = f"at x_e = {x_e.tolist()} it drifts by {drift.tolist()}, and no input holds it there or nearby"
             raise unusable(known.name, text)

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from tests.helpers.plants.quadrotor import QUADROTOR
 
 from lbmpc.plants import PLANTS, Description, Known
 from lbmpc.plants.linear_motion import discretise
@@ -19,7 +20,6 @@ from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow, simulate
 from tests.helpers.plants import quadrotor
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.helpers.plants.quadrotor import QUADROTOR
 
 PERIOD = 0.1
 SETTINGS = [
