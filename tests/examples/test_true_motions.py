@@ -42,6 +42,17 @@ def test_parts_of_a_period_make_the_whole(named: tuple[str, str]) -> None:
     np.testing.assert_allclose(parts, whole, atol=2e-3 * np.abs(whole - x).max())
 
 
+def test_what_mujocos_constraint_solver_remembers_is_forgotten() -> None:
+    """Dry friction is a constraint, and the solver begins where it ended the last time unless it is told not to."""
+    true, known = loaded(CRANE)
+    model = type(true.model).from_xml_path(str(ROOT / "examples" / "mujoco_crane" / "crane.xml"))
+    model.dof_frictionloss[:] = [3.0, 0.1]
+    rubbing = type(true)(model)
+    once = rubbing.step(known.x0, np.array([4.0]), 0.02)
+    rubbing.step(0.5 * known.x_max, known.u_min, 0.013)
+    assert rubbing.step(known.x0, np.array([4.0]), 0.02).tobytes() == once.tobytes()
+
+
 def test_the_crane_without_wind_and_with_the_known_load_moves_as_the_matrices_say() -> None:
     """In the first instant, but for the load's size, of which a point mass has none."""
     true, known = loaded(CRANE)
