@@ -14,7 +14,15 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.description import Description, PlantError, as_tuple
-from lbmpc.plants.faults import bound_faults, choice_faults, name_faults, number_faults, refuse, unusable
+from lbmpc.plants.faults import (
+    bound_faults,
+    choice_faults,
+    name_faults,
+    number_faults,
+    refuse,
+    require_held,
+    unusable,
+)
 from lbmpc.plants.known import Known
 from lbmpc.plants.rest import nearest_rest
 
@@ -54,9 +62,13 @@ class Plant(Description):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
     ) -> Plant:
-        """As that of a description; of x_e and u_e alone, about the nearest rest. Raises `PlantDefinitionError` too."""
+        """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
         there = super().changed(bounds, x_e, u_e)
-        return there if (x_e is None) == (u_e is None) else there.resting_near()
+        if x_e is None or u_e is not None:
+            return there
+        rest = there.resting_near()
+        require_held(there, rest, input_too=False)
+        return rest
 
     def known(self) -> Known:
         """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""

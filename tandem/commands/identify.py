@@ -66,7 +66,8 @@ class Identify(Command):
         if self.out is not None:
             self.out.write_text(_source(known, found, self._named), encoding="utf-8")
             result["file"] = str(self.out)
-            self.say(f"written: {self.out}; tandem run --set plant.model={self.out}:PLANT")
+            rate = f"--set rate={1.0 / period:.10g}"
+            self.say(f"written: {self.out}", f"run it:  tandem run --set plant.model={self.out}:PLANT {rate}")
         self.emit(result)
         return 0
 

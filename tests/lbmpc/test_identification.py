@@ -133,7 +133,7 @@ def test_what_a_nonlinear_plant_does_along_one_path_is_not_taken_for_an_effect_o
     found = identify(samples, T, cart)
     assert abs(found.B[1, 0] - gain * T) < 2.0 * found.B_error[1, 0]
     # At rest it does not move.
-    assert abs(found.offset[1]) < 2.0 * found.offset_error[1]
+    assert abs(found.offset[1]) < 3.0 * found.offset_error[1]
     # More of the same does not make it better known.
     once = identify(runs[0], T, cart)
     assert found.B_error[1, 0] > 0.4 * once.B_error[1, 0]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from tyro.conf import Positional, arg
 
 from tandem import terminal
 from tandem.commands.base import FROM_CONFIG, Configured
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from lbmpc.analysis import SampledDisturbance
@@ -41,6 +41,8 @@ class ModelCheck(Configured):
 
     def run(self) -> int:
         """0, or 2 where something is wrong."""
+        import numpy as np
+
         from lbmpc.model import ModelError, build_model
         from lbmpc.plants import Known, PlantDefinitionError, get_plant
         from node_runtime.config.plant import plant_of
@@ -74,6 +76,8 @@ class ModelCheck(Configured):
         return 2
 
     def _look(self, config: Config, model: Model, plant: Known | Plant) -> int:
+        import numpy as np
+
         from lbmpc.analysis import advised_horizon, poles, reach, sample_disturbance
         from lbmpc.plants import Known, PlantError, get_plant, get_truth, true_motion
         from node_runtime.config.plant import initial_state, true_plant_of
@@ -138,6 +142,8 @@ class ModelCheck(Configured):
 
     def _proved(self, model: Model) -> np.ndarray | None:
         """A rigorous bound of |h| over X and U, (d,) per second; None, and why, where there is none."""
+        import numpy as np
+
         from lbmpc.sets.enclosures.disturbance import DisturbanceError, Region, bound_box
 
         plant = model.plant

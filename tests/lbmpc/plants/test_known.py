@@ -285,13 +285,26 @@ def test_numbers_rest_elsewhere_too() -> None:
 
 @pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
 def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
-    there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
+    lower = 14.0
+    upper = plant.resting_near(x_e=[9.0, lower]).x_e[0]
+    there = plant.changed({"q": (0.0, 25.0)}, x_e=[upper, lower])
     assert there.u_max.tolist() == [25.0]
-    assert np.abs(there.x_e - [9.0, 14.0]).max() < 1.0
+    np.testing.assert_allclose(there.x_e, [upper, lower], rtol=1e-9)
     assert faults(there) == ()
     # What is shown of it can be given, and is the same to the bit.
     again = plant.changed({"q": (0.0, 25.0)}, there.x_e.tolist(), there.u_e.tolist())
     assert (again.x_e.tolist(), again.u_e.tolist()) == (there.x_e.tolist(), there.u_e.tolist())
+    with pytest.raises(
+        PlantDefinitionError, match=r"no input holds it there: x_e = .* The nearest rest is x_e = \["
+    ):
+        plant.changed({}, x_e=[upper + 0.5, lower])
+
+
+def test_numbers_do_not_rest_where_their_matrices_do_not() -> None:
+    with pytest.raises(
+        PlantDefinitionError, match=r"not an equilibrium: x_e = \[0.5, 0.0\], u_e = \[0.9\]. The nearest"
+    ):
+        numbers().changed({}, [0.5, 0.0], [0.9])
 
 
 def test_what_cannot_be_changed_is_looked_at_first() -> None:

@@ -220,6 +220,10 @@ def test_bounds_and_equilibrium_of_the_configuration_are_in_the_log(
         ("plant.bounds.upper=[1, 0]", "x_min of upper is 1 and x_max is 0: the lower bound must be below"),
         ("plant.x_e=[1.0]", "plant.x_e has 1 entries; tanks has 2 states (upper, lower)"),
         (
+            "plant.x_e=[1.5, 1.0]",
+            "no input holds it there: x_e = [1.5, 1.0]. The nearest rest is x_e = [1.0, 1.0]",
+        ),
+        (
             'plant={model = "tanks.py:TANKS", x_e = [1.5, 1.0], u_e = [0.1]}',
             "(x_e, u_e) is not an equilibrium",
         ),
