@@ -77,18 +77,18 @@ class TargetSelector:
         realise: Callable[[ca.Function], ca.Function] = lambda function: function,
     ):
         model, plant = problem.model, problem.model.plant
-        outputs = list(outputs)
+        chosen = list(outputs)
         self._scale = np.concatenate([plant.x_scale, plant.u_scale])
-        there = np.asarray(r, dtype=float) / plant.x_scale[outputs]
-        self._wanted = [*zip(outputs, there.tolist(), strict=True)]
+        there = np.asarray(r, dtype=float) / plant.x_scale[chosen]
+        self._wanted = [*zip(chosen, there.tolist(), strict=True)]
         weights = np.concatenate([np.diag(model.Q), np.diag(model.R)]) * self._scale**2
         weights = np.maximum(weights / weights.max(), LEAST)
-        if outputs:
+        if chosen:
             weights *= SECOND
-            weights[outputs] += 1.0
+            weights[chosen] += 1.0
         self._per_weight = 1.0 / np.sqrt(weights)
         wanted = np.zeros_like(weights)
-        wanted[outputs] = there
+        wanted[chosen] = there
         self._rows, self._lower, self._upper = _rows(problem, self._scale)
         ranges = row_ranges(self._rows, 1.0)
         self._penalty = Penalty(np.ones(len(self._rows), dtype=bool), ranges, PENALTY)
@@ -102,9 +102,9 @@ class TargetSelector:
         outside = ca.mmax(ca.fmax(self._lower - values, values - self._upper) / ranges)
         inside = ca.fmin(ca.fmax(free, self._low), self._high)
         said = ca.vertcat(wrong, moved, outside)
-        outputs = {"free": free, "inside": inside, "rests": ca.densify(rests), "said": said}
-        names = ["w", "theta"], list(outputs)
-        self._newton = Bound(realise(ca.Function("newton", [w, theta], [*outputs.values()], *names)))
+        found = {"free": free, "inside": inside, "rests": ca.densify(rests), "said": said}
+        function = ca.Function("newton", [w, theta], [*found.values()], ["w", "theta"], list(found))
+        self._newton = Bound(realise(function))
 
     def find(self, theta: np.ndarray, start: np.ndarray) -> SteadyState:
         """The target under the oracle's parameters theta, from `start`, (d + m,): x and u of the last one.
@@ -128,7 +128,7 @@ class TargetSelector:
         """One Newton step from w, (d + m,), in half-widths.
 
         Returns:
-            Where it leads, inside the plant's X and U; how far that is, infinite where the numbers are unusable; how far
+            Where it leads, inside X and U of the plant; how far that is, infinite where the numbers are unusable; how far
             it is outside Z and V.
         """
         newton = self._newton
