@@ -2,8 +2,8 @@
 
     angle'' = g / length angle + torque / (mass length^2)
 
-The environment's pendulum is a uniform rod: gravity acts 1.5 times and the torque 3 times as much, and gravity goes with
-the sine.
+The environment's pendulum is a uniform rod: gravity acts 1.5 times as much, by the sine, and the torque 3 times. It is
+to be held at `LEAN`, where the matrices say that a torque of -1.47 N m is needed; -0.73 N m is.
 """
 
 from __future__ import annotations

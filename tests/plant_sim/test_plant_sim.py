@@ -300,6 +300,20 @@ def test_old_commands_in_a_burst_are_refused() -> None:
     assert verdicts == ["stale"] * 57 + ["ok"] * 3
 
 
+def test_a_look_at_the_next_sample_changes_nothing() -> None:
+    def states(looked: bool) -> list[m.PlantState]:
+        sim, found = plant(), []
+        for k in range(6):
+            ahead = sim.look(k * PERIOD) if looked else None
+            found.append(sim.sample(k * PERIOD))
+            assert ahead in (None, found[-1])
+            if k < 3:
+                sim.command(command(k, U + 0.01 * k, [U] * 2, answers=k), (k + 0.2) * PERIOD)
+        return found
+
+    assert states(looked=True) == states(looked=False)
+
+
 def test_looking_ahead_changes_nothing() -> None:
     def states(ahead: bool) -> list[list[float]]:
         motion, rng, found = Motion(Truth(PLANT), PLANT.x0, PERIOD), np.random.default_rng(1), []
