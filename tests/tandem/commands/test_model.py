@@ -95,6 +95,12 @@ def test_a_proved_bound_holds_what_was_found(mine: Any, capsys: Capture) -> None
     _code, found = checked(capsys, "mine", *TEN, "--prove")
     assert (np.array(found["h_bound"]) >= np.array(found["h_sampled"]) * (1.0 - 1e-9)).all()
     assert found["h_bound"][1] < 1.1 * found["h_sampled"][1]
+    wider = ("--set", f"controller.W={[1.01 * bound for bound in found['h_bound']]}")
+    _code, found = checked(capsys, "mine", *TEN, "--prove", *wider)
+    assert "W" not in found["notes"]
+    assert found["W"][1] > found["h_bound"][1]
+    _code, found = checked(capsys, "mine", *TEN, "--prove", "--set", "plant.truth.stiffness=5.0")
+    assert found["h_bound"] is None
     mine(replace(INTEGRATOR, x_max=np.array([1.0, np.inf])))
     code, text = said(capsys, "mine", "--prove")
     assert code == 0
