@@ -128,7 +128,7 @@ class TargetSelector:
         """One Newton step from w, (d + m,), in half-widths.
 
         Returns:
-            Where it leads, inside X and U of the plant; how far that is, infinite where the numbers are unusable; how far
+            Where it leads, inside X and U of the plant; how far that is, infinite where numbers are unusable; how far
             it is outside Z and V.
         """
         newton = self._newton
