@@ -41,7 +41,7 @@ examples: $(READY)  ## every example, one of them live, with pictures into runs/
 	$(BIN)/tandem replay $(EXAMPLES)/crane-live.mcap
 	$(BIN)/tandem simulate --config examples/tanks/tanks.toml --oracle constant --steps 60 --log $(EXAMPLES)/tanks.mcap
 	$(BIN)/python examples/replay/what_if.py $(EXAMPLES)/tanks.mcap controller.oracle=linear --out $(EXAMPLES)/what_if.png
-	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU
+	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU --set network.hidden='[16,16]'
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)
