@@ -89,7 +89,7 @@ def _stability(model: Model) -> Finding:
     text = f"poles, 1/s: {poles_text(found)}"
     if found[0].real > 1e-9 * abs(found).max():
         return Finding("ok", "unstable", f"{text}; by itself it grows e-fold in {1.0 / found[0].real:.3g} s")
-    if found[0].real > -1e-9 * abs(found).max():
+    if found[0].real >= -1e-9 * abs(found).max():
         return Finding("ok", "marginally stable", f"{text}; by itself it does not come back")
     return Finding("ok", "stable", f"{text}; by itself it comes back")
 
