@@ -251,6 +251,11 @@ def _resolved(
 ) -> Config:
     """The configuration with the settings in it, and with the arguments that are not None, (key, value) by name."""
     folder, where = None, "Loop"
+    names = (*arguments, "config", *Config.__struct_fields__)
+    for name in settings:
+        if name not in names:
+            known = f"known: {', '.join(names)}"
+            raise ConfigError(f"Loop: unknown argument {name!r}; {strict.did_you_mean(name, names, known)}")
     if isinstance(config, Config):
         tree = to_tree(config)
     elif config is None:

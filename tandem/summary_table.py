@@ -37,7 +37,7 @@ MEANING = {
     "offset": "of the outputs in the last second, of their half-widths",
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
-    "prediction_error": "first / last second",
+    "prediction_error": "first / last second, or period if longer",
     "outside_ticks": "outside of the certified sets",
     "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",

@@ -24,7 +24,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 class PredictionError(msgspec.Struct, frozen=True):
-    """Mean of |h_hat - h| over the first and the last second; null where no tick in it has one."""
+    """Mean of |h_hat - h| over the first and the last second, or period if longer; null where no tick in it has one."""
 
     first_second: float | None
     last_second: float | None
@@ -119,11 +119,13 @@ def _prediction_error(period: float, ticks: list[m.Tick], results: list[m.TickRe
     if not known:
         return PredictionError(None, None)
 
+    window = max(1.0, period)
+
     def mean(of: str, *, first: bool) -> float | None:
         run = [(r, error) for r, error in known if r.run_id == of]
         t = np.array([when.get((r.run_id, r.seq), r.seq * period) for r, _error in run])
         # Half a period of slack, since the slots are on a grid that floats only approximate.
-        near = t < t[0] + 1.0 - period / 2 if first else t > t[-1] - 1.0 + period / 2
+        near = t < t[0] + window - period / 2 if first else t > t[-1] - window + period / 2
         errors = [error for (_r, error), inside in zip(run, near, strict=True) if inside]
         # A second may hold no tick.
         return float(np.mean(errors)) if errors else None

@@ -163,17 +163,24 @@ class Run(Configured):
         from tandem import summary_table
         from tandem.live.supervisor import Impatient
 
+        if trouble is None and not began:
+            trouble = "stopped before the first command" + (": no plant came" if self.no_plant else "")
         if trouble is None and not logged:
             trouble = (
                 f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
             )
-        if trouble is None and not began:
-            trouble = "stopped before the first command" + (": no plant came" if self.no_plant else "")
+        parts = existing_parts(files.log)
+        if not parts and not began:
+            # It was stopped while the processes started, and the recorder had not begun a log.
+            terminal.complain(
+                f"{trouble}; there is no log. All output is in {_near(files.folder)}.", as_json=False
+            )
+            self.emit({"error": trouble})
+            return 1
         result: dict[str, Any] = {}
         code = 1
         try:
             with self.console.status("reading the log"):
-                parts = existing_parts(files.log)
                 ran = read_run(parts[0] if parts else files.log)
                 # A file may have changed since, and then nothing is said of the motion between samples.
                 with suppress(ConfigError):

@@ -20,7 +20,7 @@ from lbmpc.plants import get_plant
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from protocol import topics
-from protocol.messages import InputSource
+from protocol.messages import InputSource, Tick
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
@@ -162,13 +162,18 @@ def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged
     assert summarise(gather(config, slow)).late_ticks == 3
 
 
-def test_a_second_without_a_tick_has_no_prediction_error(
-    config: Config, messages: list[Logged], recwarn: pytest.WarningsRecorder
+def test_of_a_slow_plant_the_first_and_the_last_prediction_count(
+    config: Config, messages: list[Logged]
 ) -> None:
-    """At a period of 4 s."""
-    slow = summarise(gather(override(config, ["rate=0.25"]), messages))
-    assert slow.prediction_error == PredictionError(None, None)
-    assert not recwarn.list
+    """At a period of 4 s, no second has a prediction in it."""
+    spread = [
+        (topic, msgspec.structs.replace(said, t=80.0 * said.t) if isinstance(said, Tick) else said, t)
+        for topic, said, t in messages
+    ]
+    run = gather(override(config, ["rate=0.25"]), spread)
+    first, last = run.results[1].prediction_error, run.results[-1].prediction_error
+    assert first is not None
+    assert summarise(run).prediction_error == PredictionError(first, last)
 
 
 # -- pictures --------------------------------------------------------------------------------------------

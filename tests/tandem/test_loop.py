@@ -204,6 +204,7 @@ def test_it_is_drawn_and_saved_as_any_run(tmp_path: Path) -> None:
             {"controller": {"horizn": 3}},
             "Loop: unknown key 'controller.horizn'; did you mean 'controller.horizon'?",
         ),
+        ({"orcale": "dnn"}, "Loop: unknown argument 'orcale'; did you mean 'oracle'?"),
         ({"controller": 3}, "controller = 3 is a table"),
         ({"rate": "fast"}, "rate = 'fast' is not a number"),
         ({"config": "compresor"}, "did you mean 'compressor'?"),

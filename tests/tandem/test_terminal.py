@@ -198,7 +198,7 @@ def test_a_second_ctrl_c_while_drawing_keeps_the_figures(
         raise Impatient
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", pressed)
-    assert Run(json=True)._conclude(files, None, True, True) == 130
+    assert Run(json=True)._conclude(Config(), files, None, True, True) == 130
     said = capsys.readouterr()
     result = json.loads(said.out)
     assert result["ticks"] == 12
@@ -214,7 +214,7 @@ def test_a_picture_that_fails_costs_neither_table_nor_exit_code(
         raise RuntimeError("latex was not able to process the following string:\nb'lp'\nand so on")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fails)
-    assert Run(json=True)._conclude(files, None, True, True) == 0
+    assert Run(json=True)._conclude(Config(), files, None, True, True) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)["ticks"] == 12
     assert "no picture: " in said.err
@@ -224,3 +224,14 @@ def test_a_picture_that_fails_costs_neither_table_nor_exit_code(
     assert report["ticks"] == 12
     assert len(report["failed"]) == 6
     assert read_run(files.log).truncated is False
+
+
+def test_a_run_that_was_stopped_while_it_started_says_just_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    none = RunFiles.of(tmp_path / "none.mcap")
+    assert Run(json=True)._conclude(Config(), none, None, False, False) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out) == {"error": "stopped before the first command"}
+    assert "stopped before the first command; there is no log. All output is in " in said.err
+    assert "recorder" not in said.err

@@ -81,7 +81,12 @@ class ModelCheck(Configured):
         from lbmpc.analysis import advised_horizon, poles, reach, sample_disturbance
         from lbmpc.plants import Known, PlantError, get_plant, get_truth, true_motion
         from node_runtime.config.plant import initial_state, true_plant_of
-        from tandem.commands.model.findings import disturbance_finding, findings
+        from tandem.commands.model.findings import (
+            disturbance_finding,
+            findings,
+            network_finding,
+            weights_finding,
+        )
         from tandem.model_tables import matrix_tables
 
         known, horizon, x0 = model.plant, config.controller.horizon, initial_state(config, plant)
@@ -113,6 +118,7 @@ class ModelCheck(Configured):
         said = list(findings(model, horizon, x0, step))
         if sampled is not None:
             said.append(disturbance_finding(known, W, sampled))
+        said += [f for f in (weights_finding(model), network_finding(config)) if f is not None]
         self.say("")
         self.console.print(_findings_table(said))
         faults = [finding.text for finding in said if finding.verdict == "fault"]

@@ -23,11 +23,16 @@ from lbmpc.analysis import (
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.plants import Known, PlantError
 from lbmpc.plants.matrices import unmoved_modes
+from node_runtime.config.sections import Config
 from tandem.model_tables import percent, poles_text
 
 Verdict = Literal["ok", "note", "fault"]
 FOLLOWED = 10.0
 """Seconds for which the safe input is followed, or two horizons if that is longer."""
+CHEAP = 1e-3
+"""Of what the dearest input costs at its half-width: a performance state that costs less there is not cared for."""
+THROWN = 0.1
+"""Half-widths in a sample."""
 WEAK = 0.1
 """Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
 
@@ -78,6 +83,43 @@ def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) 
         "W",
         f"h is larger somewhere in X and U: {', '.join(above)}. What tightening promises holds where h is in W{lost}",
     )
+
+
+def weights_finding(model: Model) -> Finding | None:
+    """What a half-width of a performance state costs, where that is next to nothing beside the inputs; else None."""
+    plant = model.plant
+    states = np.diag(model.Q) * plant.x_scale**2 / model.period
+    inputs = np.diag(model.R) * plant.u_scale**2 / model.period
+    most = int(np.argmax(inputs))
+    cheap = [
+        f"{plant.states[i]} {states[i]:.2g}" for i in plant.performance if states[i] < CHEAP * inputs[most]
+    ]
+    if not cheap:
+        return None
+    text = (
+        f"a half-width costs, per second: {', '.join(cheap)}; {plant.inputs[most]} {inputs[most]:.2g}. The input "
+        "will hardly be used. controller.Q and R count squares of the plant's own units"
+    )
+    return Finding("note", "weights", text)
+
+
+def network_finding(config: Config) -> Finding | None:
+    """How far the network of the first sample may throw a prediction, where that is much; None where it is not.
+
+    A column of K_0 has 1 + n entries of standard deviation `adaptation.initial_scale`, and the features are about 1 at
+    most.
+    """
+    adaptation = config.adaptation
+    if config.controller.oracle != "dnn" or adaptation.start != "random":
+        return None
+    drawn = adaptation.initial_scale * config.period * math.sqrt(1 + config.network.hidden[-1])
+    if drawn < THROWN:
+        return None
+    text = (
+        f"its first weights are drawn at random, and may predict {drawn:.2g} half-widths of motion in a sample of "
+        f'{config.period:.3g} s that is not there. Set adaptation.start = "zero"'
+    )
+    return Finding("note", "network", text)
 
 
 def _factor(largest: float, given: float) -> str:

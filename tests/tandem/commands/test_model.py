@@ -63,7 +63,8 @@ def said(capsys: Capture, *words: str) -> tuple[int, str]:
 
 def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> None:
     mine(TANKS)
-    code, text = said(capsys, "mine", "--rate", "0.2", "--set", "controller.horizon_seconds=120")
+    slow = ("--set", "controller.horizon_seconds=120", "--set", "adaptation.start=zero")
+    code, text = said(capsys, "mine", "--rate", "0.2", *slow)
     assert code == 0
     assert "tanks: equations, linearised at (x_e, u_e); a sample every 5 s" in text
     assert "poles, 1/s: -0.0125, -0.0221; by itself it comes back" in text
@@ -186,6 +187,18 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "horizon",
         r"2 steps \(10 s\); advised: \d+ steps",
     ),
+    "a network that begins with a leap": (
+        TANKS,
+        ("--rate", "0.2"),
+        "network",
+        r"may predict 0.48 half-widths of motion in a sample of 5 s .* Set adaptation.start = \"zero\"",
+    ),
+    "weights in units that hide a state": (
+        PENDULUM,
+        (*TEN, "--set", "controller.Q=[1e-4, 1]"),
+        "weights",
+        r"per second: angle 0.0001; torque 9\. .* squares of the plant's own units",
+    ),
     "states from which nothing can be followed": (
         replace(TANKS, x_min=np.array([-9.0, 1.0])),
         ("--rate", "0.2"),
@@ -193,6 +206,13 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         r"from \d+ of 500 states the motion cannot be followed",
     ),
 }
+
+
+def test_an_oracle_without_a_network_is_told_nothing_of_one(mine: Any, capsys: Capture) -> None:
+    mine(TANKS)
+    _code, found = checked(capsys, "mine", "--rate", "0.2", "--set", "controller.oracle=constant")
+    assert "network" not in found["notes"]
+    assert "weights" not in found["notes"]
 
 
 @pytest.mark.parametrize("case", NOTES)
