@@ -30,18 +30,18 @@ paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html
 
 EXAMPLES := runs/examples
 examples: $(READY)  ## every example, one of them live, with pictures into runs/examples: 5 minutes
+	rm -rf $(EXAMPLES)
 	mkdir -p $(EXAMPLES)
-	rm -f $(EXAMPLES)/*.mcap
 	cd $(EXAMPLES) && $(CURDIR)/$(BIN)/python $(CURDIR)/examples/compressor/compressor.py
 	$(BIN)/python examples/compare.py examples/tanks/tanks.toml --steps 60 --out $(EXAMPLES)/tanks.png
 	$(BIN)/python examples/compare.py examples/quadrotor/quadrotor.toml --steps 250 --out $(EXAMPLES)/quadrotor.png
 	$(BIN)/python examples/compare.py examples/mujoco_crane/crane.toml --steps 500 --out $(EXAMPLES)/crane.png
 	$(BIN)/python examples/compare.py examples/gymnasium_pendulum/pendulum.toml --steps 100 --out $(EXAMPLES)/pendulum.png
-	$(BIN)/tandem run --config examples/mujoco_crane/crane.toml --seconds 20 --log $(EXAMPLES)/crane.mcap
-	$(BIN)/tandem replay $(EXAMPLES)/crane.mcap
+	$(BIN)/tandem run --config examples/mujoco_crane/crane.toml --seconds 20 --log $(EXAMPLES)/crane-live.mcap
+	$(BIN)/tandem replay $(EXAMPLES)/crane-live.mcap
 	$(BIN)/tandem simulate --config examples/tanks/tanks.toml --oracle constant --steps 60 --log $(EXAMPLES)/tanks.mcap
 	$(BIN)/python examples/replay/what_if.py $(EXAMPLES)/tanks.mcap controller.oracle=linear --out $(EXAMPLES)/what_if.png
-	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU
+	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU --set network.hidden='[16,16]'
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)

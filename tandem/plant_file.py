@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lbmpc.plants import Known
+from tandem.terminal import Refused
 
 DIGITS = 12
 """Of a matrix: more than any log tells, and enough for what a horizon makes of them."""
@@ -19,6 +22,26 @@ COMMENTS = {
     "period": "s: A and B hold at this rate only",
 }
 """What a reader is told of a field, on the line before it."""
+
+
+def require_new(file: Path) -> None:
+    """Raises `Refused` for a plant file that cannot be written there."""
+    if file.suffix != ".py":
+        raise Refused(f"{file}: the name of a plant file ends in .py")
+    if os.path.lexists(file):
+        raise Refused(f"{file}: exists already, and is not overwritten; choose another name")
+    if not file.absolute().parent.is_dir():
+        raise Refused(f"{file}: there is no folder {file.absolute().parent}")
+
+
+def write_new(file: Path, text: str) -> None:
+    """Raises `Refused` where that cannot be; nothing is overwritten."""
+    require_new(file)
+    try:
+        with file.open("x", encoding="utf-8") as opened:
+            opened.write(text)
+    except OSError as error:
+        raise Refused(f"{file}: cannot be written: {error.strerror}") from error
 
 
 def source(fields: Mapping[str, Any], about: Sequence[str], name: str = "PLANT") -> str:

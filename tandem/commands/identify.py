@@ -47,9 +47,10 @@ class Identify(Command):
         import numpy as np
 
         from lbmpc.identification import NotIdentifiable, Quality, Variables, identify
+        from tandem.plant_file import require_new, write_new
 
         if self.out is not None:
-            _require_free(self.out)
+            require_new(self.out)
         known, period, logs = self._read()
         transitions = logs[0].transitions
         for log in logs[1:]:
@@ -64,7 +65,7 @@ class Identify(Command):
         self._show(known, found, own)
         result = _result(known, found, own)
         if self.out is not None:
-            self.out.write_text(_source(known, found, self._named), encoding="utf-8")
+            write_new(self.out, _source(known, found, self._named))
             result["file"] = str(self.out)
             rate = f"--set rate={1.0 / period:.10g}"
             self.say(f"written: {self.out}", f"run it:  tandem run --set plant.model={self.out}:PLANT {rate}")
@@ -159,15 +160,6 @@ def _model_of(ran: Any) -> Model:
         return build_model(plant_of(ran), ran.config.period)
     except ModelError as error:
         raise LogError(f"{ran.path}: {error}") from error
-
-
-def _require_free(out: Path) -> None:
-    if out.suffix != ".py":
-        raise Refused(f"--out {out}: the name of a plant file ends in .py")
-    if out.exists():
-        raise Refused(f"{out}: exists already, and is not overwritten; choose another name")
-    if not out.absolute().parent.is_dir():
-        raise Refused(f"{out}: there is no folder {out.absolute().parent}")
 
 
 def _quality_table(known: Known, found: Identified, own: Quality) -> Table:

@@ -42,6 +42,34 @@ def test_parts_of_a_period_make_the_whole(named: tuple[str, str]) -> None:
     np.testing.assert_allclose(parts, whole, atol=2e-3 * np.abs(whole - x).max())
 
 
+SLIDING_BOX = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1"/>
+    <body pos="0 0 0.1">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <joint type="hinge" axis="0 1 0"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>
+"""
+
+
+def test_what_mujocos_contact_solver_remembers_is_forgotten() -> None:
+    """It begins where it ended the last time, unless it is told not to, and ends some rounding away."""
+    crane, _ = loaded(CRANE)
+    model = type(crane.model).from_xml_string(SLIDING_BOX)
+    box = type(crane)(model)
+    rng, size = np.random.default_rng(0), np.array([1.0, 1e-3, 1e-2, 1.0, 1e-2, 1e-2])
+    for x, other in size * rng.uniform(-1, 1, (20, 2, 6)):
+        once = box.step(x, np.array([4.0]), 0.02)
+        box.step(other, np.array([-20.0]), 0.02)
+        assert box.step(x, np.array([4.0]), 0.02).tobytes() == once.tobytes()
+
+
 def test_the_crane_without_wind_and_with_the_known_load_moves_as_the_matrices_say() -> None:
     """In the first instant, but for the load's size, of which a point mass has none."""
     true, known = loaded(CRANE)

@@ -173,6 +173,15 @@ def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
     sources = list(dict.fromkeys(state.source for state in states))
     assert [source for source in sources if source != "hold"] == ["safe", "command", "plan"]
     assert [state.seq for state in states] == sorted({state.seq for state in states})
+    # Commands act when they come, in the middle of a period, and what acted before them is known.
+    assert any(len(state.pieces) == 2 for state in states)
+
+
+def test_a_machine_is_safe_before_there_is_anybody_to_command_it() -> None:
+    machine = Machine()
+    with served(machine, live_config()):
+        wait_for(lambda: machine.written == [SAFE])
+    assert machine.written == [SAFE]
 
 
 @pytest.mark.live

@@ -330,6 +330,25 @@ def test_looking_ahead_changes_nothing() -> None:
     assert states(ahead=True) == states(ahead=False)
 
 
+def test_a_sample_that_was_looked_ahead_at_is_not_worked_out_again() -> None:
+    truth, steps = Truth(PLANT), []
+
+    class Counted:
+        def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+            steps.append(dt)
+            return truth.step(x, u, dt)
+
+    motion = Motion(Counted(), PLANT.x0, PERIOD)
+    for k in range(5):
+        # On a grid of large times, rounded as a clock's are.
+        motion.read(26000.123456789 + k * PERIOD)
+        before = len(steps)
+        motion.write(PLANT.u_e, 26000.123456789 + (k + 0.1) * PERIOD)
+        motion.look_ahead()
+        assert len(steps) == before + (2 if k else 1)
+    assert len(steps) == 9
+
+
 def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
     sim = plant(np.array([-1.6, 0.05, 2.0, 0.0]))
     sim.sample(0.0)

@@ -87,6 +87,7 @@ class ModelCheck(Configured):
         known, horizon, x0 = model.plant, config.controller.horizon, initial_state(config, plant)
         true = true_plant_of(config, get_plant, get_truth)
         step = true_motion(true).step
+        W = known.W if config.controller.W is None else np.array(config.controller.W)
         self.say(f"{known.name}: {_kind(plant)}; a sample every {model.period:.6g} s", "")
         self.say("x+ = A x + B u, in deviations from x_e and u_e")
         scales = known.x_scale, np.concatenate([known.x_scale, known.u_scale])
@@ -100,18 +101,18 @@ class ModelCheck(Configured):
             with self.console.status("asking the true motion for h"):
                 rng = np.random.default_rng(0)
                 sampled = sample_disturbance(model, step, SAMPLES, rng, PlantError)
-        if self.prove and not isinstance(plant, Known):
-            bound = self._proved(model)
+        if self.prove:
+            bound = self._proved(model, own_truth=not config.plant.truth)
         moved = reach(model, horizon)
         self.say(
             "",
             f"moved: by full inputs in {horizon * model.period:.3g} s, the horizon, half-widths; W, h: per second",
         )
-        self.console.print(_state_table(model, x0, moved, sampled, bound))
+        self.console.print(_state_table(known, x0, moved, W, sampled, bound))
         self.console.print(_input_table(known))
         said = list(findings(model, horizon, x0, step))
         if sampled is not None:
-            said.append(disturbance_finding(model, sampled))
+            said.append(disturbance_finding(known, W, sampled))
         self.say("")
         self.console.print(_findings_table(said))
         faults = [finding.text for finding in said if finding.verdict == "fault"]
@@ -133,19 +134,25 @@ class ModelCheck(Configured):
                 "moved": moved,
                 "horizon": horizon,
                 "advised_horizon": advised_horizon(model),
-                "W": known.W,
+                "W": W,
                 "h_sampled": None if sampled is None else sampled.largest,
                 "h_bound": bound,
             }
         )
         return 2 if faults else 0
 
-    def _proved(self, model: Model) -> np.ndarray | None:
+    def _proved(self, model: Model, own_truth: bool) -> np.ndarray | None:
         """A rigorous bound of |h| over X and U, (d,) per second; None, and why, where there is none."""
         import numpy as np
 
         from lbmpc.sets.enclosures.disturbance import DisturbanceError, Region, bound_box
 
+        if model.equations is None or not own_truth:
+            why = (
+                "there are no equations" if own_truth else "plant.truth says that the equations are not true"
+            )
+            self.say(f"h cannot be bounded: {why}", style="yellow")
+            return None
         plant = model.plant
         bounds = (plant.x_min, plant.x_max), (plant.u_min, plant.u_max)
         sides = [
@@ -180,9 +187,10 @@ def _rounded(value: float, scale: float) -> str:
 
 
 def _state_table(
-    model: Model,
+    known: Known,
     x0: np.ndarray,
     moved: np.ndarray,
+    W: np.ndarray,
     sampled: SampledDisturbance | None,
     bound: np.ndarray | None,
 ) -> Table:
@@ -190,14 +198,13 @@ def _state_table(
 
     from tandem.model_tables import plain
 
-    known = model.plant
     names = ["half-width", "x_e", "x0", "moved", "W"]
     names += ["largest h found"] * (sampled is not None) + ["h bound"] * (bound is not None)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, state in enumerate(known.states):
         scale = known.x_scale[i]
         row = [_with_unit(known, state, scale), _rounded(known.x_e[i], scale), _rounded(x0[i], scale)]
-        row += [f"{moved[i]:.3g}", f"{known.W[i]:.3g}"]
+        row += [f"{moved[i]:.3g}", f"{W[i]:.3g}"]
         row += [] if sampled is None else [f"{sampled.largest[i]:.3g}"]
         row += [] if bound is None else [f"{bound[i]:.3g}"]
         shown.add_row(state, *row)

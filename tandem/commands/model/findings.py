@@ -21,7 +21,7 @@ from lbmpc.analysis import (
     under_safe_input,
 )
 from lbmpc.model import Model, ModelError, require_horizon
-from lbmpc.plants import PlantError
+from lbmpc.plants import Known, PlantError
 from lbmpc.plants.matrices import unmoved_modes
 from tandem.model_tables import percent, poles_text
 
@@ -61,15 +61,14 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
     yield from _safe(model, horizon, x0, step)
 
 
-def disturbance_finding(model: Model, found: SampledDisturbance) -> Finding:
-    """W against what was found of h."""
-    plant = model.plant
+def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) -> Finding:
+    """W, (d,) per second, against what was found of h."""
     lost = (
         f"; from {found.lost} of {found.samples} states the motion cannot be followed" if found.lost else ""
     )
     above = [
-        f"{plant.states[i]} by a factor of {_factor(found.largest[i], plant.W[i])}"
-        for i in np.flatnonzero(found.largest > plant.W * (1 + 1e-9) + 1e-9 * plant.x_scale)
+        f"{plant.states[i]} by a factor of {_factor(found.largest[i], W[i])}"
+        for i in np.flatnonzero(found.largest > W * (1 + 1e-9) + 1e-9 * plant.x_scale)
     ]
     if not above:
         verdict: Verdict = "note" if found.lost else "ok"
@@ -90,7 +89,7 @@ def _stability(model: Model) -> Finding:
     text = f"poles, 1/s: {poles_text(found)}"
     if found[0].real > 1e-9 * abs(found).max():
         return Finding("ok", "unstable", f"{text}; by itself it grows e-fold in {1.0 / found[0].real:.3g} s")
-    if found[0].real > -1e-9 * abs(found).max():
+    if found[0].real >= -1e-9 * abs(found).max():
         return Finding("ok", "marginally stable", f"{text}; by itself it does not come back")
     return Finding("ok", "stable", f"{text}; by itself it comes back")
 

@@ -9,7 +9,6 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from tandem.commands.base import Command
-from tandem.terminal import Refused
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +21,13 @@ class ModelNew(Command):
     def run(self) -> int:
         from importlib.resources import files
 
-        require_new(self.file)
+        from tandem.plant_file import write_new
+
         text = files("tandem.templates").joinpath("plant.py").read_text(encoding="utf-8")
-        self.file.write_text(text.replace("THIS_FILE", str(self.file)), encoding="utf-8")
+        name = str(self.file)
+        # Not one that would end a text of Python.
+        plain = name.isprintable() and '"' not in name and "\\" not in name
+        write_new(self.file, text.replace("THIS_FILE", name if plain else "FILE.py"))
         self.say(
             f"{self.file}: PLANT by its equations, and MATRICES by numbers; keep one",
             f"look at it: tandem model check {self.file}:PLANT",
@@ -32,13 +35,3 @@ class ModelNew(Command):
         )
         self.emit({"file": str(self.file), "names": ["PLANT", "MATRICES"]})
         return 0
-
-
-def require_new(file: Path) -> None:
-    """Raises `Refused` for a plant file that cannot be written there."""
-    if file.suffix != ".py":
-        raise Refused(f"{file}: the name of a plant file ends in .py")
-    if file.exists():
-        raise Refused(f"{file}: exists already, and is not overwritten; choose another name")
-    if not file.absolute().parent.is_dir():
-        raise Refused(f"{file}: there is no folder {file.absolute().parent}")

@@ -17,6 +17,7 @@ from lbmpc.plants import PLANTS, Known, Plant
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
 from tandem.cli import main
+from tandem.commands.model.check import ModelCheck
 from tests.helpers.plants.integrator import INTEGRATOR
 from tests.helpers.plants.pendulum import PENDULUM
 from tests.lbmpc.plants.test_inspection import FAULTY
@@ -41,6 +42,12 @@ def mine(monkeypatch: pytest.MonkeyPatch) -> Any:
 def checked(capsys: Capture, *words: str) -> tuple[int, dict[str, Any]]:
     code = main(["model", "check", *words, "--json"])
     return code, json.loads(capsys.readouterr().out)
+
+
+def refused(capsys: Capture, plant: str) -> str:
+    """The faults, without the time that parsing a command line takes."""
+    assert ModelCheck(plant=plant, json=True).run() == 2
+    return " ".join(json.loads(capsys.readouterr().out)["faults"])
 
 
 def said(capsys: Capture, *words: str) -> tuple[int, str]:
@@ -68,6 +75,12 @@ def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> 
         assert word not in text
 
 
+def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
+    limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
+    mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
+    assert "poles, 1/s: 0, 0; by itself it does not come back" in said(capsys, "mine")[1]
+
+
 def test_the_numbers_of_the_json_are_those_of_the_model(mine: Any, capsys: Capture) -> None:
     mine(PENDULUM)
     code, found = checked(capsys, "mine", *TEN)
@@ -88,6 +101,12 @@ def test_a_proved_bound_holds_what_was_found(mine: Any, capsys: Capture) -> None
     _code, found = checked(capsys, "mine", *TEN, "--prove")
     assert (np.array(found["h_bound"]) >= np.array(found["h_sampled"]) * (1.0 - 1e-9)).all()
     assert found["h_bound"][1] < 1.1 * found["h_sampled"][1]
+    wider = ("--set", f"controller.W={[1.01 * bound for bound in found['h_bound']]}")
+    _code, found = checked(capsys, "mine", *TEN, "--prove", *wider)
+    assert "W" not in found["notes"]
+    assert found["W"][1] > found["h_bound"][1]
+    _code, found = checked(capsys, "mine", *TEN, "--prove", "--set", "plant.truth.stiffness=5.0")
+    assert found["h_bound"] is None
     mine(replace(INTEGRATOR, x_max=np.array([1.0, np.inf])))
     code, text = said(capsys, "mine", "--prove")
     assert code == 0
@@ -192,9 +211,7 @@ def test_what_is_worth_a_look_is_said_and_no_fault(case: str, mine: Any, capsys:
 def test_every_fault_of_equations_is_named(case: str, mine: Any, capsys: Capture) -> None:
     plant, message = FAULTY[case]
     mine(plant)
-    code, found = checked(capsys, "mine")
-    assert code == 2
-    assert re.search(message, " ".join(found["faults"]))
+    assert re.search(message, refused(capsys, "mine"))
 
 
 @pytest.mark.parametrize("case", FAULTY_NUMBERS)
@@ -212,9 +229,7 @@ def test_every_fault_of_numbers_is_named_though_the_file_raises_while_it_is_read
         "from math import inf, nan\nfrom lbmpc.plants import Known\n"
         f"PLANT = Known.from_matrices({A!r}, {B!r}, **{arguments!r})\n"
     )
-    code, found = checked(capsys, "plant.py:PLANT")
-    assert code == 2
-    assert re.search(message, " ".join(found["faults"]))
+    assert re.search(message, refused(capsys, "plant.py:PLANT"))
 
 
 def test_all_faults_of_a_file_are_named_at_once(capsys: Capture) -> None:
@@ -317,11 +332,19 @@ def test_a_new_plant_file_overwrites_nothing(tmp_path: Path, capsys: Capture) ->
         ("my.py", "my.py: exists already, and is not overwritten"),
         ("my.txt", "ends in .py"),
         ("away/my.py", "there is no folder"),
+        (f"{'x' * 300}.py", "File name too long"),
     ):
         assert main(["model", "new", name]) == 2
         assert message in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["my.py"]
     assert Path("my.py").read_text() == "kept"
+
+
+def test_a_strange_name_does_not_spoil_the_file(capsys: Capture) -> None:
+    strange = 'my """\\N.py'
+    assert main(["model", "new", strange]) == 0
+    capsys.readouterr()
+    assert checked(capsys, f"{strange}:PLANT")[0] == 0
 
 
 def test_the_name_may_be_left_out_where_there_is_one(capsys: Capture) -> None:
