@@ -14,7 +14,7 @@ from node_runtime.realtime import clock
 
 log = logging.getLogger(__name__)
 
-Read = Callable[[], np.ndarray]
+Read = Callable[[], np.ndarray | None]
 Write = Callable[[np.ndarray], object]
 Call = Literal["read", "write"]
 R = TypeVar("R")
@@ -62,9 +62,12 @@ class Guarded:
             return ""
         return f"{under_way[0]} has not returned for more than {HANGS_S:g} s"
 
-    def _measure(self) -> np.ndarray:
+    def _measure(self) -> np.ndarray | None:
         self.measured = self._now()
-        x = np.array(self._read(), dtype=float)
+        read = self._read()
+        if read is None:
+            return None
+        x = np.array(read, dtype=float)
         if x.shape != (self._states,):
             raise ValueError(f"x has the shape {x.shape}, the plant has {self._states} states")
         if not np.isfinite(x).all():
