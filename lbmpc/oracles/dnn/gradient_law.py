@@ -17,6 +17,10 @@ import numpy as np
 from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw
 
 
+NOISE = 9.0
+TINY = 1e-300
+
+
 @dataclass(frozen=True, eq=False)
 class GradientLaw(AdaptationLaw):
     """Nothing is remembered beside K."""
@@ -30,9 +34,17 @@ class GradientLaw(AdaptationLaw):
         return {"gamma": np.array([self.gamma]), "bounds": self.bounds}
 
     def expression(
-        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+        self,
+        phi: ca.MX,
+        K: ca.MX,
+        error: ca.MX,
+        variance: ca.MX,
+        settings: Mapping[str, ca.MX],
+        memory: Mapping[str, ca.MX],
     ) -> dict[str, ca.MX]:
-        moved = K - (settings["gamma"] / ca.dot(phi, phi)) * (error @ phi.T)
+        # 1 exactly where the label is.
+        deserved = ca.fmax(0, 1 - NOISE * variance / (error * error + TINY))
+        moved = K - (settings["gamma"] / ca.dot(phi, phi)) * ((deserved * error) @ phi.T)
         norms, bounds = ca.sqrt(ca.sum2(moved * moved)), settings["bounds"]
         # bounds / bounds is 1 exactly, so what keeps its bound is not touched.
         return {"K": moved * ca.repmat(bounds / ca.fmax(norms, bounds), 1, K.shape[1])}

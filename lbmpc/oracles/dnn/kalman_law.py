@@ -77,11 +77,17 @@ class KalmanLaw(AdaptationLaw):
         }
 
     def expression(
-        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+        self,
+        phi: ca.MX,
+        K: ca.MX,
+        error: ca.MX,
+        variance: ca.MX,
+        settings: Mapping[str, ca.MX],
+        memory: Mapping[str, ca.MX],
     ) -> dict[str, ca.MX]:
         Sigma = memory["Sigma"]
         along = Sigma @ phi
-        s = settings["label_variance"] + ca.dot(phi, along)
+        s = settings["label_variance"] + ca.mmax(variance) + ca.dot(phi, along)
         # The product of one vector with itself is symmetric to the last bit, and so is Sigma for ever.
         root = along / ca.sqrt(s)
         less = settings["kept"] * (Sigma - root @ root.T)
