@@ -100,6 +100,7 @@ class Trainer:
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
         self._fresh = 0
+        # What the labels' variance adds to the loss.
         self._noise = 0.0
         self._step = 1
         self.resume(hidden, version)
@@ -156,9 +157,18 @@ class Trainer:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
         windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
-        if (variance := samples[-1].variance) and np.isfinite(variance).all():
-            self._noise = float((np.array(variance) / np.array(self.description.output_scale) ** 2).sum())
+        if samples[-1].variance:
+            self._noise = self._noise_of(np.array(samples[-1].variance))
         return self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
+
+    def _noise_of(self, variance: np.ndarray) -> float:
+        """What labels of this variance, (d,), add to the loss. Raises `ValueError` for what is none."""
+        noise = float((variance / np.array(self.description.output_scale) ** 2).sum())
+        if variance.shape != (self.description.states,) or not (
+            (variance >= 0.0).all() and math.isfinite(noise)
+        ):
+            raise ValueError("no variance")
+        return noise
 
     def due(self) -> bool:
         """Whether enough new samples came since the last training began."""
@@ -168,7 +178,8 @@ class Trainer:
         """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
 
         M samples are drawn from the buffer, and `steps` Adam steps taken on all of them, in float32. Adam
-        starts afresh each time.
+        starts afresh each time. Where labels have a variance, a quarter of the samples is held out: the steps count up
+        to where these were predicted best, and the old layers stay where that is within the noise.
 
         Args:
             output: K_{T_k}, (1 + n_L, d), and the hash of the hidden layers it was adapted to.

@@ -19,6 +19,7 @@ often as neighbouring labels say the same.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import schur
 
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
 from lbmpc.model import Model
@@ -32,6 +33,8 @@ LONGEST_GAP = 100
 """Periods without a sample after which nothing is known any more."""
 RANK, PART = 1e-9, 1e-6
 """What counts as nothing: of the largest singular value, and of a mode."""
+LASTS = 1.0 - 1e-6
+"""|eigenvalue| from which on a mode does not fade."""
 
 
 class KalmanEstimator(Estimator):
@@ -174,6 +177,9 @@ def unobservable(model: Model, measured: np.ndarray) -> list[int]:
         rows.append(rows[-1] @ slope)
     _left, sizes, right = np.linalg.svd(np.vstack(rows))
     unseen = right[int((sizes > RANK * sizes[0]).sum()) :].T
-    values, modes = np.linalg.eig(unseen.T @ (model.A * units / units[:, None]) @ unseen)
-    lasting = unseen @ modes[:, np.abs(values) >= 1.0 - RANK]
-    return np.flatnonzero((np.abs(lasting) > PART).any(axis=1)).tolist()
+    if not unseen.size:
+        return []
+    inner = unseen.T @ (model.A * units / units[:, None]) @ unseen
+    # Of an invariant subspace, not of eigenvectors: two integrators in a row have one of those.
+    _form, vectors, count = schur(inner, sort=lambda re, im: np.hypot(re, im) >= LASTS)
+    return np.flatnonzero((np.abs(unseen @ vectors[:, :count]) > PART).any(axis=1)).tolist()
