@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper bench test compose-test wheel-test remote-test faults fuzz soak lint format clean
+.PHONY: help setup run simulate paper examples bench test compose-test wheel-test remote-test faults fuzz soak lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -16,7 +16,7 @@ setup: $(READY)  ## a virtual environment in .venv with everything in it
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[trainer,log,experiment,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[trainer,log,experiment,examples,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
@@ -27,6 +27,21 @@ simulate: $(READY)  ## the same in lock-step, faster than real time
 
 paper: $(READY)  ## the paper's experiment and beyond, into paper/report.html
 	$(BIN)/tandem experiment paper --out paper $(ARGS)
+
+EXAMPLES := runs/examples
+examples: $(READY)  ## every example, one of them live, with pictures into runs/examples: 5 minutes
+	rm -rf $(EXAMPLES)
+	mkdir -p $(EXAMPLES)
+	cd $(EXAMPLES) && $(CURDIR)/$(BIN)/python $(CURDIR)/examples/compressor/compressor.py
+	$(BIN)/python examples/compare.py examples/tanks/tanks.toml --steps 60 --out $(EXAMPLES)/tanks.png
+	$(BIN)/python examples/compare.py examples/quadrotor/quadrotor.toml --steps 250 --out $(EXAMPLES)/quadrotor.png
+	$(BIN)/python examples/compare.py examples/mujoco_crane/crane.toml --steps 500 --out $(EXAMPLES)/crane.png
+	$(BIN)/python examples/compare.py examples/gymnasium_pendulum/pendulum.toml --steps 100 --out $(EXAMPLES)/pendulum.png
+	$(BIN)/tandem run --config examples/mujoco_crane/crane.toml --seconds 20 --log $(EXAMPLES)/crane-live.mcap
+	$(BIN)/tandem replay $(EXAMPLES)/crane-live.mcap
+	$(BIN)/tandem simulate --config examples/tanks/tanks.toml --oracle constant --steps 60 --log $(EXAMPLES)/tanks.mcap
+	$(BIN)/python examples/replay/what_if.py $(EXAMPLES)/tanks.mcap controller.oracle=linear --out $(EXAMPLES)/what_if.png
+	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU --set network.hidden='[16,16]'
 
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)

@@ -6,7 +6,10 @@ live node, the lock-step simulation and the replay all call `step` and differ on
 
 from __future__ import annotations
 
+import hashlib
 import platform
+
+import msgspec
 
 from controller_node.build import GivenPlant, build_backup, build_controller, build_model
 from controller_node.certified_sets import CertifiedSets, find_sets
@@ -14,10 +17,16 @@ from controller_node.codegen.compiler import Compiler
 from controller_node.memory import Memory
 from controller_node.translation import Outputs, Translation
 from lbmpc.controller.backup_policy import BackupPlanner
+from lbmpc.plants import Known
 from node_runtime import provenance
 from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
 from protocol import messages as m
+
+
+def sha256_of_known(plant: Known) -> str:
+    """Of all its numbers and words: whether two processes knew the same."""
+    return hashlib.sha256(msgspec.json.encode(plant.to_builtins(), order="sorted")).hexdigest()
 
 
 class ControllerCore:
@@ -109,7 +118,7 @@ class ControllerCore:
 
     def run_info(self, unix_time: float) -> m.RunInfo:
         """What a log needs to be replayed on its own."""
-        facts = self.arithmetic()
+        facts = self.arithmetic() | {"known plant": sha256_of_known(self.plant)}
         if self.sets is not None:
             facts |= {"certified sets": self.sets.sha256}
         network = self.controller.oracle.description

@@ -44,25 +44,26 @@ class Row:
     rest: np.ndarray
     """(d,) x - x_e at the end."""
     violations: int
+    """Samples outside X or U, in all episodes."""
     result: Result
 
 
 def compare(
-    config: Path, steps: int, oracles: tuple[str, ...], episodes: int = 1, seed: int = 0
+    config: Path, steps: int, oracles: tuple[str, ...], episodes: int = 1, seed: int = 0, **settings: Any
 ) -> list[Row]:
-    """One run of each oracle, the same in all else."""
-    return [_row(config, steps, oracle, episodes, seed) for oracle in oracles]
-
-
-def _row(config: Path, steps: int, oracle: str, episodes: int, seed: int) -> Row:
-    loop = Loop(config=config, seed=seed, **ORACLES[oracle])
-    result = loop.run(steps)
-    for _ in range(episodes - 1):
-        loop.start_again()
+    """One run of each oracle, the same in all else; `settings` as `Loop` takes them."""
+    rows = []
+    for oracle in oracles:
+        loop = Loop(config=config, seed=seed, **{**settings, **ORACLES[oracle]})
         result = loop.run(steps)
-    summary = result.summary
-    costs = [episode.J for episode in summary.episodes]
-    return Row(oracle, costs, result.x[-1] - loop.plant.x_e, summary.constraint_violations, result)
+        for _ in range(episodes - 1):
+            loop.start_again()
+            result = loop.run(steps)
+        summary = result.summary
+        costs = [episode.J for episode in summary.episodes]
+        rest = result.x[-1] - loop.plant.x_e
+        rows.append(Row(oracle, costs, rest, summary.constraint_violations, result))
+    return rows
 
 
 def picture(rows: list[Row], plant: Description) -> Figure:
@@ -116,14 +117,12 @@ def main(
         out: file of the picture; none is drawn without.
     """
     rows = compare(config, steps, oracles, episodes, seed)
-    plant = Loop(config=config, oracle="linear").plant
-    first = plant.states[plant.performance[0]]
-    print(f"{'oracle':13s} {'J of each episode':{9 * episodes}s}  {first} - {first}_e at the end  outside")
+    plant = rows[0].result.traces.plant
+    first = plant.performance[0]
+    print(f"{'oracle':14s}{'J of each episode':20s}{plant.states[first]} at the end, off by    outside")
     for row in rows:
-        costs = "".join(f"{J:9.4g}" for J in row.J)
-        print(
-            f"{row.oracle:13s}{costs:>{max(18, 9 * episodes + 1)}s}  {row.rest[plant.performance[0]]:12.3g} {row.violations:14d}"
-        )
+        costs = " ".join(f"{J:.4g}" for J in row.J)
+        print(f"{row.oracle:14s}{costs:20s}{row.rest[first]:<+20.3g}{row.violations:d}")
     if out is not None:
         with matplotlib.rc_context(matplotlib.rcParamsDefault):
             picture(rows, plant).savefig(out)

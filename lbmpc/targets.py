@@ -39,6 +39,8 @@ SECOND = 1e-8
 """Weight of the cost beside that of the outputs: small enough to move them by less than anybody sees."""
 LEAST = 1e-6
 """Of the largest weight: what a state or input counts at least, so that there is one nearest rest."""
+SOLVED = 1e-6
+"""What linear equations in half-widths may be off by; more, and they have no solution."""
 PENALTY = 1e6
 """Of the rows, so that there is a solution of the QP where no rest is inside."""
 
@@ -75,24 +77,34 @@ class TargetSelector:
         realise: Callable[[ca.Function], ca.Function] = lambda function: function,
     ):
         model, plant = problem.model, problem.model.plant
-        self._d, self._outputs = model.d, list(outputs)
+        chosen = list(outputs)
         self._scale = np.concatenate([plant.x_scale, plant.u_scale])
-        self._r = np.asarray(r, dtype=float) / plant.x_scale[self._outputs]
+        there = np.asarray(r, dtype=float) / plant.x_scale[chosen]
+        self._wanted = [*zip(chosen, there.tolist(), strict=True)]
         weights = np.concatenate([np.diag(model.Q), np.diag(model.R)]) * self._scale**2
         weights = np.maximum(weights / weights.max(), LEAST)
-        if self._outputs:
+        if chosen:
             weights *= SECOND
-            weights[self._outputs] += 1.0
+            weights[chosen] += 1.0
         self._per_weight = 1.0 / np.sqrt(weights)
         wanted = np.zeros_like(weights)
-        wanted[self._outputs] = self._r
-        self._newton = Bound(realise(build_newton(problem, self._scale, weights, wanted)))
+        wanted[chosen] = there
         self._rows, self._lower, self._upper = _rows(problem, self._scale)
-        soft = np.ones(len(self._rows), dtype=bool)
-        self._penalty = Penalty(soft, row_ranges(self._rows, 1.0), PENALTY)
+        ranges = row_ranges(self._rows, 1.0)
+        self._penalty = Penalty(np.ones(len(self._rows), dtype=bool), ranges, PENALTY)
         low, high = np.concatenate([plant.x_min, plant.u_min]), np.concatenate([plant.x_max, plant.u_max])
         equilibrium = np.concatenate([plant.x_e, plant.u_e])
         self._low, self._high = (low - equilibrium) / self._scale, (high - equilibrium) / self._scale
+        w, theta = ca.MX.sym("w", len(weights)), ca.MX.sym("theta", problem.oracle.parameters)
+        free, rests, wrong = newton_step(problem, self._scale, weights, wanted, w, theta)
+        moved = ca.mmax(ca.fabs(free - w))
+        values = ca.DM(self._rows) @ free
+        outside = ca.mmax(ca.fmax(self._lower - values, values - self._upper) / ranges)
+        inside = ca.fmin(ca.fmax(free, self._low), self._high)
+        said = ca.vertcat(wrong, moved, outside)
+        found = {"free": free, "inside": inside, "rests": ca.densify(rests), "said": said}
+        function = ca.Function("newton", [w, theta], [*found.values()], ["w", "theta"], list(found))
+        self._newton = Bound(realise(function))
 
     def find(self, theta: np.ndarray, start: np.ndarray) -> SteadyState:
         """The target under the oracle's parameters theta, from `start`, (d + m,): x and u of the last one.
@@ -101,66 +113,66 @@ class TargetSelector:
         """
         w, rests = start / self._scale, False
         self._newton.inputs["theta"][:, 0] = theta
-        with np.errstate(all="ignore"):
-            for _ in range(STEPS):
-                free = self._step(w)
-                if free is None:
-                    w, rests = np.zeros_like(w), False
-                    break
-                arrived = bool(np.abs(free - w).max() < ARRIVED)
-                w = np.minimum(np.maximum(free, self._low), self._high)
-                rests = arrived and self._are_inside(free)
-                if arrived:
-                    break
-        off = np.abs(w[self._outputs] - self._r)
-        distance = float(off.max()) if self._outputs else 0.0
+        for _ in range(STEPS):
+            w, moved, outside = self._step(w)
+            if not np.isfinite(moved):
+                break
+            if moved < ARRIVED:
+                rests = outside <= INSIDE
+                break
+        distance = max(abs(float(w[i]) - r) for i, r in self._wanted) if self._wanted else 0.0
         status: TargetStatus = "no rest" if not rests else "reached" if distance < REACHED else "nearest"
         return SteadyState(w * self._scale, status, distance)
 
-    def _step(self, w: np.ndarray) -> np.ndarray | None:
-        """One Newton step from w, (d + m,), in half-widths; None when its numbers are unusable."""
+    def _step(self, w: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """One Newton step from w, (d + m,), in half-widths.
+
+        Returns:
+            Where it leads, inside X and U of the plant; how far that is, infinite where numbers are unusable; how far
+            it is outside Z and V.
+        """
         newton = self._newton
         newton.inputs["w"][:, 0] = w
         newton()
-        matrix, n = newton.outputs["matrix"], len(w)
-        try:
-            free = np.linalg.solve(matrix, newton.outputs["right"][:, 0])[:n]
-        except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(free).all():
-            return None
-        if self._are_inside(free):
-            return free
-        # w = free + moves q with |q|^2 / 2 more cost, along the linearised rests.
-        basis = np.linalg.qr((matrix[n:, :n] * self._per_weight).T, mode="complete")[0][:, self._d :]
-        moves = self._per_weight[:, None] * basis
-        values, slopes = self._rows @ free, self._rows @ moves
-        nearest = least_distance(values, slopes, self._lower, self._upper, self._penalty)
-        return None if nearest is None else free + moves @ nearest.w
-
-    def _are_inside(self, w: np.ndarray) -> bool:
-        outside = violation(self._rows @ w, self._lower, self._upper)
-        return bool((outside <= INSIDE * self._penalty.scale).all())
+        wrong, moved, outside = newton.outputs["said"][:, 0].tolist()
+        if not wrong <= SOLVED:
+            return np.zeros_like(w), np.inf, np.inf
+        if outside <= INSIDE:
+            return newton.outputs["inside"][:, 0].copy(), moved, outside
+        # free + moves q costs |q|^2 / 2 more, along the rests as they are linearised.
+        with np.errstate(all="ignore"):
+            free, d = newton.outputs["free"][:, 0], len(newton.outputs["rests"])
+            basis = np.linalg.qr((newton.outputs["rests"] * self._per_weight).T, mode="complete")[0][:, d:]
+            moves = self._per_weight[:, None] * basis
+            values, slopes = self._rows @ free, self._rows @ moves
+            nearest = least_distance(values, slopes, self._lower, self._upper, self._penalty)
+            if nearest is None:
+                return np.zeros_like(w), np.inf, np.inf
+            free = free + moves @ nearest.w
+            outside = violation(nearest.values, self._lower, self._upper) / self._penalty.scale
+        return np.clip(free, self._low, self._high), float(np.abs(free - w).max()), float(outside.max())
 
 
-def build_newton(problem: Problem, scale: np.ndarray, weights: np.ndarray, wanted: np.ndarray) -> ca.Function:
-    """(w, theta) -> (matrix, right): matrix (w+, multipliers) = right for one Newton step from w to w+, (d + m,).
+def newton_step(
+    problem: Problem, scale: np.ndarray, weights: np.ndarray, wanted: np.ndarray, w: ca.MX, theta: ca.MX
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """One Newton step from w, (d + m,), in units of `scale`, (d + m,).
 
-    In units of `scale`, (d + m,): w+ minimises w'diag(weights) w / 2 - wanted'w on the rests of the model linearised
-    at w.
+    Returns:
+        w+, which minimises w'diag(weights) w / 2 - wanted'w on the rests of the model linearised at w; the Jacobian of
+        these rests, (d, d + m); how far w+ is from a solution, NaN where it is none.
     """
-    model, oracle, d = problem.model, problem.oracle, problem.model.d
-    w, theta = ca.MX.sym("w", d + model.m), ca.MX.sym("theta", oracle.parameters)
+    model, d = problem.model, problem.model.d
     linear = ca.DM(np.hstack([model.A - np.eye(d), model.B]))
-    h, slopes = _h_at_rest(oracle, w * scale, theta)
+    h, slopes = _h_at_rest(problem.oracle, w * scale, theta)
     motion = (linear @ (w * scale) + h) / scale[:d]
-    jacobian = (linear + slopes) * (scale / scale[:d, None])
-    matrix = ca.vertcat(
-        ca.horzcat(ca.DM(np.diag(weights)), jacobian.T), ca.horzcat(jacobian, ca.DM.zeros(d, d))
-    )
-    right = ca.vertcat(wanted, jacobian @ w - motion)
-    outputs = [ca.densify(matrix), ca.densify(right)]
-    return ca.Function("newton", [w, theta], outputs, ["w", "theta"], ["matrix", "right"])
+    rests = (linear + slopes) * (scale / scale[:d, None])
+    matrix = ca.vertcat(ca.horzcat(ca.DM(np.diag(weights)), rests.T), ca.horzcat(rests, ca.DM.zeros(d, d)))
+    matrix, right = ca.densify(matrix), ca.densify(ca.vertcat(wanted, rests @ w - motion))
+    solution = ca.solve(matrix, right, "qr")
+    # A sum of squares, since a largest one of CasADi overlooks what is no number.
+    wrong = ca.norm_2(matrix @ solution - right) / (1.0 + ca.norm_2(right))
+    return solution[: len(scale)], rests, wrong
 
 
 def _h_at_rest(oracle: Oracle, xu: ca.MX, theta: ca.MX) -> tuple[ca.MX, ca.MX]:

@@ -46,6 +46,8 @@ log = logging.getLogger(__name__)
 
 LATE = 0.2
 """Share of a period after which a sample counts as late."""
+STRETCH = 0.01
+"""Share of a period."""
 LONGEST_WAIT_S = 0.1
 """How soon the loop notices that it is told to stop."""
 NOTES: dict[InputSource, str] = {
@@ -158,9 +160,10 @@ class _Loop:
     def __init__(self, shield: Shield, machine: Guarded, bus: Bus, simulated: bool):
         self._shield, self._machine, self._bus, self._simulated = shield, machine, bus, simulated
         self._period = bus.config.period
-        plant = shield.plant
-        self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=plant.d, inputs=plant.m)
-        self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=plant.d, inputs=plant.m)
+        self._arrived = threading.Condition(threading.Lock())
+        d, m = shield.plant.d, shield.plant.m
+        self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=d, inputs=m, arrived=self._arrived)
+        self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=d, inputs=m, arrived=self._arrived)
         names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
         self._counts = dict.fromkeys(names, 0)
         self._source: InputSource = "hold"
@@ -193,13 +196,20 @@ class _Loop:
 
     def _obey_until(self, stop: threading.Event, time: float) -> bool:
         """Let act what arrives and what is due, until `time`; False when told to stop."""
+        # The last stretch is slept through: that is more punctual, and what comes in it acts right after the sample.
+        rest = time - STRETCH * self._period
         while not stop.is_set():
             self._take_orders()
             now = clock.now()
             self._act(min(now, time))
-            if now >= time:
+            if now >= rest:
+                clock.sleep_until(time)
+                self._act(time)
                 return True
-            self._commands.wait_any(min(time - now, max(0.0, self._shield.due - now), LONGEST_WAIT_S))
+            wait = min(rest - now, max(0.0, self._shield.due - now), LONGEST_WAIT_S)
+            with self._arrived:
+                # For policies too: read at the slot, they would make its sample late.
+                self._arrived.wait_for(lambda: self._commands or self._backups, wait)
         return False
 
     def _act(self, t: float) -> None:

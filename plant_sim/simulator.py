@@ -57,7 +57,7 @@ class Motion:
         if t > self._t:
             if self._u is not None:
                 self._x = self._after(t)
-            self._t, self._ahead = t, None
+            self._t = t
 
     def _after(self, t: float) -> np.ndarray:
         """x(t), (d,), under the present input."""

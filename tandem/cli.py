@@ -22,7 +22,9 @@ from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
 from tandem.commands.health import Health
+from tandem.commands.identify import Identify
 from tandem.commands.keys import KeysCommand
+from tandem.commands.model import ModelCommand
 from tandem.commands.processes import Controller, Plant, Record, Router, Trainer
 from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
@@ -46,6 +48,8 @@ AnyCommand = (
     | Annotated[Health, subcommand("health")]
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[SetsCommand, subcommand("sets")]
+    | Annotated[ModelCommand, subcommand("model")]
+    | Annotated[Identify, subcommand("identify")]
     | Annotated[KeysCommand, subcommand("keys")]
     | Annotated[ConfigCommand, subcommand("config")]
     | Annotated[ArchitectureCommand, subcommand("architecture")]

@@ -139,12 +139,14 @@ class Controller:
         start = self._when_it_acts(oracle, seen, delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
-        target = self._target(state, oracle)
-        plan, mode, solution = self._plan(state, oracle, start, first, target)
+        # A prepared step goes on from what was known when it was prepared.
+        theta = None if self._prepares(state) else self.oracle.theta(oracle)
+        target = self._target(state, theta)
+        s = state.predicted if start is None else self._with_past(oracle, start)
+        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
-        s = self._with_past(oracle, start) if start is not None else state.predicted
         x, u = s[: self.model.d], plan.u[0]
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
         estimator = self.estimator.commanded(estimator, u)
@@ -220,62 +222,60 @@ class Controller:
         """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
         return self.real_time and state.plan.left > 0
 
-    def _target(self, state: ControllerState, oracle: OracleState) -> SteadyState | None:
-        """Where the step's plan aims; a prepared one by what was known when it was prepared."""
+    def _target(self, state: ControllerState, theta: np.ndarray | None) -> SteadyState | None:
+        """Where the step's plan aims, by theta; None: by that of the prepared step."""
         if self._targets is None:
             return None
-        if self._prepares(state):
+        if theta is None:
             self.prepare(state)
             return self._prepared_target
-        return self._find_target(state, self.oracle.theta(oracle))
+        return self._find_target(state, theta)
 
     def _find_target(self, state: ControllerState, theta: np.ndarray) -> SteadyState | None:
         return None if self._targets is None else self._targets.find(theta, state.target)
 
     def _references(self, target: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """x^r (N + 1, d) and u^r (N, m) of a plan to `target`, (d + m,), or (0,) for the equilibrium: None."""
+        """x^r (1, d) and u^r (1, m) of a plan to `target`, (d + m,), or (0,) for the equilibrium: None."""
         if not target.size:
             return None, None
-        n, d, m = self.problem.horizon, self.model.d, self.model.m
-        return np.broadcast_to(target[:d], (n + 1, d)), np.broadcast_to(target[d:], (n, m))
+        return target[None, : self.model.d], target[None, self.model.d :]
 
     def _plan(
         self,
         state: ControllerState,
-        oracle: OracleState,
-        x: np.ndarray | None,
+        theta: np.ndarray | None,
+        s: np.ndarray | None,
         certified: FirstInputs | None,
         target: SteadyState | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
-        if x is not None:
-            solution = self._solve(state, oracle, x, first, target)
+        if s is not None:
+            solution = self._solve(state, theta, s, first, target)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
             return _begun_within(plan, first), "shifted_plan", solution
         nothing, d = empty_plan(horizon, self.model.m), self.model.d
         xs, us = (0.0, 0.0) if target is None else (target.xu[:d], target.xu[d:])
-        if x is None:
+        if s is None:
             # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
             return replace(nothing, u=nothing.u + us), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, x, horizon, xs, us))
+        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
         self,
         state: ControllerState,
-        oracle: OracleState,
-        x: np.ndarray,
+        theta: np.ndarray | None,
+        s: np.ndarray,
         first: Box | None,
         target: SteadyState | None,
     ) -> Solution:
-        s = self._with_past(oracle, x)
-        if not self._prepares(state):
+        if theta is not None:
             references = self._references(_aim(target))
-            return self._solver.solve(s, self.oracle.theta(oracle), state.plan.c, *references, first=first)
+            return self._solver.solve(s, theta, state.plan.c, *references, first=first)
         self.prepare(state)
         self._prepared_for = None
         return self._solver.feedback(s, first)

@@ -3,8 +3,8 @@
     h_hat_{t+1} = h_hat_t + gain (h(x_t, u_t) - h_hat_t),    h_hat_0 = 0
 
 h_hat is the same all over X x U, and at rest it equals the disturbance there: nothing is left of it in the prediction
-error (Pannocchia and Rawlings 2003). The target of the cost stays (x_e, u_e), so an offset is left where an input other
-than u_e holds the plant and costs something. It is the baseline of all that learns a function.
+error (Pannocchia and Rawlings 2003). With a reference (`lbmpc.targets`) no offset is left. It is the baseline of all
+that learns a function.
 """
 
 from __future__ import annotations

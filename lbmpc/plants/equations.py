@@ -14,7 +14,15 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.plants.description import Description, PlantError, as_tuple
-from lbmpc.plants.faults import bound_faults, name_faults, number_faults, refuse, unusable
+from lbmpc.plants.faults import (
+    bound_faults,
+    choice_faults,
+    name_faults,
+    number_faults,
+    refuse,
+    require_held,
+    unusable,
+)
 from lbmpc.plants.known import Known
 from lbmpc.plants.rest import nearest_rest
 
@@ -54,9 +62,13 @@ class Plant(Description):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
     ) -> Plant:
-        """As that of a description; of x_e and u_e alone, about the nearest rest. Raises `PlantDefinitionError` too."""
+        """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
         there = super().changed(bounds, x_e, u_e)
-        return there if (x_e is None) == (u_e is None) else there.resting_near()
+        if x_e is None or u_e is not None:
+            return there
+        rest = there.resting_near()
+        require_held(there, rest, input_too=False)
+        return rest
 
     def known(self) -> Known:
         """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""
@@ -112,7 +124,10 @@ class Plant(Description):
         Raises:
             PlantDefinitionError: there is none nearby, or it is outside of X or U.
         """
-        refuse(self.name, name_faults(self) or tuple(number_faults(self)) or tuple(bound_faults(self)))
+        refuse(
+            self.name,
+            name_faults(self) or tuple(number_faults(self)) or (*bound_faults(self), *choice_faults(self)),
+        )
         near_x = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
         near_u = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
         slopes, x, u = self._slopes(), near_x, near_u
@@ -121,7 +136,7 @@ class Plant(Description):
             if not all(np.isfinite(values).all() for values in (residual, a, b)):
                 break
             drift = residual + a @ (near_x - x) + b @ (near_u - u)
-            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale)
+            moved = nearest_rest(a, b, drift, self.x_scale, self.u_scale, self.performance)
             if moved is None:
                 break
             last, x, u = (x, u), near_x + moved[0], near_u + moved[1]

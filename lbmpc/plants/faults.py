@@ -12,6 +12,8 @@ from lbmpc.plants.description import INPUT_VECTORS, STATE_VECTORS, Description, 
 
 TIME = "t"
 """The name of time in a plant's units."""
+SAME = 1e-5
+"""Half-widths: a rest that is so near to what was asked for is that."""
 W_IS = (
     "W is missing: give the half-widths of what the model does not know, per second, one for each of {names}. "
     "`tandem identify` finds them from a log; zeros claim that the model is exact"
@@ -28,6 +30,23 @@ def unusable(name: str, *found: str, where: str = "") -> PlantDefinitionError:
     """What says that the plant of that name has these faults, at least one; `where` it is written."""
     listed = f" {found[0]}" if len(found) == 1 else "".join(f"\n  - {fault}" for fault in found)
     return PlantDefinitionError(f"the plant {name!r} cannot be used{where}:{listed}")
+
+
+def require_held(asked: Description, rest: Description, input_too: bool) -> None:
+    """Raise `unusable` unless the nearest rest is where it was asked for: in x_e, and in u_e where that was given."""
+    off = np.abs(rest.x_e - asked.x_e) / asked.x_scale
+    if input_too:
+        off = np.concatenate([off, np.abs(rest.u_e - asked.u_e) / asked.u_scale])
+    if off.max() > SAME:
+        where = point(asked) if input_too else point(asked).split(", u_e")[0]
+        held = "it is not an equilibrium" if input_too else "no input holds it there"
+        raise unusable(asked.name, f"{held}: {where}. The nearest rest is {point(rest)}")
+
+
+def point(plant: Description) -> str:
+    """Its x_e and u_e as they can be written, to twelve digits."""
+    x_e, u_e = ([float(f"{value:.12g}") for value in axis.tolist()] for axis in (plant.x_e, plant.u_e))
+    return f"x_e = {x_e}, u_e = {u_e}"
 
 
 def name_faults(plant: Description) -> tuple[str, ...]:

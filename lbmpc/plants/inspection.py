@@ -20,6 +20,7 @@ from lbmpc.plants.faults import (
     is_index,
     name_faults,
     number_faults,
+    point,
     pole_faults,
     refuse,
 )
@@ -157,7 +158,7 @@ def _nearest(plant: Plant) -> str:
     except PlantDefinitionError:
         return ""
     return (
-        f". The nearest rest is x_e = {rest.x_e.tolist()}, u_e = {rest.u_e.tolist()}. Where something known moves it, "
+        f". The nearest rest is {point(rest)}. Where something known moves it, "
         "wind or weight, let it be found: Plant(...).resting_near()"
     )
 

@@ -16,6 +16,7 @@ from lbmpc.plants.faults import (
     number_faults,
     pole_faults,
     refuse,
+    require_held,
     unusable,
 )
 from lbmpc.plants.matrices import matrix_faults, mode_faults, pair_faults
@@ -23,7 +24,7 @@ from lbmpc.plants.rest import nearest_rest
 from lbmpc.plants.written import read, written
 
 ROUNDING = 1e-12
-"""In half-widths: a rest that is this near is there, so that one that was found stays, to the bit."""
+"""In half-widths: what is this near to a rest stays there, to the bit."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,12 +70,14 @@ class Known(Description):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
     ) -> Known:
-        """As that of a description; about the rest nearest to (x_e, u_e). Raises `PlantDefinitionError` as well."""
+        """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
         there = super().changed(bounds, x_e, u_e)
         if x_e is None and u_e is None:
             return there
-        refuse(self.name, known_faults(there))
-        return replace(there, x_e=self.x_e, u_e=self.u_e).resting_near(there.x_e, there.u_e)
+        refuse(self.name, all_faults(there))
+        rest = replace(there, x_e=self.x_e, u_e=self.u_e).resting_near(there.x_e, there.u_e)
+        require_held(there, rest, u_e is not None)
+        return there if u_e is not None else rest
 
     def to_builtins(self) -> dict[str, Any]:
         """What JSON can hold, and `from_builtins` makes the same plant of, bit for bit; infinities are words."""
@@ -213,7 +216,7 @@ def _at_rest(known: Known, x_e: np.ndarray, u_e: np.ndarray, drift: np.ndarray) 
     """The model about the rest nearest to (x_e, u_e), at which it drifts."""
     rounding = ROUNDING * (np.abs(known.slope_x) @ known.x_scale + np.abs(known.B) @ known.u_scale)
     if (np.abs(drift) > rounding).any():
-        moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale)
+        moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale, known.performance)
         if moved is None:
             text = f"at x_e = {x_e.tolist()} it drifts by {drift.tolist()}, and no input holds it there or nearby"
             raise unusable(known.name, text)

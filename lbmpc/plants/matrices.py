@@ -15,6 +15,8 @@ UNMOVED = 1e-9
 """Of the largest singular value of (A B), in half-widths: a mode that is moved by less is moved by nothing."""
 MARGINAL = 1e-9
 """Of the largest eigenvalue: how far inside of stability a mode must be to count as stable."""
+LARGEST = 1e100
+"""In half-widths: its square is still a number."""
 PART = 0.1
 """Of its largest state: what a state must have of a mode to be named."""
 
@@ -85,6 +87,12 @@ def unmoved_modes(A: np.ndarray, B: np.ndarray, x_scale: np.ndarray, u_scale: np
 
 def mode_faults(A: np.ndarray, B: np.ndarray, period: float | None, plant: Description) -> Iterator[str]:
     """What grows, or stays, and no input moves: no controller can hold such a plant."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        rows = 1.0 / plant.x_scale[:, None]
+        sizes = np.abs([*(A * plant.x_scale * rows).ravel(), *(B * plant.u_scale * rows).ravel(), *A.ravel()])
+    if not sizes.max() < LARGEST:
+        yield f"A and B have numbers beyond {LARGEST:g} in half-widths: give the states other units, or other bounds"
+        return
     largest = max(np.abs(np.linalg.eigvals(A)).max(), np.finfo(float).tiny)
     fastest = largest if period is None else 1.0 / period
     for mode in unmoved_modes(A, B, plant.x_scale, plant.u_scale):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from math import isfinite
+from math import isclose, isfinite, remainder
 from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
@@ -14,7 +14,7 @@ from lbmpc.casadi_buffers import Bound
 from lbmpc.plants.description import PlantError
 from lbmpc.plants.equations import Plant
 from lbmpc.plants.known import Known
-from lbmpc.plants.linear_motion import balanced, discretise, within_period
+from lbmpc.plants.linear_motion import StraightLine, balanced, discretise, within_period
 
 INTEGRATION_TOLERANCE = 1e-12
 
@@ -56,10 +56,23 @@ class LinearTruth:
             phi, gamma = self._over(dt)
             after = phi @ dx + gamma @ du
         else:
+            self._require_motion(dt)
             after = self._within.after(dx, du, dt)
         if not np.isfinite(after).all():
             raise PlantError(f"{known.name}: the state is not finite: {after.tolist()}")
         return np.asarray(known.x_e + after)
+
+    def _require_motion(self, dt: float) -> None:
+        """A straight line does for a prediction. As a truth, two halves of it would not make a period."""
+        within = self._within
+        if not isinstance(within, StraightLine):
+            return
+        if not isclose(remainder(dt, within.period), 0.0, abs_tol=1e-6 * dt):
+            raise PlantError(
+                f"{self._known.name}: its A and B are in discrete time and have no motion between two samples, so that "
+                "they cannot simulate an input that changes there, as any does that comes with a delay. Name something "
+                "that moves: plant.truth"
+            )
 
 
 class Own:

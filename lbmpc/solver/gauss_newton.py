@@ -116,7 +116,8 @@ class Solver:
                 s of `lbmpc.oracles.base`, (D,).
             oracle_parameters: theta, as the oracle packs it.
             warm_start: c to start from, (N, m), that of an earlier solution for one; it need not be feasible.
-            xr, ur: references over the horizon, (N + 1, d) and (N, m); the equilibrium by default.
+            xr, ur: references over the horizon, (N + 1, d) and (N, m), or one row for all of it; the equilibrium by
+                default.
             first: hard bounds on v_0 for this solve, (m,) each, inside U; U itself by default.
 
         Returns:

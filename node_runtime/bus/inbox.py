@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar, cast
@@ -116,16 +117,22 @@ class Inbox(Generic[M]):
         inputs: int | None = None,
         sent: Callable[[M], float] | None = None,
         capacity: int = 256,
+        arrived: threading.Condition | None = None,
     ):
         """`states`, `inputs`: the plant's dimensions, None to leave them unchecked. `sent`: the sender's time
-        in a message, for its age. A flood beyond `capacity` between two reads loses the oldest."""
+        in a message, for its age. A flood beyond `capacity` between two reads loses the oldest. `arrived`: notified of
+        every message, for who waits for any of several inboxes."""
         self.topic = topic
         self.follower = Follower(bus.config.bus.follow_silence)
-        self._mailbox: Mailbox = bus.queue(topic, capacity)
+        self._mailbox: Mailbox = bus.queue(topic, capacity, arrived)
         self._bad = bus.bad
         self._dimensions = None if states is None or inputs is None else (states, inputs)
         self._sent = sent
         self._ages = AgeEstimate()
+
+    def __len__(self) -> int:
+        """Messages that wait to be taken, whatever they are worth."""
+        return len(self._mailbox)
 
     def take(self) -> Received[M] | None:
         """The newest message that arrived since the last call and may be obeyed; never blocks.
@@ -141,10 +148,6 @@ class Inbox(Generic[M]):
         """All that arrived since the last call and may be obeyed, in order; never blocks."""
         checked = (self._check(delivery) for delivery in self._mailbox.drain())
         return [received for received in checked if received is not None]
-
-    def wait_any(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` for a message, whatever it is worth: `take_all` then judges it."""
-        self._mailbox.wait(timeout_s)
 
     def wait(self, timeout_s: float) -> Received[M] | None:
         """Like `take`, waiting up to `timeout_s` for a message that may be obeyed."""

@@ -23,7 +23,14 @@ class Delivery:
 class Mailbox:
     """A queue of at most `capacity` messages and `max_bytes` bytes; the oldest is dropped and counted."""
 
-    def __init__(self, name: str, capacity: int, max_bytes: int = MAX_BYTES):
+    def __init__(
+        self,
+        name: str,
+        capacity: int,
+        max_bytes: int = MAX_BYTES,
+        arrived: threading.Condition | None = None,
+    ):
+        """arrived: notified of every message, for who waits for any of several mailboxes; None: its own."""
         if capacity < 1:
             raise ValueError(f"a mailbox needs a capacity of at least 1, not {capacity}")
         self.name = name
@@ -31,7 +38,7 @@ class Mailbox:
         self._max_bytes = max_bytes
         self._items: deque[Delivery] = deque()
         self._bytes = 0
-        self._arrived = threading.Condition(threading.Lock())
+        self._arrived = arrived or threading.Condition(threading.Lock())
         self.overflow = 0
         """Messages dropped because nobody fetched them in time."""
 
@@ -57,11 +64,6 @@ class Mailbox:
             delivery = self._items.popleft()
             self._bytes -= len(delivery.payload)
             return delivery
-
-    def wait(self, timeout_s: float) -> bool:
-        """Whether a message is here, after up to `timeout_s` in which one was waited for."""
-        with self._arrived:
-            return bool(self._arrived.wait_for(lambda: self._items, timeout_s))
 
     def drain(self) -> list[Delivery]:
         """Everything that is here, oldest first."""

@@ -167,9 +167,14 @@ class Bus:
 
     # -- receiving ---------------------------------------------------------------------------------------
 
-    def queue(self, topic: Topic, capacity: int = 1000) -> Mailbox:
-        """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted."""
-        mailbox = Mailbox(topic.name, capacity)
+    def queue(
+        self, topic: Topic, capacity: int = 1000, arrived: threading.Condition | None = None
+    ) -> Mailbox:
+        """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted.
+
+        arrived: notified of each; None: only the mailbox itself waits.
+        """
+        mailbox = Mailbox(topic.name, capacity, arrived=arrived)
         self._boxes.append(mailbox)
         session, name = self._lanes.session(topic.lane), self.config.name
         self._subscribe(session, topic.key(name), mailbox, topic)

@@ -38,6 +38,8 @@ class Loaded(NamedTuple):
 def load(reference: str, fits: Callable[[Any], bool] | None = None, what: str = "object") -> Any:
     """The object that `reference` names: "tanks.py:TANKS", "/abs/tanks.py:TANKS" or "mypackage.module:PLANT".
 
+    Of a file with one such object the name may be left out.
+
     A file runs once in a process, as long as it stays the same, and its folder comes last in `sys.path`: it may import
     its neighbours, and none of them replaces what is installed. A package must be installed; the current folder, and
     the folders of files that were loaded, are not looked at.
@@ -62,6 +64,8 @@ def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str 
     right = [key for key in there if fits is None or fits(getattr(module, key))]
     few = ", ".join(right[:10]) + (", ..." if len(right) > 10 else "")
     known = f"it has {few}" if right else f"it has no {what}"
+    if not name and len(right) == 1:
+        name = right[0]
     if not name:
         example = f"write {place}:{right[0] if right else 'NAME'}"
         raise ConfigError(f"{reference}: which {what} of it? {example}; {known}")

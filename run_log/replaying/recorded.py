@@ -30,6 +30,8 @@ class RecordedController:
     weights: dict[int, Entry[m.OutputWeights]]
     keyframes: dict[int, Entry[m.Keyframe]]
     sets: CertifiedSets | None
+    known: str
+    """sha256 of what it knew of the plant; empty where it does not say."""
     architecture: str
     """Of the network: file, name in it and hash of its text; empty where it is none of a stranger's."""
     complete: bool
@@ -68,6 +70,7 @@ def _recorded(run: Run, run_id: str) -> RecordedController:
         weights=_by_tick(run, run_id, topics.OUTPUT_WEIGHTS),
         keyframes=_by_tick(run, run_id, topics.KEYFRAME),
         sets=_sets(run, run_id),
+        known=infos[0].versions.get("known plant", "") if infos else "",
         architecture=infos[0].versions.get("architecture", "") if infos else "",
         # A simulation has no health; a live run that ended says so.
         complete=not run.ends_within and (not said or "stopping" in said),

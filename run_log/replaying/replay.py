@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from controller_node.certified_sets import CertifiedSets
-from controller_node.core import ControllerCore
+from controller_node.core import ControllerCore, sha256_of_known
 from network_model.registry import register
 from node_runtime.config.architecture import OwnArchitecture, register_architecture
 from node_runtime.config.loading import override
@@ -248,6 +248,11 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
     for r in recorded:
         if -1 in r.keyframes and (before := r.keyframes[-1].message.resumed):
             notes.append(f"{r.run_id}: goes on from the memory of {before}, out of a checkpoint")
+        if run.plant is not None and r.known and r.known != sha256_of_known(run.plant):
+            notes.append(
+                f"{r.run_id}: knew another plant than the recorder, whose numbers these are: its file changed between "
+                "the starts"
+            )
         if not r.complete:
             notes.append(
                 f"{r.run_id}: the log does not hold the run to its end; replayed up to tick {r.last}"

@@ -87,9 +87,9 @@ def traces(run: Run) -> Traces:
 
 def _tick_times(run: Run, motion: Trajectory) -> dict[tuple[str, int], float]:
     """Slots are on the controller's clock; the states that ticks answer tie it to the plant's."""
-    states = [s for s in run.plant_states if s.source != "hold"] or run.plant_states
+    states = [s for s in run.plant_states if s.command_seq >= 0] or run.plant_states
     sampled = {(s.run_id, s.seq): s.t for s in run.plant_states}
-    start = states[0].t - (motion.t[1] if len(motion.t) > 1 and states[0].source != "hold" else 0.0)
+    start = states[0].t - (motion.t[1] if len(motion.t) > 1 and states[0].command_seq >= 0 else 0.0)
     offsets: dict[str, list[float]] = {}
     for tick in run.ticks:
         if tick.state is not None and tick.state_verdict == "fresh":
@@ -101,7 +101,7 @@ def _tick_times(run: Run, motion: Trajectory) -> dict[tuple[str, int], float]:
 
 def _losses(run: Run, motion: Trajectory) -> np.ndarray:
     states = run.entries(topics.PLANT_STATE)
-    moving = [entry.log_time for entry in states if entry.message.source != "hold"]
+    moving = [entry.log_time for entry in states if entry.message.command_seq >= 0]
     zero = moving[0] - (motion.t[1] if len(motion.t) > 1 else 0.0) * 1e9 if moving else 0.0
     rows = [
         ((entry.log_time - zero) * 1e-9, entry.message.loss_before, entry.message.loss_after)

@@ -11,7 +11,7 @@ import pytest
 from tandem.cli import main
 from tests.helpers.paths import INSTALLED, ROOT
 
-PACKAGES = (*INSTALLED, "benchmarks", "verification", "tests")
+PACKAGES = (*INSTALLED, "benchmarks", "verification", "examples", "tests")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")])
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)

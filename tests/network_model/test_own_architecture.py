@@ -173,7 +173,12 @@ def test_what_is_wrong_with_it_is_said(
 def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions and CasADi's virtual machine round otherwise; far apart they are not."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    small = ["controller.horizon=5", "network.hidden=[4]", f"network.architecture={EXAMPLE}:GRU"]
+    small = [
+        "controller.horizon=2",
+        "network.window=2",
+        "network.hidden=[3]",
+        f"network.architecture={EXAMPLE}:GRU",
+    ]
     runs = [
         simulate(load(None, [*small, f"controller.solver.compile={mode}"]), 8) for mode in ("auto", "never")
     ]

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.live import free_endpoint
+from tests.helpers.plants.tanks import write_tanks
 from tests.helpers.wheel import build_wheel, copy_sources
 
 PATIENCE_S = 600.0
@@ -86,6 +87,24 @@ def test_with_all_extras_every_command_works(whole: Environment, command: str, l
     done = whole.tandem(tmp_path, *command.split())
     assert done.returncode == 0, done.stderr
     assert (tmp_path / leaves).exists()
+
+
+def test_a_plant_of_ones_own_in_an_empty_folder(whole: Environment, tmp_path: Path):
+    file = write_tanks(tmp_path)
+    mine = ("--set", "plant.model=tanks.py:TANKS", "--set", "rate=20", "--set", "controller.horizon=20")
+    sets = ("sets", "compute", "--kind", "box", "--set", "plant.model=tanks.py:TANKS", "--set", "rate=1")
+    for command in (("run", *mine, "--seconds", "5"), ("replay", "run.mcap"), sets):
+        done = whole.tandem(tmp_path, *command)
+        assert done.returncode == 0, done.stderr
+    shown = whole.tandem(tmp_path, "config", "show", *mine)
+    (tmp_path / "shown.toml").write_text(shown.stdout)
+    again = whole.tandem(tmp_path, "config", "show", "--config", "shown.toml")
+    assert again.stdout == shown.stdout
+    # The log is enough; what it names is not loaded.
+    file.write_text("raise SystemExit('loaded')\n")
+    for command in ("replay", "report"):
+        done = whole.tandem(tmp_path, command, "run.mcap")
+        assert done.returncode == 0, done.stderr
 
 
 def test_without_extras_router_plant_and_controller_run(bare: Environment, tmp_path: Path):

@@ -300,6 +300,20 @@ def test_old_commands_in_a_burst_are_refused() -> None:
     assert verdicts == ["stale"] * 57 + ["ok"] * 3
 
 
+def test_a_look_at_the_next_sample_changes_nothing() -> None:
+    def states(looked: bool) -> list[m.PlantState]:
+        sim, found = plant(), []
+        for k in range(6):
+            ahead = sim.look(k * PERIOD) if looked else None
+            found.append(sim.sample(k * PERIOD))
+            assert ahead in (None, found[-1])
+            if k < 3:
+                sim.command(command(k, U + 0.01 * k, [U] * 2, answers=k), (k + 0.2) * PERIOD)
+        return found
+
+    assert states(looked=True) == states(looked=False)
+
+
 def test_looking_ahead_changes_nothing() -> None:
     def states(ahead: bool) -> list[list[float]]:
         motion, rng, found = Motion(Truth(PLANT), PLANT.x0, PERIOD), np.random.default_rng(1), []
@@ -314,6 +328,25 @@ def test_looking_ahead_changes_nothing() -> None:
         return found
 
     assert states(ahead=True) == states(ahead=False)
+
+
+def test_a_sample_that_was_looked_ahead_at_is_not_worked_out_again() -> None:
+    truth, steps = Truth(PLANT), []
+
+    class Counted:
+        def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+            steps.append(dt)
+            return truth.step(x, u, dt)
+
+    motion = Motion(Counted(), PLANT.x0, PERIOD)
+    for k in range(5):
+        # On a grid of large times, rounded as a clock's are.
+        motion.read(26000.123456789 + k * PERIOD)
+        before = len(steps)
+        motion.write(PLANT.u_e, 26000.123456789 + (k + 0.1) * PERIOD)
+        motion.look_ahead()
+        assert len(steps) == before + (2 if k else 1)
+    assert len(steps) == 9
 
 
 def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:

@@ -39,7 +39,8 @@ def messages() -> list[tuple[Topic, m.Message]]:
         input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
     )  # fmt: skip
-    absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None, "target_distance": None}
+    absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
+    absent |= {"target_status": "none", "target_distance": None}
     replaced = msgspec.structs.replace
     return [
         (topics.PLANT_STATE, state),
@@ -51,7 +52,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
         (topics.TICK, tick),
         (topics.TICK, replaced(tick, state=None, weights=None, state_verdict="missing", late=False)),
         (topics.RESULT, result),
-        (topics.RESULT, replaced(result, x=[], oracle_norms=[], target_status="none", target_x=[], target_u=[], **absent)),
+        (topics.RESULT, replaced(result, x=[], oracle_norms=[], target_x=[], target_u=[], **absent)),
         (topics.TIMING, m.TickTiming(**who, solve_ms=2.5, tick_ms=3.0, lateness_ms=0.1, state_age_ms=1.0)),
         (topics.SAMPLES, m.Samples(**who, samples=[m.Sample(i, x, u, x[::-1]) for i in (3, 4)])),
         (topics.SAMPLES, m.Samples(**who, samples=[])),

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from lbmpc.plants import PLANTS
 from node_runtime.config.loading import to_tree
+from node_runtime.config.plant import spelt_out
 from node_runtime.config.sections import Config
 from tandem.cli import main
 
@@ -174,7 +176,8 @@ def test_config_show_resolves_file_then_set(tmp_path: Path):
     arguments = ["config", "show", "--config", str(file), "--set", "trainer.batch=9"]
     as_toml = tomllib.loads(tandem(*arguments).stdout)
     as_json = json.loads(tandem(*arguments, "--json").stdout)
-    expected = to_tree(Config())
+    expected = to_tree(spelt_out(Config(), PLANTS["moore_greitzer"]))
+    assert expected["controller"]["W"] is not None
     expected["rate"] = 50.0
     expected["trainer"] |= {"batch": 9, "steps": 8}
     assert as_json == expected

@@ -161,8 +161,8 @@ def test_a_plant_that_was_lost_can_be_started_again() -> None:
     simulator = Simulator(fails_after=3)
     loop = Loop(truth=simulator, **QUICK)
     assert loop.run(10).lost is not None
-    simulator.left = 100
     loop.start_again()
+    simulator.left = 100
     result = loop.run(5)
     assert result.lost is None
     assert result.u.shape == (9, 1)

@@ -277,7 +277,6 @@ class LockStep:
         if (seq + 1) % self.config.controller.keyframe_every == 0:
             self._note(topics.KEYFRAME, self.core.memory.keyframe(seq), seq)
         self.taken += 1
-        self.motion.at = None
         return true, outputs
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:

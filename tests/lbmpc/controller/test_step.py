@@ -17,6 +17,7 @@ from lbmpc.problem import build_problem
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
+from lbmpc.targets import TargetSelector
 from network_model.description import hash_layers
 from tests.helpers.science import compressor, describe, features
 
@@ -116,12 +117,13 @@ class Failing:
         x: np.ndarray,
         oracle_parameters: np.ndarray,
         warm_start: np.ndarray,
-        *,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
         first: Box | None = None,
     ) -> Solution:
         self.good -= 1
         if self.good >= 0:
-            return self.real.solve(x, oracle_parameters, warm_start)
+            return self.real.solve(x, oracle_parameters, warm_start, xr, ur)
         nothing = np.zeros_like(warm_start)
         return Solution(
             Status.NUMERICAL, nothing, nothing, nothing, np.zeros((len(nothing), 4)), np.inf, 0, 0.0, ""
@@ -207,6 +209,20 @@ def test_the_feedback_is_clipped_to_U() -> None:
     assert (result.plan >= low).all()
     assert (result.plan <= high).all()
     assert abs(float((MODEL.K @ [0.5, -0.5, 0, 0])[0])) > high[0]
+
+
+def test_the_feedback_holds_the_target() -> None:
+    """K pulls the nominal model towards it: at the target the input is its own, and beside it K's on top."""
+    controller = Controller(PROBLEM, Failing(0), targets=TargetSelector(PROBLEM, [1], [0.05]))
+    state = controller.initial_state(0)
+    _, probe = controller.step(state, seen(X, 0, None))
+    assert probe.target is not None
+    xs, us = probe.target.xu[:4], probe.target.xu[4:]
+    assert abs(xs[1] - 0.05) < 1e-6
+    for off in (np.zeros(4), np.array([0.01, -0.02, 0.0, 0.0])):
+        _, result = controller.step(state, seen(xs + off, 0, None))
+        assert result.mode == "feedback"
+        np.testing.assert_allclose(result.plan[0], us + MODEL.K @ off, atol=1e-12)
 
 
 def test_the_memory_survives_freezing_and_thawing_bit_for_bit() -> None:

@@ -12,7 +12,7 @@ import pytest
 from examples.quadrotor.quadrotor import QUADROTOR
 from examples.tanks.tanks import TANKS
 from lbmpc.model import ModelError, build_model
-from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, Truth, get_plant, true_motion
+from lbmpc.plants import PLANTS, Known, Plant, PlantDefinitionError, PlantError, Truth, get_plant, true_motion
 from lbmpc.plants.inspection import faults
 from lbmpc.plants.linear_motion import Continuous, StraightLine, discretise
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
@@ -223,6 +223,18 @@ def test_numbers_move_as_their_model_says(known: Known) -> None:
     np.testing.assert_allclose(halfway, after, atol=1e-12)
 
 
+def test_without_a_motion_within_a_period_numbers_are_a_truth_of_whole_periods() -> None:
+    a, b = WITHOUT_MOTION["a dead time"]
+    known = numbers(a, b, period=0.1)
+    truth, x, u = true_motion(known), np.array([0.3, -0.5]), np.array([-0.7])
+    np.testing.assert_allclose(truth.step(x, u, 0.1), known.A @ x + known.B @ u)
+    np.testing.assert_allclose(
+        truth.step(x, u, 0.3), truth.step(truth.step(truth.step(x, u, 0.1), u, 0.1), u, 0.1)
+    )
+    with pytest.raises(PlantError, match=r"no motion between two samples.*plant\.truth"):
+        truth.step(x, u, 0.04)
+
+
 # -- rest -------------------------------------------------------------------------------------
 
 
@@ -241,6 +253,16 @@ def test_the_state_gives_way_where_no_input_holds_an_offset() -> None:
     np.testing.assert_allclose(drift, np.zeros(2), atol=1e-14)
     # A speed of -0.3 and no more.
     np.testing.assert_allclose(known.x_e, [0.1, -0.3], atol=1e-14)
+
+
+def test_what_the_plant_is_for_moves_last() -> None:
+    """An actuator that is a period late: it holds the offset, where the first state could give way as well."""
+    a, b = [[1.05, 0.1], [0.0, 0.0]], [[0.0], [1.0]]
+    held = numbers(a, b, period=0.1, offset=[0.01, 0.0], performance=(0,))
+    np.testing.assert_allclose([*held.x_e, *held.u_e], [0.0, -0.1, -0.1], atol=1e-14)
+    shared = numbers(a, b, period=0.1, offset=[0.01, 0.0])
+    assert np.linalg.norm(shared.x_e / [1.0, 2.0]) < np.linalg.norm(held.x_e / [1.0, 2.0])
+    np.testing.assert_allclose(0.05 * shared.x_e[0] + 0.1 * shared.x_e[1], -0.01, atol=1e-14)
 
 
 def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
@@ -263,13 +285,26 @@ def test_numbers_rest_elsewhere_too() -> None:
 
 @pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
 def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
-    there = plant.changed({"q": (0.0, 25.0)}, x_e=[9.0, 14.0])
+    lower = 14.0
+    upper = plant.resting_near(x_e=[9.0, lower]).x_e[0]
+    there = plant.changed({"q": (0.0, 25.0)}, x_e=[upper, lower])
     assert there.u_max.tolist() == [25.0]
-    assert np.abs(there.x_e - [9.0, 14.0]).max() < 1.0
+    np.testing.assert_allclose(there.x_e, [upper, lower], rtol=1e-9)
     assert faults(there) == ()
     # What is shown of it can be given, and is the same to the bit.
     again = plant.changed({"q": (0.0, 25.0)}, there.x_e.tolist(), there.u_e.tolist())
     assert (again.x_e.tolist(), again.u_e.tolist()) == (there.x_e.tolist(), there.u_e.tolist())
+    with pytest.raises(
+        PlantDefinitionError, match=r"no input holds it there: x_e = .* The nearest rest is x_e = \["
+    ):
+        plant.changed({}, x_e=[upper + 0.5, lower])
+
+
+def test_numbers_do_not_rest_where_their_matrices_do_not() -> None:
+    with pytest.raises(
+        PlantDefinitionError, match=r"not an equilibrium: x_e = \[0.5, 0.0\], u_e = \[0.9\]. The nearest"
+    ):
+        numbers().changed({}, [0.5, 0.0], [0.9])
 
 
 def test_what_cannot_be_changed_is_looked_at_first() -> None:

@@ -332,13 +332,26 @@ class Failing:
         self.real, self.good = real, good
 
     def solve(
-        self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray, *, first: Box | None = None
+        self,
+        x: np.ndarray,
+        theta: np.ndarray,
+        warm: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+        first: Box | None = None,
     ) -> Solution:
         self.good -= 1
-        found = self.real.solve(x, theta, warm, first=first)
+        found = self.real.solve(x, theta, warm, xr, ur, first=first)
         return found if self.good >= 0 else replace(found, status=Status.NUMERICAL)
 
-    def prepare(self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray) -> None: ...
+    def prepare(
+        self,
+        x: np.ndarray,
+        theta: np.ndarray,
+        warm: np.ndarray,
+        xr: np.ndarray | None = None,
+        ur: np.ndarray | None = None,
+    ) -> None: ...
 
     def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
         raise AssertionError("not in this mode")

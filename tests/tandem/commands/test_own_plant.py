@@ -11,9 +11,15 @@ from typing import Any
 
 import pytest
 
+from controller_node.build import build_plant
 from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
+from run_log.replaying.replay import replay
 from tandem.cli import main
+from tandem.experiments.experiment import settings
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.study.declaration import load, resolve
+from tandem.experiments.study.plan import Job
 from tests.helpers.plants.tanks import OPTIONS, TRUE, write_tanks
 
 STEPS = ("--steps", "30")
@@ -69,6 +75,14 @@ def as_json(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> d
 
 def test_replay_with_the_file_is_equal_byte_for_byte(made: Path, capsys: pytest.CaptureFixture[str]):
     assert as_json(capsys, "replay", str(made / "run.mcap"))["equal"]
+
+
+def test_a_controller_that_knew_another_plant_than_the_recorder_is_named(made: Path):
+    run = read_run(made / "run.mcap")
+    assert replay(run).notes == []
+    assert run.plant is not None
+    run.plant = run.plant.changed({"pump": (0.0, 0.11)})
+    assert any("knew another plant than the recorder" in note for note in replay(run).notes)
 
 
 def test_a_log_says_what_was_known_and_which_file_it_was(made: Path):
@@ -205,7 +219,14 @@ def test_bounds_and_equilibrium_of_the_configuration_are_in_the_log(
         ),
         ("plant.bounds.upper=[1, 0]", "x_min of upper is 1 and x_max is 0: the lower bound must be below"),
         ("plant.x_e=[1.0]", "plant.x_e has 1 entries; tanks has 2 states (upper, lower)"),
-        ("plant.x_e=[1.5, 1.0]", "(x_e, u_e) is not an equilibrium"),
+        (
+            "plant.x_e=[1.5, 1.0]",
+            "no input holds it there: x_e = [1.5, 1.0]. The nearest rest is x_e = [1.0, 1.0]",
+        ),
+        (
+            'plant={model = "tanks.py:TANKS", x_e = [1.5, 1.0], u_e = [0.1]}',
+            "(x_e, u_e) is not an equilibrium",
+        ),
         ("plant.truth.leek=1", "tanks has no parameter 'leek'; did you mean 'leak'?"),
     ],
 )
@@ -220,6 +241,38 @@ def test_mistakes_are_named_before_anything_begins(
     for command in (["simulate", *STEPS], ["config", "show"], ["plant"], ["record"]):
         assert main([*command, *OPTIONS, "--set", setting]) == 2
         assert text.format(here=here) in said(capsys)
+
+
+EXPERIMENT = """
+name = "tanks"
+title = "Tanks"
+steps = 10
+set = { plant = { model = "tanks.py:TANKS" }, rate = 1, controller = { horizon = 10, oracle = "linear" } }
+[[group]]
+name = "all"
+title = "All"
+[[case]]
+name = "linear"
+group = "all"
+set.controller.solver.compile = "never"
+"""
+
+
+def test_an_experiment_finds_the_plant_file_beside_itself_in_all_its_processes(
+    here: Path, capsys: pytest.CaptureFixture[str]
+):
+    (here / "study").mkdir()
+    file = write_tanks(here / "study")
+    (here / "study" / "tanks.toml").write_text(EXPERIMENT)
+    found = as_json(capsys, "experiment", "study/tanks.toml", "--out", "out", "--jobs", "1")
+    (row,) = found["rows"]
+    assert row["J"] > 0.0
+    declared, where = load(here / "study" / "tanks.toml"), "study/tanks.toml"
+    (case,) = resolve(declared, build_plant(settings(declared, where)), where)
+    job = Job(config=case.config, steps=10, episodes=1, faults=Faults())
+    before = job.key
+    file.write_text(file.read_text() + "# changed\n")
+    assert job.key != before
 
 
 # -- what moves in the plant's place --------------------------------------------------------------------------

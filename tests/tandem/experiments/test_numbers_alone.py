@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from examples.quadrotor.quadrotor import QUADROTOR
 from lbmpc.plants import PLANTS, Description, Known
 from lbmpc.plants.linear_motion import discretise
 from node_runtime.config.loading import load
@@ -17,9 +18,7 @@ from protocol import codec
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow, simulate
-from tests.helpers.plants import quadrotor
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.helpers.plants.quadrotor import QUADROTOR
 
 PERIOD = 0.1
 SETTINGS = [
@@ -89,7 +88,8 @@ def test_what_needs_equations_says_so() -> None:
 
 def test_a_wind_that_is_known_leaves_no_offset() -> None:
     """The linear oracle learns nothing: where the model has the wind the plant comes to rest where it should."""
-    weights, start = quadrotor.SETTINGS[2:], "plant.x0=[-0.5,0,0,0,0,0]"
+    weights = "controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"
+    start = "plant.x0=[-0.5,0,0,0,0,0]"
     ends = {}
     for model in ("quadrotor", "windy"):
         config = configured(model, start, *weights, "rate=20", "controller.horizon=15", "plant.truth=windy")

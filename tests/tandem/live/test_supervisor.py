@@ -14,12 +14,14 @@ from pathlib import Path
 import pytest
 
 from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
 from run_log.writing.parts import part_path
 from tandem.live.files import claimed
 from tandem.terminal import Refused
 from tests.helpers.launched import PATIENCE_S, RUN, launched, small
 from tests.helpers.live import wait_for
 from tests.helpers.paths import write_namesakes
+from tests.helpers.plants.tanks import write_tanks
 
 pytestmark = pytest.mark.live
 
@@ -85,14 +87,21 @@ def test_who_does_not_read_ends_the_display_and_not_the_loop(tmp_path: Path, out
     assert (tmp_path / "run.png").exists()
 
 
-def test_files_in_the_current_folder_are_not_imported(tmp_path: Path):
+def test_of_the_current_folder_a_plant_file_is_loaded_and_nothing_else(tmp_path: Path):
     write_namesakes(tmp_path)
-    with launched(tmp_path, *small()) as run:
+    file = write_tanks(tmp_path)
+    with launched(tmp_path, *small(), "--set", "plant.model=tanks.py:TANKS") as run:
         run.hears("the first command")
         run.signal(signal.SIGINT)
         code, result = run.ends()
     assert code == 0, run.said
     assert "error" not in result
+    assert result["excess_between_samples"] == 0.0
+    file.unlink()
+    log = read_run(tmp_path / "run.mcap")
+    assert log.plant is not None
+    assert log.plant.name == "tanks"
+    assert replay(log).equal
 
 
 def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):

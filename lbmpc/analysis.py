@@ -1,0 +1,148 @@
+"""What a model is like to control: which states its inputs move, how it grows, and what its disturbance is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.model import LARGEST_GROWTH, Model
+
+STABLE = 1e-9
+"""How far above 0 rounding may leave a growth a step."""
+SETTLED = 0.2
+"""Half-widths into which the feedback has brought every state from all of X when it counts as settled."""
+MOST_STEPS = 1000
+
+Step = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+"""(x, u, dt) -> x, in plant units: the true motion."""
+
+
+def poles(matrix: np.ndarray, period: float) -> np.ndarray:
+    """Continuous-time poles, 1/s, of a discrete-time matrix (d, d), fastest growth first; -inf for a 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.log(np.linalg.eigvals(matrix).astype(complex)) / period
+    return found[np.lexsort((-found.imag, -found.real))]
+
+
+def reach(model: Model, steps: int) -> np.ndarray:
+    """How far inputs within a half-width of u_e can move each state from x_e in `steps`, half-widths, (d,)."""
+    x, u = model.plant.x_scale, model.plant.u_scale
+    total, response = np.zeros(model.d), model.B * u / x[:, None]
+    transition = model.A * x / x[:, None]
+    for _ in range(steps):
+        total += np.abs(response).sum(axis=1)
+        response = transition @ response
+    return total
+
+
+def growth(model: Model, steps: int) -> float:
+    """Factor by which the fastest mode grows over so many steps; at least 1."""
+    radius = max(1.0, float(np.abs(np.linalg.eigvals(model.A)).max()))
+    return math.exp(min(700.0, steps * math.log(radius)))
+
+
+def longest_horizon(model: Model) -> int | None:
+    """Steps over which a prediction keeps half of its digits, as `lbmpc.model.require_horizon` asks; None: any."""
+    rate = math.log(max(1.0, float(np.abs(np.linalg.eigvals(model.A)).max())))
+    return int(math.log(LARGEST_GROWTH) / rate) if rate > STABLE else None
+
+
+def settling_steps(model: Model) -> int:
+    """Steps in which u = K x brings every state of X to within `SETTLED` half-widths, without bounds on u.
+
+    A horizon as long sees all of the way to rest; a shorter one leaves the rest to the terminal cost.
+    """
+    x = model.plant.x_scale
+    closed = model.closed_loop * x / x[:, None]
+    power = np.eye(model.d)
+    for steps in range(MOST_STEPS):
+        if np.abs(power).sum(axis=1).max() <= SETTLED:
+            return steps
+        power = closed @ power
+    return MOST_STEPS
+
+
+def advised_horizon(model: Model) -> int:
+    """Steps: to rest, as far as the model's growth leaves digits; at least 1."""
+    most = longest_horizon(model)
+    return max(1, min(settling_steps(model), MOST_STEPS if most is None else most))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledDisturbance:
+    """The largest |h| found at random states of X and inputs of U."""
+
+    largest: np.ndarray
+    """(d,) per second."""
+    x: np.ndarray
+    """(d, d): row i is where state i's was found; plant units. As for `u`, (d, m)."""
+    u: np.ndarray
+    samples: int
+    lost: int
+    """Samples from which the true motion could not be followed."""
+
+
+def sample_disturbance(
+    model: Model, step: Step, count: int, rng: np.random.Generator, lost: type[Exception]
+) -> SampledDisturbance:
+    """|h| = |x+ - A x - B u| of the true motion, at `count` points of X x U; half of them on its boundary.
+
+    A side without a bound is taken a half-width from (x_e, u_e). `lost` is what `step` raises where it cannot go on.
+    """
+    plant = model.plant
+    rest, scale = np.concatenate([plant.x_e, plant.u_e]), np.concatenate([plant.x_scale, plant.u_scale])
+    low = np.concatenate([plant.x_min, plant.u_min])
+    high = np.concatenate([plant.x_max, plant.u_max])
+    low = np.where(np.isfinite(low), low, rest - scale)
+    high = np.where(np.isfinite(high), high, rest + scale)
+    share = rng.uniform(0.0, 1.0, (count, len(rest)))
+    # h of a smooth plant is largest at the corners, which random points miss where there are many states.
+    edge = rng.uniform(0.0, 1.0, share.shape) < 0.8
+    share[: count // 2] = np.where(edge, np.round(share), share)[: count // 2]
+    points = low + share * (high - low)
+    largest, missing = np.zeros(model.d), 0
+    at = np.tile(rest, (model.d, 1))
+    for point in points:
+        x, u = point[: model.d], point[model.d :]
+        try:
+            after = step(x, u, model.period)
+        except lost:
+            missing += 1
+            continue
+        h = np.abs(after - plant.x_e - model.step(x - plant.x_e, u - plant.u_e)) / model.period
+        more = h > largest
+        largest[more], at[more] = h[more], point
+    return SampledDisturbance(largest, at[:, : model.d], at[:, model.d :], count, missing)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What the safe input does to the plant."""
+
+    seconds: float
+    """How long it was followed: to the end, or until it left X."""
+    left: str
+    """The state that left X first, or why the motion could not be followed; "": it stayed."""
+
+
+def under_safe_input(
+    model: Model, step: Step, start: np.ndarray, seconds: float, lost: type[Exception]
+) -> Kept:
+    """The true motion from `start`, (d,), plant units, under the safe input and gain, renewed every period."""
+    plant, x = model.plant, np.array(start, dtype=float)
+    steps = max(1, round(seconds / model.period))
+    for k in range(steps + 1):
+        outside = np.flatnonzero((x < plant.x_min) | (x > plant.x_max))
+        if outside.size:
+            return Kept(k * model.period, plant.states[int(outside[0])])
+        u = plant.safe_input
+        if plant.safe_gain is not None:
+            u = np.clip(u + plant.safe_gain @ (x - plant.x_e), plant.u_min, plant.u_max)
+        try:
+            x = step(x, u, model.period)
+        except lost as error:
+            return Kept(k * model.period, str(error))
+    return Kept(steps * model.period, "")

@@ -1,0 +1,58 @@
+"""The samples of a log as motion: where the plant was, what acted, where it was a period later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbmpc.identification import Transitions
+from lbmpc.model import Model
+from protocol import topics
+from protocol.messages import Sample
+from run_log.errors import LogError
+from run_log.run import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """n samples as the controllers saw them, in the order of time."""
+
+    transitions: Transitions
+    missed: np.ndarray
+    """(n, d): h, what the log's own model missed the next sample by; plant units."""
+
+
+def observed(run: Run, model: Model) -> Observed:
+    """All labelled samples of a log.
+
+    A controller labels a pair of consecutive samples of one start of the plant, with the input that acted from one to
+    the next. So nothing here leads across an episode, a gap or a restart. Where several inputs acted within a period,
+    `u` is their mean, and `after` is where their mean would have led by the log's model: as h, whose rest is theirs.
+
+    Args:
+        run: a log, as read.
+        model: that of the log's controllers, which h is of.
+
+    Raises:
+        LogError: no samples, or samples of another plant.
+    """
+    plant = model.plant
+    found: dict[tuple[str, int], Sample] = {}
+    controllers = run.controllers
+    for entry in run.entries(topics.SAMPLES):
+        if not controllers or entry.message.run_id in controllers:
+            found |= {(entry.message.run_id, sample.seq): sample for sample in entry.message.samples}
+    if not found:
+        raise LogError(f"{run.path}: holds no samples{run.unreadable}")
+    order = sorted(found, key=lambda key: (controllers.index(key[0]) if controllers else 0, key[1]))
+    samples = [found[key] for key in order]
+    sizes = {(len(sample.x), len(sample.u), len(sample.h)) for sample in samples}
+    if sizes != {(plant.d, plant.m, plant.d)}:
+        raise LogError(
+            f"{run.path}: its samples are not those of a plant with the states {', '.join(plant.states)} and the "
+            f"inputs {', '.join(plant.inputs)}"
+        )
+    x, u, h = (np.array([getattr(sample, name) for sample in samples]) for name in ("x", "u", "h"))
+    after = x @ model.A.T + u @ model.B.T + h
+    return Observed(Transitions(x + plant.x_e, u + plant.u_e, after + plant.x_e), h)

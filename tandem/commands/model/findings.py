@@ -1,0 +1,166 @@
+"""What is to be said of a model before it is used: one sentence each, and whether it is well."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.analysis import (
+    SETTLED,
+    SampledDisturbance,
+    Step,
+    advised_horizon,
+    growth,
+    longest_horizon,
+    poles,
+    reach,
+    under_safe_input,
+)
+from lbmpc.model import Model, ModelError, require_horizon
+from lbmpc.plants import Known, PlantError
+from lbmpc.plants.matrices import unmoved_modes
+from tandem.model_tables import percent, poles_text
+
+Verdict = Literal["ok", "note", "fault"]
+FOLLOWED = 10.0
+"""Seconds for which the safe input is followed, or two horizons if that is longer."""
+WEAK = 0.1
+"""Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A "note" is worth a look, with a "fault" nothing works."""
+
+    verdict: Verdict
+    subject: str
+    text: str
+
+
+def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
+    """Of a model for which there is a controller.
+
+    Args:
+        model: at the rate.
+        horizon: N of the configuration.
+        x0: (d,), plant units.
+        step: the true motion; where none is known, the model's own.
+    """
+    yield _stability(model)
+    yield _inputs(model, horizon)
+    yield _horizon(model, horizon)
+    yield Finding(
+        "ok", "feedback K", f"poles of A + BK, 1/s: {poles_text(poles(model.closed_loop, model.period))}"
+    )
+    yield Finding("ok", "terminal cost", "P pays for every stage after the horizon")
+    yield _start(model, x0)
+    yield from _safe(model, horizon, x0, step)
+
+
+def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) -> Finding:
+    """W, (d,) per second, against what was found of h."""
+    lost = (
+        f"; from {found.lost} of {found.samples} states the motion cannot be followed" if found.lost else ""
+    )
+    above = [
+        f"{plant.states[i]} by a factor of {_factor(found.largest[i], W[i])}"
+        for i in np.flatnonzero(found.largest > W * (1 + 1e-9) + 1e-9 * plant.x_scale)
+    ]
+    if not above:
+        verdict: Verdict = "note" if found.lost else "ok"
+        return Finding(verdict, "W", f"holds h at {found.samples} points of X and U{lost}")
+    return Finding(
+        "note",
+        "W",
+        f"h is larger somewhere in X and U: {', '.join(above)}. What tightening promises holds where h is in W{lost}",
+    )
+
+
+def _factor(largest: float, given: float) -> str:
+    return f"{largest / given:.2g}" if given > 0.0 else "infinity (W is 0)"
+
+
+def _stability(model: Model) -> Finding:
+    found = poles(model.A, model.period)
+    text = f"poles, 1/s: {poles_text(found)}"
+    if found[0].real > 1e-9 * abs(found).max():
+        return Finding("ok", "unstable", f"{text}; by itself it grows e-fold in {1.0 / found[0].real:.3g} s")
+    if found[0].real >= -1e-9 * abs(found).max():
+        return Finding("ok", "marginally stable", f"{text}; by itself it does not come back")
+    return Finding("ok", "stable", f"{text}; by itself it comes back")
+
+
+def _inputs(model: Model, horizon: int) -> Finding:
+    plant = model.plant
+    unmoved = [
+        " and ".join(plant.states[i] for i in mode.states)
+        for mode in unmoved_modes(plant.A, plant.B, plant.x_scale, plant.u_scale)
+    ]
+    if unmoved:
+        text = f"no input moves {', nor '.join(unmoved)}, which decays by itself"
+        return Finding("note", "controllability", text)
+    weak = [
+        f"{state} by {percent(moved)}"
+        for state, moved in zip(plant.states, reach(model, horizon), strict=True)
+        if moved < WEAK
+    ]
+    if weak:
+        return Finding(
+            "note",
+            "controllability",
+            f"full inputs hardly move {', '.join(weak)} of a half-width within the horizon: a longer one would help",
+        )
+    return Finding("ok", "controllability", "the inputs move every state")
+
+
+def _horizon(model: Model, horizon: int) -> Finding:
+    seconds, advised = horizon * model.period, advised_horizon(model)
+    try:
+        require_horizon(model, horizon)
+    except ModelError as error:
+        return Finding("fault", "horizon", str(error))
+    grown, most = growth(model, horizon), longest_horizon(model)
+    text = f"{horizon} steps ({seconds:.3g} s)"
+    if grown > 1.0 + 1e-6:
+        limit = "" if most is None else f", and {most} steps are the most"
+        text += f", in which a prediction grows by {_power(grown)}{limit}"
+    text += (
+        f"; advised: {advised} steps ({advised * model.period:.3g} s), in which K brings all of X to within "
+        f"{SETTLED:g} half-widths"
+    )
+    return Finding("note" if 3 * horizon < advised else "ok", "horizon", text)
+
+
+def _power(factor: float) -> str:
+    return f"{factor:.2g}" if factor < 1e3 else f"10^{math.log10(factor):.1f}"
+
+
+def _start(model: Model, x0: np.ndarray) -> Finding:
+    plant = model.plant
+    outside = [
+        f"{plant.states[i]} = {x0[i]:g}, X is [{plant.x_min[i]:g}, {plant.x_max[i]:g}]"
+        for i in np.flatnonzero((x0 < plant.x_min) | (x0 > plant.x_max))
+    ]
+    if outside:
+        return Finding("note", "x0", f"outside of X: {'; '.join(outside)}")
+    return Finding("ok", "x0", "in X")
+
+
+def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
+    seconds = max(FOLLOWED, 2.0 * horizon * model.period)
+    law = "the safe input" if model.plant.safe_gain is None else "the safe input with its gain"
+    for where, start in (("x0", x0), ("x_e", model.plant.x_e)):
+        kept = under_safe_input(model, step, start, seconds, PlantError)
+        if not kept.left:
+            yield Finding("ok", f"safe from {where}", f"{law} keeps it in X for {seconds:.3g} s")
+        elif kept.left in model.plant.states:
+            text = f"under {law} {kept.left} leaves X after {kept.seconds:.3g} s"
+            yield Finding("note", f"safe from {where}", text)
+        else:
+            yield Finding(
+                "note", f"safe from {where}", f"under {law}, after {kept.seconds:.3g} s: {kept.left}"
+            )

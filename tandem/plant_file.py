@@ -1,0 +1,92 @@
+"""A plant of numbers as a file of Python, for a person to read and to change."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lbmpc.plants import Known
+from tandem.terminal import Refused
+
+DIGITS = 12
+"""Of a matrix: more than any log tells, and enough for what a horizon makes of them."""
+COMMENTS = {
+    "A": "x+ = A x + B u in deviations from (x_e, u_e)",
+    "offset": "x+ - x at (x_e, u_e): Tandem takes the nearest point of rest for (x_e, u_e)",
+    "W": "half-widths of what A and B leave out, per second",
+    "period": "s: A and B hold at this rate only",
+}
+"""What a reader is told of a field, on the line before it."""
+
+
+def require_new(file: Path) -> None:
+    """Raises `Refused` for a plant file that cannot be written there."""
+    if file.suffix != ".py":
+        raise Refused(f"{file}: the name of a plant file ends in .py")
+    if os.path.lexists(file):
+        raise Refused(f"{file}: exists already, and is not overwritten; choose another name")
+    if not file.absolute().parent.is_dir():
+        raise Refused(f"{file}: there is no folder {file.absolute().parent}")
+
+
+def write_new(file: Path, text: str) -> None:
+    """Raises `Refused` where that cannot be; nothing is overwritten."""
+    require_new(file)
+    try:
+        with file.open("x", encoding="utf-8") as opened:
+            opened.write(text)
+    except OSError as error:
+        raise Refused(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def source(fields: Mapping[str, Any], about: Sequence[str], name: str = "PLANT") -> str:
+    """The text of a file in which `name` is `Known.from_matrices(**fields)`.
+
+    Args:
+        fields: arguments of `Known.from_matrices`: arrays, tuples, mappings, texts, numbers; None is left out.
+        about: lines of the file's docstring.
+        name: of the plant in the file.
+    """
+    lines = ['"""' + "\n".join(about).replace("\\", "/").replace('"""', "'''") + '"""', ""]
+    given = {key: _text(value, 4) for key, value in fields.items() if value is not None}
+    if any("inf" in text for key, text in given.items() if key.endswith(("_min", "_max"))):
+        lines += ["from math import inf", ""]
+    lines += ["from lbmpc.plants import Known", "", f"{name} = Known.from_matrices("]
+    for key, text in given.items():
+        if key in COMMENTS:
+            lines.append(f"    # {COMMENTS[key]}")
+        lines.append(f"    {key}={text},")
+    return "\n".join([*lines, ")", ""])
+
+
+def shared_fields(known: Known) -> dict[str, Any]:
+    """What a model with other matrices has in common with this one, as `from_matrices` takes it; names come first."""
+    names = (
+        *("name", "states", "inputs", "units", "x_e", "u_e", "x_min", "x_max", "u_min", "u_max"),
+        *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
+    )
+    fields = {key: getattr(known, key) for key in names}
+    return fields | {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+
+
+def _text(value: Any, indent: int) -> str:
+    """Python for a value: matrices a row a line, floats with `DIGITS` digits, texts in double quotes."""
+    if isinstance(value, np.ndarray) and value.ndim == 2:
+        pad = " " * (indent + 4)
+        rows = "".join(f"{pad}{_text(row, 0)},\n" for row in value)
+        return f"[\n{rows}{' ' * indent}]"
+    if isinstance(value, np.ndarray | list):
+        return f"[{', '.join(_text(one, 0) for one in np.asarray(value).tolist())}]"
+    if isinstance(value, Mapping):
+        pairs = (f"{_text(key, 0)}: {_text(one, 0)}" for key, one in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, tuple):
+        return f"({', '.join(_text(one, 0) for one in value)}{',' if len(value) == 1 else ''})"
+    if isinstance(value, float):
+        return repr(float(f"{value:.{DIGITS}g}"))
+    return json.dumps(value) if isinstance(value, str) else repr(value)

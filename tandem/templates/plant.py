@@ -1,0 +1,73 @@
+"""A plant: a cart that is pushed along a rail. Change everything; this is a start that runs as it is.
+
+    tandem model check THIS_FILE:PLANT
+    tandem run --set plant.model=THIS_FILE:PLANT
+
+Below is the same cart twice: as PLANT by its equations, and as MATRICES by numbers alone. Keep the one that you need.
+"""
+
+import casadi as ca
+
+from lbmpc.plants import Known, Plant
+
+PARAMETERS = {"mass": 1.5, "friction": 0.6, "drag": 0.8}
+"""kg, N s/m, N s^2/m^2. A true plant may have others: tandem run --set plant.truth.drag=1.2"""
+
+
+def equations(mass, friction, drag):
+    """dx/dt of a cart with these parameters, in CasADi's operations: ca.sin, not math.sin, and ca.if_else, not if."""
+
+    def rhs(x, u):
+        speed, force = x[1], u[0]
+        # Drag has no slope at rest: the linear model does not know it, and the network learns it.
+        return [speed, (force - friction * speed - drag * speed * ca.fabs(speed)) / mass]
+
+    return rhs
+
+
+PLANT = Plant(
+    name="cart",
+    # Names are for plots, tables and messages; units for a person, "t" is time.
+    states=["position", "speed"],
+    inputs=["force"],
+    units={"position": "m", "speed": "m/s", "force": "N", "t": "s"},
+    rhs=equations(**PARAMETERS),
+    equations=equations,
+    parameters=PARAMETERS,
+    # Where the plant rests and is wanted: dx/dt = 0 there.
+    x_e=[0.0, 0.0],
+    u_e=[0.0],
+    # Bounds that the controller keeps. Infinite where there is none: then scale={"speed": 1.0} says what counts as 1.
+    x_min=[-1.0, -1.0],
+    x_max=[1.0, 1.0],
+    u_min=[-3.0],
+    u_max=[3.0],
+    # What the linear model misses, per second, as half-widths of a box: `tandem model check` shows how large it is.
+    W=[0.01, 0.1],
+    # Where a simulation starts.
+    x0=[-0.8, 0.0],
+    # What the machine does by itself when nobody commands it. For a plant that this would not hold, also
+    # safe_gain=[[..]]: then safe_input + safe_gain (x - x_e).
+    safe_input=[0.0],
+    # States that reports are about, by index; and what the kernel of the oracle l2nw sees.
+    performance=[0],
+    kernel=["speed", "force"],
+)
+
+# Where there are no equations: dx/dt = A x + B u in deviations from (x_e, u_e), or x+ = A x + B u with period=0.05.
+# What is not given has a default. `tandem identify LOG` finds A, B and W from a log. In a simulation the plant moves as
+# the matrices say, or as another one does:
+#     tandem run --set plant.model=THIS_FILE:MATRICES --set plant.truth=THIS_FILE:PLANT
+MATRICES = Known.from_matrices(
+    A=[[0.0, 1.0], [0.0, -0.4]],
+    B=[[0.0], [0.667]],
+    W=[0.01, 0.1],
+    name="cart",
+    states=["position", "speed"],
+    inputs=["force"],
+    x_min=[-1.0, -1.0],
+    x_max=[1.0, 1.0],
+    u_min=[-3.0],
+    u_max=[3.0],
+    x0=[-0.8, 0.0],
+)

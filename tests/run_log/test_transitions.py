@@ -1,0 +1,82 @@
+"""The samples of a log as motion: nothing leads across an episode, a gap or a restart."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from controller_node.build import build_model
+from node_runtime.config.loading import override
+from node_runtime.config.sections import Config
+from protocol import topics
+from run_log.errors import LogError
+from run_log.reading.transitions import observed
+from run_log.run import Entry, Run
+from tandem.experiments.simulation.lockstep import simulate
+from tests.helpers.plants.pendulum import pendulum
+
+SETTINGS = ["controller.oracle=constant", "controller.solver.compile=never", "trainer.enabled=false"]
+
+
+@pytest.fixture(scope="module")
+def episodes() -> Run:
+    return simulate(override(Config(), SETTINGS), 12, episodes=2)
+
+
+def test_each_is_a_step_of_the_true_motion_and_none_leads_from_one_episode_to_the_next(episodes: Run) -> None:
+    model = build_model(episodes.config)
+    seen = observed(episodes, model)
+    states = episodes.plant_states
+    # Behind its last tick an episode has one more sample, which no controller saw.
+    pairs = [(a, b) for a, b in pairwise(states) if a.run_id == b.run_id and b.seq < 12]
+    assert len(pairs) == 22
+    np.testing.assert_allclose(seen.transitions.x, [a.x for a, _b in pairs], atol=1e-13)
+    np.testing.assert_allclose(seen.transitions.u, [b.applied for _a, b in pairs], atol=1e-13)
+    np.testing.assert_allclose(seen.transitions.after, [b.x for _a, b in pairs], atol=1e-13)
+    missed = (
+        seen.transitions.after
+        - model.plant.x_e
+        - np.array(
+            [
+                model.step(np.array(a.x) - model.plant.x_e, np.array(b.applied) - model.plant.u_e)
+                for a, b in pairs
+            ]
+        )
+    )
+    np.testing.assert_allclose(seen.missed, missed, atol=1e-13)
+
+
+def test_a_sample_that_is_logged_twice_counts_once_and_order_is_that_of_time(episodes: Run) -> None:
+    model = build_model(episodes.config)
+    entries = episodes.entries(topics.SAMPLES)
+    again = Run(
+        episodes.path,
+        episodes.config,
+        streams={**episodes.streams, topics.SAMPLES.name: [*entries[::-1], *entries]},
+    )
+    np.testing.assert_array_equal(
+        observed(again, model).transitions.x, observed(episodes, model).transitions.x
+    )
+
+
+def test_samples_of_strangers_are_left_out(episodes: Run) -> None:
+    model = build_model(episodes.config)
+    first = episodes.entries(topics.SAMPLES)[0]
+    foreign = msgspec.structs.replace(first.message, run_id="controller-stranger")
+    streams = {
+        **episodes.streams,
+        topics.SAMPLES.name: [*episodes.entries(topics.SAMPLES), Entry(0, b"", foreign)],
+    }
+    assert len(observed(Run(episodes.path, episodes.config, streams=streams), model).transitions) == 22
+
+
+def test_a_log_without_samples_and_one_of_another_plant_are_refused(episodes: Run) -> None:
+    with pytest.raises(LogError, match="holds no samples"):
+        observed(Run(episodes.path, episodes.config), build_model(episodes.config))
+    with pytest.raises(
+        LogError, match="not those of a plant with the states angle, rate and the inputs torque"
+    ):
+        observed(episodes, pendulum())

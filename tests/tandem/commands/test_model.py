@@ -1,0 +1,358 @@
+"""`tandem model`: a start that runs as it is, and a look at a plant that names all that is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from examples.tanks.tanks import TANKS
+from lbmpc.plants import PLANTS, Known, Plant
+from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
+from tandem.cli import main
+from tandem.commands.model.check import ModelCheck
+from tests.helpers.plants.integrator import INTEGRATOR
+from tests.helpers.plants.pendulum import PENDULUM
+from tests.lbmpc.plants.test_inspection import FAULTY
+from tests.lbmpc.plants.test_known import FAULTY as FAULTY_NUMBERS
+
+Capture = pytest.CaptureFixture[str]
+TEN = ("--rate", "10", "--set", "controller.horizon=20")
+
+
+@pytest.fixture(autouse=True)
+def a_small_terminal_in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def mine(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Make a plant known as "mine"."""
+    return lambda plant: monkeypatch.setitem(PLANTS, "mine", plant)
+
+
+def checked(capsys: Capture, *words: str) -> tuple[int, dict[str, Any]]:
+    code = main(["model", "check", *words, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def refused(capsys: Capture, plant: str) -> str:
+    """The faults, without the time that parsing a command line takes."""
+    assert ModelCheck(plant=plant, json=True).run() == 2
+    return " ".join(json.loads(capsys.readouterr().out)["faults"])
+
+
+def said(capsys: Capture, *words: str) -> tuple[int, str]:
+    """As one line, for a table breaks its sentences."""
+    code = main(["model", "check", *words])
+    seen = capsys.readouterr()
+    assert all(len(line) <= 80 for line in seen.out.splitlines())
+    return code, " ".join((seen.out + seen.err).split())
+
+
+# -- what is well ----------------------------------------------------------------------------
+
+
+def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> None:
+    mine(TANKS)
+    code, text = said(capsys, "mine", "--rate", "0.2", "--set", "controller.horizon_seconds=120")
+    assert code == 0
+    assert "tanks: equations, linearised at (x_e, u_e); a sample every 5 s" in text
+    assert "poles, 1/s: -0.0125, -0.0221; by itself it comes back" in text
+    assert "the inputs move every state" in text
+    assert "24 steps (120 s); advised:" in text
+    assert "holds h at 500 points of X and U" in text
+    assert "the safe input keeps it in X for 240 s" in text
+    for word in ("wrong", "look"):
+        assert word not in text
+
+
+def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
+    limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
+    mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
+    assert "poles, 1/s: 0, 0; by itself it does not come back" in said(capsys, "mine")[1]
+
+
+def test_the_numbers_of_the_json_are_those_of_the_model(mine: Any, capsys: Capture) -> None:
+    mine(PENDULUM)
+    code, found = checked(capsys, "mine", *TEN)
+    assert code == 0
+    assert (found["faults"], found["period"], found["horizon"]) == ([], 0.1, 20)
+    np.testing.assert_allclose(found["poles"], [[2.0, 0.0], [-2.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(
+        np.abs(np.linalg.eigvals(np.array(found["A"]) + np.array(found["B"]) @ np.array(found["K"]))) < 1.0,
+        True,
+    )
+    assert (found["x_scale"], found["u_scale"], found["W"]) == ([1.0, 2.0], [3.0], [0.01, 0.1])
+    assert found["h_sampled"][1] > 0.5
+    assert found["h_bound"] is None
+
+
+def test_a_proved_bound_holds_what_was_found(mine: Any, capsys: Capture) -> None:
+    mine(PENDULUM)
+    _code, found = checked(capsys, "mine", *TEN, "--prove")
+    assert (np.array(found["h_bound"]) >= np.array(found["h_sampled"]) * (1.0 - 1e-9)).all()
+    assert found["h_bound"][1] < 1.1 * found["h_sampled"][1]
+    wider = ("--set", f"controller.W={[1.01 * bound for bound in found['h_bound']]}")
+    _code, found = checked(capsys, "mine", *TEN, "--prove", *wider)
+    assert "W" not in found["notes"]
+    assert found["W"][1] > found["h_bound"][1]
+    _code, found = checked(capsys, "mine", *TEN, "--prove", "--set", "plant.truth.stiffness=5.0")
+    assert found["h_bound"] is None
+    mine(replace(INTEGRATOR, x_max=np.array([1.0, np.inf])))
+    code, text = said(capsys, "mine", "--prove")
+    assert code == 0
+    assert "h cannot be bounded: integrator: the region has speed" in text
+
+
+def test_matrices_in_discrete_time_are_looked_at_at_their_own_rate(mine: Any, capsys: Capture) -> None:
+    known = PENDULUM.known()
+    A, B = np.array([[1.0, 0.02], [0.08, 1.0]]), np.array([[0.0], [0.02]])
+    mine(replace(known, A=A, B=B, period=0.02))
+    code, found = checked(capsys, "mine")
+    assert (code, found["period"]) == (0, 0.02)
+    assert found["A"] == A.tolist()
+    # Of numbers that are their own truth h is zero, and no figure.
+    assert found["h_sampled"] is None
+    code, found = checked(capsys, "mine", "--rate", "10")
+    assert code == 2
+    assert "take rate = 50" in found["faults"][0]
+
+
+# -- what is worth a look --------------------------------------------------------------------
+
+
+def beside(**extra: Any) -> Plant:
+    """A pendulum beside a temperature that cools down by itself."""
+    fields: dict[str, Any] = {
+        "states": ("angle", "rate", "heat"),
+        "units": {**PENDULUM.units, "heat": "K"},
+        "rhs": lambda x, u: [x[1], 4.0 * ca.sin(x[0]) + u[0], -0.7 * x[2]],
+        "parameters": {},
+        "equations": None,
+        "x_e": np.zeros(3),
+        "x_min": np.array([-1.0, -2.0, -300.0]),
+        "x_max": np.array([1.0, 2.0, 300.0]),
+        "W": np.zeros(3),
+        "x0": np.zeros(3),
+    }
+    return replace(PENDULUM, **{**fields, **extra})
+
+
+NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
+    "W that h exceeds": (PENDULUM, TEN, "W", r"h is larger somewhere in X and U: .*rate by a factor of \d"),
+    "W of zero": (beside(), TEN, "W", r"angle by a factor of infinity \(W is 0\)"),
+    "x0 outside of X": (
+        replace(PENDULUM, x0=np.array([1.5, 0.0])),
+        TEN,
+        "x0",
+        r"outside of X: angle = 1.5, X is \[-1, 1\]",
+    ),
+    "a safe input that does not keep it": (
+        PENDULUM,
+        TEN,
+        "safe from x0",
+        "under the safe input angle leaves X after 0.7 s",
+    ),
+    "a safe input that leads out of the equations": (
+        replace(TANKS, safe_input=np.zeros(1), x_min=np.array([-9.0, -9.0])),
+        ("--rate", "0.2"),
+        "safe from x_e",
+        "under the safe input, after .* upper level h1 is",
+    ),
+    "a state that no input moves": (
+        beside(),
+        TEN,
+        "controllability",
+        "no input moves heat, which decays by itself",
+    ),
+    "a state that is hardly moved": (
+        replace(TANKS, u_min=TANKS.u_e - 0.1, u_max=TANKS.u_e + 0.1),
+        ("--rate", "0.2", "--set", "controller.horizon=2"),
+        "controllability",
+        "full inputs hardly move h1 by .* h2 by .* a longer one would help",
+    ),
+    "a short horizon": (
+        TANKS,
+        ("--rate", "0.2", "--set", "controller.horizon=2"),
+        "horizon",
+        r"2 steps \(10 s\); advised: \d+ steps",
+    ),
+    "states from which nothing can be followed": (
+        replace(TANKS, x_min=np.array([-9.0, 1.0])),
+        ("--rate", "0.2"),
+        "W",
+        r"from \d+ of 500 states the motion cannot be followed",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NOTES)
+def test_what_is_worth_a_look_is_said_and_no_fault(case: str, mine: Any, capsys: Capture) -> None:
+    plant, words, subject, sentence = NOTES[case]
+    mine(plant)
+    code, found = checked(capsys, "mine", *words)
+    assert (code, found["faults"]) == (0, [])
+    assert re.search(sentence, found["notes"][subject])
+
+
+# -- what is wrong ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", FAULTY)
+def test_every_fault_of_equations_is_named(case: str, mine: Any, capsys: Capture) -> None:
+    plant, message = FAULTY[case]
+    mine(plant)
+    assert re.search(message, refused(capsys, "mine"))
+
+
+@pytest.mark.parametrize("case", FAULTY_NUMBERS)
+def test_every_fault_of_numbers_is_named_though_the_file_raises_while_it_is_read(
+    case: str, capsys: Capture
+) -> None:
+    given, message = FAULTY_NUMBERS[case]
+    arguments = {
+        **{"a": [[0.0, 1.0], [-2.0, -0.3]], "b": [[0.0], [1.0]], "W": [0.01, 0.1]},
+        **{"x_min": [-1.0, -2.0], "x_max": [1.0, 2.0], "u_min": [-3.0], "u_max": [3.0]},
+        **given,
+    }
+    A, B = arguments.pop("a"), arguments.pop("b")
+    Path("plant.py").write_text(
+        "from math import inf, nan\nfrom lbmpc.plants import Known\n"
+        f"PLANT = Known.from_matrices({A!r}, {B!r}, **{arguments!r})\n"
+    )
+    assert re.search(message, refused(capsys, "plant.py:PLANT"))
+
+
+def test_all_faults_of_a_file_are_named_at_once(capsys: Capture) -> None:
+    Path("plant.py").write_text(
+        "from lbmpc.plants import Known\n"
+        "PLANT = Known.from_matrices([[0.0]], [[1.0]], W=[-1.0], x_min=[2.0], x_max=[1.0], "
+        "performance=(3,), kernel=('w',), poles=(1.0,))\n"
+    )
+    code, found = checked(capsys, "plant.py:PLANT")
+    assert code == 2
+    assert [fault.split()[0] for fault in found["faults"]] == [
+        *("x_min", "u_min", "W", "poles", "performance", "kernel"),
+    ]
+    code, text = said(capsys, "plant.py:PLANT")
+    assert "performance has 3" in text
+
+
+MISTAKES: dict[str, tuple[str | None, tuple[str, ...], str]] = {
+    "no such file": (None, ("plant.py:PLANT",), "no such file"),
+    "no such name": ("x = 1", ("plant.py:PLANT",), "has nothing called 'PLANT'; it has no plant"),
+    "no plant": ("PLANT = 1", ("plant.py:PLANT",), "PLANT is no plant but of type int"),
+    "not Python": ("PLANT =", ("plant.py:PLANT",), "line 1: not valid Python"),
+    "code that fails": ("1 / 0", ("plant.py:PLANT",), "line 1: ZeroDivisionError"),
+    "no such plant of Tandem": (None, ("moore_greitser",), "did you mean 'moore_greitzer'?"),
+    "no such rate": (None, ("moore_greitzer", "--rate", "-1"), "--rate"),
+    "a horizon that leaves no digits": (
+        None,
+        ("unstable", "--rate", "10", "--set", "controller.horizon=200"),
+        "unstable: over a horizon of 200 steps .* What makes sense: at most 92 steps",
+    ),
+    "poles that cannot be placed": (
+        None,
+        ("twice", "--rate", "10"),
+        "no stabilising K at a period of 0.1 s: with one input no pole may be there twice",
+    ),
+    "no terminal cost": (
+        None,
+        ("moore_greitzer", "--set", "controller.terminal=published", "--rate", "2"),
+        "the terminal cost 'published' at a period of 0.5 s",
+    ),
+    "weights of another plant": (
+        None,
+        ("moore_greitzer", "--set", "controller.Q=[1.0]"),
+        "controller.Q has 1 entries",
+    ),
+    "a truth that is none": (
+        None,
+        ("moore_greitzer", "--set", "plant.truth=plant.py:TRUE"),
+        "plant.truth: .*no such file",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mistake_ends_with_one_message(case: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    text, words, message = MISTAKES[case]
+    monkeypatch.setitem(PLANTS, "unstable", replace(PENDULUM, name="unstable"))
+    monkeypatch.setitem(PLANTS, "twice", replace(PENDULUM, poles=(-3.0, -3.0)))
+    if text is not None:
+        Path("plant.py").write_text(text)
+    code, seen = said(capsys, *words)
+    assert code == 2
+    assert re.search(message, seen)
+    assert "Traceback" not in seen
+
+
+# -- a start ---------------------------------------------------------------------------------
+
+
+def test_a_new_plant_file_is_looked_at_runs_converges_and_replays(capsys: Capture) -> None:
+    assert main(["model", "new", "my.py"]) == 0
+    assert "tandem model check my.py:PLANT" in capsys.readouterr().out
+    assert "tandem run --set plant.model=my.py:PLANT" in Path("my.py").read_text()
+    for name in ("PLANT", "MATRICES"):
+        code, found = checked(capsys, f"my.py:{name}")
+        assert (code, found["faults"]) == (0, [])
+    quick = ["--oracle", "constant", "--set", "controller.solver.compile=never", "--json"]
+    model = ["--set", "plant.model=my.py:PLANT"]
+    for words in (model, ["--set", "plant.model=my.py:MATRICES", "--set", "plant.truth=my.py:PLANT"]):
+        log = f"run{len(words)}.mcap"
+        assert main(["simulate", *words, *quick, "--steps", "110", "--log", log]) == 0
+        summary = json.loads(capsys.readouterr().out)
+        assert summary["settled_s"] is not None
+        assert (summary["constraint_violations"], summary["fallback_ticks"]) == (0, 0)
+    Path("my.py").unlink()
+    assert replay(read_run("run2.mcap")).equal
+
+
+def test_both_plants_of_a_new_file_are_the_same_cart(capsys: Capture) -> None:
+    main(["model", "new", "my.py"])
+    capsys.readouterr()
+    equations, numbers = (checked(capsys, f"my.py:{name}")[1] for name in ("PLANT", "MATRICES"))
+    for key in ("A", "B", "x_scale", "u_scale", "W"):
+        np.testing.assert_allclose(equations[key], numbers[key], rtol=1e-3, atol=1e-12)
+
+
+def test_a_new_plant_file_overwrites_nothing(tmp_path: Path, capsys: Capture) -> None:
+    Path("my.py").write_text("kept")
+    for name, message in (
+        ("my.py", "my.py: exists already, and is not overwritten"),
+        ("my.txt", "ends in .py"),
+        ("away/my.py", "there is no folder"),
+        (f"{'x' * 300}.py", "File name too long"),
+    ):
+        assert main(["model", "new", name]) == 2
+        assert message in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["my.py"]
+    assert Path("my.py").read_text() == "kept"
+
+
+def test_a_strange_name_does_not_spoil_the_file(capsys: Capture) -> None:
+    strange = 'my """\\N.py'
+    assert main(["model", "new", strange]) == 0
+    capsys.readouterr()
+    assert checked(capsys, f"{strange}:PLANT")[0] == 0
+
+
+def test_the_name_may_be_left_out_where_there_is_one(capsys: Capture) -> None:
+    main(["model", "new", "my.py"])
+    capsys.readouterr()
+    code, text = said(capsys, "my.py")
+    assert code == 2
+    assert "which plant of it? write" in text
+    assert "it has PLANT, MATRICES" in text
+    Path("one.py").write_text(Path("my.py").read_text().partition("# Where there are no equations")[0])
+    assert checked(capsys, "one.py")[0] == 0
