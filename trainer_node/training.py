@@ -163,7 +163,8 @@ class Trainer:
 
     def _noise_of(self, variance: np.ndarray) -> float:
         """What labels of this variance, (d,), add to the loss. Raises `ValueError` for what is none."""
-        noise = float((variance / np.array(self.description.output_scale) ** 2).sum())
+        with np.errstate(over="ignore"):
+            noise = float((variance / np.array(self.description.output_scale) ** 2).sum())
         if variance.shape != (self.description.states,) or not (
             (variance >= 0.0).all() and math.isfinite(noise)
         ):

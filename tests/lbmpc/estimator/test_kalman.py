@@ -99,7 +99,7 @@ def test_without_noise_the_estimate_is_the_sample() -> None:
         before = motion.x
         motion.go()
         memory, estimate = kalman.update(memory, Measured(motion.x, 7, motion.number, motion.u, ()))
-        np.testing.assert_allclose(estimate.x, motion.x, atol=1e-7)
+        np.testing.assert_allclose(estimate.x / SCALE, motion.x / SCALE, atol=1e-6)
         np.testing.assert_allclose(MODEL.label(before, motion.u, estimate.reached), H, atol=1e-6)
 
 
