@@ -11,7 +11,7 @@ whenever |phi| >= 1, which the leading 1 of phi guarantees.
 
     (i)    V_t <= 4 sum Wbar_i^2
     (ii)   V_{t+1} - V_t  <=  sum_i gamma_i / |phi|^2 (eps_i^2 - (1 - gamma_i) xtilde_i^2)
-    (iii)  where eps_i^2 <= 9 r_i for all i:  V_{t+1} - V_t  <=  -(1 - gamma) / gamma sum_i (gamma_i xtilde_i)^2 / |phi|^2
+    (iii)  V_{t+1} - V_t  <=  -(1 - gamma) / gamma sum_i (gamma_i xtilde_i)^2 / |phi|^2  where all eps_i^2 <= 9 r_i
 
 Proof of (ii): K_t' phi - W*' phi = xtilde + eps, so that a column moves by gamma_i / |phi|^2 (-2 xtilde_i (xtilde_i +
 eps_i) + gamma_i xtilde_i^2), and -2 xtilde_i eps_i <= xtilde_i^2 + eps_i^2; the projection brings nothing farther from

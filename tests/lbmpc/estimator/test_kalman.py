@@ -212,6 +212,6 @@ def test_a_name_that_is_no_state_is_refused(text: str, error: str) -> None:
 
 def test_the_configuration_says_it_in_a_persons_words() -> None:
     config = load(None, ["rate=100", "estimator.kind=kalman", 'estimator.measured=["speed"]'])
-    with pytest.raises(ConfigError, match="measured = speed: .* never tells of position"):
+    with pytest.raises(ConfigError, match=r"measured = speed: .* never tells of position"):
         build_estimator(config, chain())
     assert build_estimator(load(None, []), chain()) is None

@@ -216,8 +216,8 @@ def test_who_learns_is_not_told_of_a_drift() -> None:
 def test_faults_that_do_not_fit_the_plant_are_named() -> None:
     with pytest.raises(ConfigError, match=r"faults\.drift: .* no parameter 'bta'; did you mean 'beta'"):
         follow(config(), 5, Faults(drift=Drift(to={"bta": 2.0}, at=0.0)))
-    with pytest.raises(ConfigError, match="2 entries, the plant has 4 states"):
-        follow(config(), 5, Faults(noise=[0.1, 0.1]))
+    with pytest.raises(ConfigError, match=r"plant\.sensors\.noise: .* no state 'zz'; did you mean 'z'"):
+        follow(config("plant.sensors.noise={zz=0.1}"), 5)
 
 
 def test_lemma_1_holds_on_a_real_run() -> None:
