@@ -27,6 +27,7 @@ from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode
 from lbmpc.sets.certificate import require_match as require_model
 from lbmpc.sets.motion import over_any_delay
 from node_runtime.config.plant import initial_state
+from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
@@ -283,7 +284,9 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
         doubt = why_not_believed(work) if work.sets.exists() else None
         candidates = [work.sets] if doubt is None else []
         doubts += [doubt] if doubt is not None else []
-        candidates += sorted(SHIPPED.glob(f"{model.plant.name}-*-{kind}.json*"))
+        # Somebody's own plant may have the name and the linear part of a shipped one, and another h.
+        if not is_reference(config.plant.model):
+            candidates += sorted(SHIPPED.glob(f"{model.plant.name}-*-{kind}.json*"))
         for path in candidates:
             usable = _usable(path, model)
             if usable is not None:

@@ -128,8 +128,8 @@ class TargetSelector:
         """One Newton step from w, (d + m,), in half-widths.
 
         Returns:
-            Where it leads, inside X and U of the plant; how far that is, infinite where numbers are unusable; how far
-            it is outside Z and V.
+            Where it leads, inside the plant's X and U; how far that is, infinite where the numbers are unusable; how
+            far from Z and V that is.
         """
         newton = self._newton
         newton.inputs["w"][:, 0] = w

@@ -113,7 +113,7 @@ def by_another_method(oracle: Oracle, theta: np.ndarray, cost: Any) -> np.ndarra
     return done.x * SCALE
 
 
-@pytest.mark.parametrize("name", ["constant", "dnn", "perfect"])
+@pytest.mark.parametrize("name", ["constant", "dnn", "rnn", "perfect"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_without_outputs_it_is_the_rest_that_costs_least(name: str, seed: int) -> None:
     oracle = ORACLES[name]

@@ -31,7 +31,7 @@ from lbmpc.plants import PLANTS
 from lbmpc.sets import construct as construction
 from lbmpc.sets.certificate import CertificateError, model_of
 from lbmpc.sets.geometry.polytope import SetError
-from node_runtime.config.loading import load
+from node_runtime.config.loading import load, override
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import topics
@@ -324,6 +324,10 @@ def test_sets_that_are_installed_are_in_force_where_the_cache_is_not_believed(
     write_sets(read_sets(SHIPPED / "moore_greitzer-20Hz-regions.json.gz"), work.sets, 0o666)
     work.sets.chmod(0o666)
     assert find_sets(config, model, tmp_path).certificate.model.plant == "moore_greitzer"
+    # Somebody's own file may have the same name and matrices, and another h.
+    own = override(config, ['plant.model="own.py:MOORE_GREITZER"'])
+    with pytest.raises(ConfigError, match="none are there for this plant"):
+        find_sets(own, model, tmp_path)
     assert "chmod -R go-w" in caplog.text
 
 
