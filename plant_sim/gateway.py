@@ -106,7 +106,7 @@ class Gateway:
         depend on the state.
 
         Args:
-            read: the state, (d,), plant units, as it is now; None where it could not be measured, and no more is said.
+            read: the state, (d,), plant units, as it is now.
             write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where
                 the input is the same, and at least every two periods, for a watchdog of the machine's own.
             stop: outside the main thread, where no signal arrives, the only way to end it.

@@ -14,7 +14,7 @@ from node_runtime.realtime import clock
 
 log = logging.getLogger(__name__)
 
-Read = Callable[[], np.ndarray | None]
+Read = Callable[[], np.ndarray]
 Write = Callable[[np.ndarray], object]
 Call = Literal["read", "write"]
 R = TypeVar("R")
@@ -25,6 +25,10 @@ HANGS_S = 1.0
 """Seconds for which a call must not have returned to be a trouble."""
 REMEMBERED_S = 1.0
 """Seconds for which one that failed is a trouble."""
+
+
+class NotMeasured(Exception):
+    """What `read` may raise where there is no sample this time, and nothing is wrong."""
 
 
 class Guarded:
@@ -62,12 +66,9 @@ class Guarded:
             return ""
         return f"{under_way[0]} has not returned for more than {HANGS_S:g} s"
 
-    def _measure(self) -> np.ndarray | None:
+    def _measure(self) -> np.ndarray:
         self.measured = self._now()
-        read = self._read()
-        if read is None:
-            return None
-        x = np.array(read, dtype=float)
+        x = np.array(self._read(), dtype=float)
         if x.shape != (self._states,):
             raise ValueError(f"x has the shape {x.shape}, the plant has {self._states} states")
         if not np.isfinite(x).all():
@@ -89,6 +90,8 @@ class Guarded:
             result = function()
         except PlantError:
             raise
+        except NotMeasured:
+            return None
         except Exception as error:  # not our code: whatever it raises, the machine still needs an input
             if self._simulated:
                 raise

@@ -45,7 +45,10 @@ Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
 """Lower and upper; None: there is none. In TOML that is -inf or inf."""
 
 
-Shares = NonNegative | dict[str, NonNegative]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
+Instant = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+"""Seconds from a beginning, or 0."""
+Shares = Share | dict[str, Share]
 """Shares of half-widths: one for every state, or by the state's name, and then 0 for those that are not named."""
 
 
@@ -54,15 +57,15 @@ class SensorsConfig(Section, frozen=True):
 
     noise: Shares = 0.0
     """Standard deviation, in half-widths."""
-    correlation: NonNegative = 0.0
+    correlation: Instant = 0.0
     """Seconds in which the noise forgets itself, by a factor of e; 0: it is white."""
     quantisation: Shares = 0.0
     """Step between two values that can be measured, in half-widths."""
-    bias: dict[str, float] = msgspec.field(default_factory=dict)
+    bias: dict[str, Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]] = msgspec.field(default_factory=dict)
     """Added to what is measured of a state, in half-widths, by its name."""
-    bias_at: NonNegative = 0.0
+    bias_at: Instant = 0.0
     """Seconds after the first sample from which on there is a bias."""
-    stuck: dict[str, NonNegative] = msgspec.field(default_factory=dict)
+    stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
     """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
