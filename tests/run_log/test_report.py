@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
 import subprocess
 import sys
@@ -40,7 +41,7 @@ def test_names_and_units_are_no_formulas(config: Config, messages: list[Logged])
     odd = {"states": (r"a$x_\frac$", "b$", r"\$c$$", "d"), "units": {"d": "$"}}
     data = dataclasses.replace(data, plant=dataclasses.replace(data.plant, **odd))
     figure = plots.overview(data, r"$\frac$")
-    figure.canvas.draw()
+    figure.savefig(io.BytesIO(), dpi=20)
     assert r"a$x_\frac$" in figure.axes[0].get_ylabel().replace(r"\$", "$")
 
 
@@ -191,6 +192,17 @@ def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
     assert [file.name for file in files] == [f"run{part}.png" for part in parts]
     for file in files:
         assert file.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_picture_that_cannot_be_written_is_told_and_the_others_are_drawn(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plots, "overview", lambda *_of: Figure())
+    monkeypatch.setattr(plots, "pictures", lambda _of: {"states": Figure})
+    (tmp_path / "run.png").mkdir()
+    drawn, (why,) = report(read_run(whole), tmp_path)
+    assert [file.name for file in drawn] == ["run-states.png"]
+    assert "run.png: cannot be written: it is a folder" in str(why)
 
 
 def test_pictures_have_units_and_bounds(whole: Path) -> None:
