@@ -23,11 +23,11 @@ import msgspec
 import numpy as np
 
 from lbmpc.model import Model
+from lbmpc.plants import PLANTS, Plant
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
 from lbmpc.sets.motion import over_any_delay
 from node_runtime.config.plant import initial_state
-from node_runtime.config.reference import is_reference
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
 from node_runtime.config.strict import ConfigError
@@ -186,7 +186,19 @@ def _equations(model: Model, kind: Kind) -> str | None:
     """Hash of those that h is bounded by: two plants may have one linear model."""
     if kind == "given" or model.equations is None:
         return None
-    return hashlib.sha256(model.equations.function().serialize().encode()).hexdigest()
+    return _sha256_of(model.equations)
+
+
+def _sha256_of(equations: Plant) -> str:
+    return hashlib.sha256(equations.function().serialize().encode()).hexdigest()
+
+
+def _comes_with_tandem(model: Model) -> bool:
+    """Somebody's own plant may have the name and the linear part of a shipped one, and another h."""
+    shipped, equations = PLANTS.get(model.plant.name), model.equations
+    if not isinstance(shipped, Plant) or equations is None:
+        return False
+    return equations.rhs is shipped.rhs or _sha256_of(equations) == _sha256_of(shipped)
 
 
 def why_not_believed(work: Work) -> str | None:
@@ -284,8 +296,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
         doubt = why_not_believed(work) if work.sets.exists() else None
         candidates = [work.sets] if doubt is None else []
         doubts += [doubt] if doubt is not None else []
-        # Somebody's own plant may have the name and the linear part of a shipped one, and another h.
-        if not is_reference(config.plant.model):
+        if _comes_with_tandem(model):
             candidates += sorted(SHIPPED.glob(f"{model.plant.name}-*-{kind}.json*"))
         for path in candidates:
             usable = _usable(path, model)

@@ -91,8 +91,8 @@ class Gateway:
         """The next sample does not follow from the last: the origin is another, or the state was set by hand.
 
         It says that nothing is known of what acted before it, so that nobody learns from it. Of older samples no
-        command is obeyed any more, and of the plan and the backup policy nothing is followed. Any thread may call this,
-        `read` too.
+        command is obeyed any more, and of the plan and the backup policy nothing is followed. `read` calls this, before
+        it returns the first such state. Any thread may, but a sample from before the leap may then come between.
         """
         if self._serving is not None:
             self._serving[0].jump()

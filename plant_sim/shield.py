@@ -21,6 +21,10 @@ JITTER = 0.1
 of what the plant moves in a period."""
 
 
+MOST_ACTED = 1000
+"""Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
+
+
 class Machine(Protocol):
     """The plant itself. `due`: seconds, for which moment a call is made."""
 
@@ -176,6 +180,7 @@ class Shield:
         self._tape.append(
             _Acting(max(due if since is None else since, self._tape[-1].since), u, drive.source)
         )
+        del self._tape[:-MOST_ACTED]
 
     # -- what a sample says ------------------------------------------------------------------------------
 

@@ -36,5 +36,5 @@ def decode(data: bytes) -> tuple[Known, dict[str, str]]:
     try:
         content = msgspec.json.decode(data, type=_Content)
         return Known.from_builtins(content.known), content.files
-    except (msgspec.DecodeError, PlantDefinitionError) as error:
+    except (msgspec.DecodeError, RecursionError, PlantDefinitionError) as error:
         raise PlantRecordError(str(error)) from error

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from controller_node.build import GivenPlant, build_plant
 from lbmpc.plants import (
+    PLANTS,
     Description,
     Known,
     Plant,
@@ -87,11 +88,13 @@ class Loop:
         config: str | Path | Config | None = None,
         **settings: Any,
     ):
-        named = truth if isinstance(truth, str | Mapping) else None
         moving = None if isinstance(truth, str | Mapping) else truth
         arguments = {
-            "known": ("plant.model", known.name if isinstance(known, Description) else known),
-            "truth": ("plant.truth", dict(named) if isinstance(named, Mapping) else named),
+            "known": ("plant.model", _name_of(known)),
+            "truth": (
+                "plant.truth",
+                dict(truth) if isinstance(truth, Mapping) else _name_of(truth, moves=True),
+            ),
             "oracle": ("controller.oracle", oracle),
             "train": ("trainer.enabled", train),
         }
@@ -271,6 +274,19 @@ def _resolved(
             _merge(tree, {table: {last: value}}, "", {})
             origins[key] = f"Loop({name}=)"
     return from_tree(tree, where, origins, folder)
+
+
+def _name_of(given: object, moves: bool = False) -> object:
+    """What a configuration calls it; of an object a name that nobody takes for a plant of Tandem's.
+
+    A truth that is an object has such a name too: without one a log would say that the plant moved as known.
+    """
+    if given is None or isinstance(given, str):
+        return given
+    name = given.name if isinstance(given, Description) else type(given).__name__
+    if PLANTS.get(name) is given or not (moves or name in PLANTS):
+        return name
+    return f"Loop:{name}"
 
 
 def _merge(tree: dict[str, Any], changes: Mapping[str, Any], above: str, origins: dict[str, str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lbmpc.plants import Known
+from node_runtime.printable import printable
 from tandem.terminal import Refused
 
 DIGITS = 12
@@ -52,7 +52,8 @@ def source(fields: Mapping[str, Any], about: Sequence[str], name: str = "PLANT")
         about: lines of the file's docstring.
         name: of the plant in the file.
     """
-    lines = ['"""' + "\n".join(about).replace("\\", "/").replace('"""', "'''") + '"""', ""]
+    # Names may be a stranger's, and files' names any bytes.
+    lines = ['"""' + printable("\n".join(about)).replace("\\", "/").replace('"""', "'''") + '"""', ""]
     given = {key: _text(value, 4) for key, value in fields.items() if value is not None}
     if any("inf" in text for key, text in given.items() if key.endswith(("_min", "_max"))):
         lines += ["from math import inf", ""]
@@ -89,4 +90,10 @@ def _text(value: Any, indent: int) -> str:
         return f"({', '.join(_text(one, 0) for one in value)}{',' if len(value) == 1 else ''})"
     if isinstance(value, float):
         return repr(float(f"{value:.{DIGITS}g}"))
-    return json.dumps(value) if isinstance(value, str) else repr(value)
+    return _quoted(value) if isinstance(value, str) else repr(value)
+
+
+def _quoted(text: str) -> str:
+    """In double quotes where it has none; what cannot be seen is written as its number."""
+    after_single = repr("'" + text)
+    return f'"{after_single[2:]}' if after_single.startswith('"') else repr(text)

@@ -168,6 +168,12 @@ def choice_faults(plant: Description) -> Iterator[str]:
                 yield f"kernel has {name!r}, which is no state or input: choose from {', '.join(known)}"
             elif name in kernel[:k]:
                 yield f"kernel has {name!r} twice: each state or input once"
+    for field in ("units", "names"):
+        texts: Any = getattr(plant, field)
+        if not isinstance(texts, Mapping) or not all(
+            isinstance(t, str) for pair in texts.items() for t in pair
+        ):
+            yield f"{field} is {texts!r}: give texts by name, as in {{{known[0]!r}: 'm'}}"
     units: Any = plant.units if isinstance(plant.units, Mapping) else {}
     without = [name for name in (*known, TIME) if not isinstance(units.get(name), str)]
     if without:

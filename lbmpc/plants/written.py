@@ -46,22 +46,30 @@ FIELDS = Written.__struct_fields__
 
 
 def written(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a `Known`, by name, in what JSON has."""
-    return {name: _plain(fields[name]) for name in FIELDS}
+    """The fields of a `Known`, by name, in what JSON has; the same whether a number was written 1 or 1.0.
+
+    Raises:
+        PlantDefinitionError: a field has what JSON, or `read`, would not take.
+    """
+    return msgspec.to_builtins(_typed({name: _plain(fields[name]) for name in FIELDS}))
 
 
 def read(data: object) -> dict[str, Any]:
     """The fields of a `Known` from what JSON gave. Raises `PlantDefinitionError`: it is something else."""
-    try:
-        found = msgspec.convert(data, Written)
-    except msgspec.ValidationError as error:
-        raise PlantDefinitionError(f"this is not the known part of a plant: {error}") from error
+    found = _typed(data)
     fields = msgspec.structs.asdict(found)
     for name in ("x_min", "x_max", "u_min", "u_max"):
         fields[name] = [float(value) for value in fields[name]]
     if found.poles is not None:
         fields["poles"] = [complex(*pole) if isinstance(pole, tuple) else pole for pole in found.poles]
     return fields
+
+
+def _typed(data: object) -> Written:
+    try:
+        return msgspec.convert(data, Written)
+    except msgspec.ValidationError as error:
+        raise PlantDefinitionError(f"this is not the known part of a plant: {error}") from error
 
 
 def _plain(value: Any) -> Any:

@@ -224,7 +224,7 @@ def from_json(text: str) -> Config:
     """The inverse of `to_json`: a configuration as a log carries it. Raises `ConfigError`."""
     try:
         tree = msgspec.json.decode(text)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ConfigError(f"the log's configuration is not valid JSON: {error}") from error
     if not isinstance(tree, dict):
         raise ConfigError("the log's configuration is not a table")

@@ -165,7 +165,8 @@ def _know_architecture(
         )
     elif own is not None:
         # Under the name that it has in the log, so that a file of which a comment has changed replays to the byte.
-        register(reference, recorded.architecture or own.name, own.architecture)
+        recorded_name = recorded.architecture if is_reference(recorded.architecture) else own.name
+        register(reference, recorded_name, own.architecture)
     elif is_reference(reference):
         name = (recorded.architecture or Path(reference).name).partition("@")[0]
         raise LogError(

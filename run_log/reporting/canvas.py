@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from node_runtime.printable import printable
 from node_runtime.whole_file import write_whole
 from run_log.errors import LogError
 
@@ -22,6 +23,11 @@ if TYPE_CHECKING:
 
 LONGEST = 200
 """Characters of a reason: LaTeX gives its whole log."""
+
+
+def words(text: str) -> str:
+    """Somebody's name or unit as it is written: Matplotlib would read what is between two `$` as a formula."""
+    return printable(text).replace("$", r"\$")
 
 
 class PictureError(LogError):

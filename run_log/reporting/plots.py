@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lbmpc.plants import Description
+from run_log.reporting.canvas import words
 from run_log.reporting.performance import TOLERANCE
 from run_log.reporting.traces import Traces
 
@@ -65,13 +66,13 @@ def _figure(title: str, draws: list[Draw], height: float = 2.0) -> Figure:
     axes[-1].set_xlabel("time since the first command (s)")
     figure.align_ylabels()
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(words(title), fontsize=11)
     return figure
 
 
 def _label(plant: Description, name: str, what: str = "") -> str:
     unit = plant.units.get(name, "")
-    return f"{what}{name} ({'–' if unit in ('', '1') else unit})"
+    return words(f"{what}{name} ({'–' if unit in ('', '1') else unit})")
 
 
 def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float, scale: float) -> None:

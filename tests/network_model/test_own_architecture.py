@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -15,6 +16,7 @@ from network_model.description import NetworkDescription
 from node_runtime.config.architecture import load_architecture
 from node_runtime.config.loading import load
 from node_runtime.config.strict import ConfigError
+from protocol import topics
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
@@ -89,6 +91,17 @@ def test_a_replay_with_the_file_is_equal_to_the_byte(recorded: tuple[Path, Path]
     found = replay(log, architecture=load_architecture(f"{recorded[0]}:GRU"))
     assert found.equal
     assert not any("text is another" in note for note in found.notes)
+
+
+def test_a_log_gives_no_file_the_name_of_a_shipped_architecture(
+    recorded: tuple[Path, Path], log: Run
+) -> None:
+    (entry,) = log.streams[topics.RUN_INFO["controller"].name]
+    info = msgspec.structs.replace(entry.message, versions={**entry.message.versions, "architecture": "mlp"})
+    log.streams[topics.RUN_INFO["controller"].name] = [replace(entry, message=info)]
+    replay(log, architecture=load_architecture(f"{recorded[0]}:GRU"))
+    assert registry.get_architecture("mlp").options == {}
+    assert list(registry._given) == [load_architecture(f"{recorded[0]}:GRU").name]
 
 
 def test_a_file_of_which_a_comment_changed_replays_and_the_change_is_said(tmp_path: Path, log: Run) -> None:

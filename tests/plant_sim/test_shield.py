@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lbmpc.plants import Plant, get_plant
-from plant_sim.shield import Shield
+from plant_sim.shield import MOST_ACTED, Shield
 from protocol import messages as m
 
 PLANT = get_plant("moore_greitzer")
@@ -199,6 +199,20 @@ def test_without_a_measurement_there_is_no_sample_and_no_label_across_the_gap() 
     state = bench.sampled(3)
     assert (state.seq, state.applied) == (3, None)
     assert bench.sampled(4).applied is not None
+
+
+def test_where_no_sample_can_be_taken_for_long_what_acted_is_forgotten() -> None:
+    bench = Bench()
+    bench.sample(0)
+    bench.x = None
+    for k in range(1, 3 * MOST_ACTED):
+        bench.sample(k)
+    assert len(bench.shield._tape) <= MOST_ACTED
+    bench.x = AWAY
+    state = bench.sampled(3 * MOST_ACTED)
+    assert state.applied is None
+    assert state.pieces[-1].u == PLANT.safe_input.tolist()
+    assert bench.sampled(3 * MOST_ACTED + 1).applied is not None
 
 
 def test_the_policy_reads_at_the_beginning_of_its_periods_and_without_a_state_the_plan_goes_on() -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from lbmpc import plants
 from lbmpc.plants import get_plant
@@ -24,6 +25,7 @@ from protocol.messages import InputSource, Tick
 from run_log.errors import LogError
 from run_log.reading.reader import read_run
 from run_log.reporting import plots
+from run_log.reporting.canvas import save
 from run_log.reporting.motion import trajectory
 from run_log.reporting.report import picture, report
 from run_log.reporting.summary import PredictionError, summarise
@@ -32,6 +34,15 @@ from run_log.run import gather
 from tests.helpers.run_log_samples import STEPS, Logged
 
 PLANT = get_plant("moore_greitzer")
+
+
+def test_names_and_units_are_no_formulas(config: Config, messages: list[Logged]) -> None:
+    data = traces(gather(config, messages))
+    odd = {"states": (r"a$x_\frac$", "b$", r"\$c$$", "d"), "units": {"d": "$"}}
+    data = dataclasses.replace(data, plant=dataclasses.replace(data.plant, **odd))
+    figure = plots.overview(data, r"$\frac$")
+    figure.savefig(io.BytesIO(), dpi=20)
+    assert r"a$x_\frac$" in figure.axes[0].get_ylabel().replace(r"\$", "$")
 
 
 # -- figures ---------------------------------------------------------------------------------------------
@@ -188,6 +199,17 @@ def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
         assert file.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_a_picture_that_cannot_be_written_is_told_and_the_others_are_drawn(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plots, "overview", lambda *_of: Figure())
+    monkeypatch.setattr(plots, "pictures", lambda _of: {"states": Figure})
+    (tmp_path / "run.png").mkdir()
+    drawn, (why,) = report(read_run(whole), tmp_path)
+    assert [file.name for file in drawn] == ["run-states.png"]
+    assert "run.png: cannot be written: it is a folder" in str(why)
+
+
 def test_pictures_have_units_and_bounds(whole: Path) -> None:
     data = traces(read_run(whole))
     labels = [ax.get_ylabel() for ax in plots.pictures(data)["states"]().axes]
@@ -254,12 +276,12 @@ def test_reading_needs_neither_torch_nor_a_display() -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
-def test_a_picture_replaces_files_alone(whole: Path, tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_a_picture_replaces_files_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
     (tmp_path / "elsewhere").write_text("somebody else's")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
-    (why,) = report(read_run(whole), tmp_path).failed
-    assert re.search(r"run\.png: cannot be written: it is a (pipe|link|folder)", str(why))
+    with pytest.raises(LogError, match=r"run\.png: cannot be written: it is a (pipe|link|folder)"):
+        save(Figure, tmp_path / "run.png")
     assert (tmp_path / "run.png").lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_text() == "somebody else's"
 

@@ -16,8 +16,9 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from lbmpc.plants import get_plant
-from node_runtime.config.loading import override, to_json
+from node_runtime.config.loading import from_json, override, to_json
 from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
 from run_log import plant_record
 from run_log.errors import LogError
@@ -165,6 +166,7 @@ def hostile(**changes: object) -> bytes:
     [
         (b"{}", "missing required field `known`"),
         (b"not JSON", "JSON is malformed"),
+        (b'{"known": {"A": ' + b"[" * 100_000 + b"]" * 100_000 + b'}, "files": {}}', "recursion"),
         (b'{"known": {}, "files": {}}', "missing required field"),
         (b" " * 1_000_001, "1000001 bytes, and 1000000 is the most"),
         (hostile(A=[[float("nan")] * 4] * 4), "malformed"),
@@ -181,6 +183,11 @@ def test_a_hostile_plant_in_a_log_is_refused_by_name(data: bytes, said: str, tmp
         read_run(with_plant(tmp_path / "run.mcap", data))
     assert f"{PLANT}: " in str(caught.value)
     assert said in str(caught.value)
+
+
+def test_a_configuration_of_a_log_may_be_nested_as_deep_as_it_likes() -> None:
+    with pytest.raises(ConfigError, match="recursion"):
+        from_json('{"plant": ' + "[" * 100_000 + "]" * 100_000 + "}")
 
 
 def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from lbmpc.model import Model
 from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.geometry.operations import Body, body, convex_hull
 from lbmpc.sets.geometry.polytope import SetError
+from run_log.reporting.canvas import words
 from run_log.reporting.plots import BLACK, BLUE, GREY, SKY, VERMILION
 
 PLANES = 3
@@ -55,7 +56,7 @@ def picture(drawn: Drawn, title: str) -> Figure:
             _slices(axes[1, column], drawn, pieces, plane, plant.x_e, "$x_e$")
             _slices(axes[2, column], drawn, pieces, plane, drawn.x0, "$x_0$")
         _disturbances(axes[-1, column], drawn, plane)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(words(title), fontsize=11)
     legend: dict[str, Artist] = {}
     for ax in axes[:, 0]:
         legend |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
@@ -193,7 +194,7 @@ def _axes(ax: Axes, drawn: Drawn, plane: Plane, what: str = "") -> None:
     labels = []
     for i in plane:
         unit = plant.units.get(plant.states[i], "")
-        labels.append(f"{what}{plant.states[i]} ({'–' if unit in ('', '1') else unit})")
+        labels.append(words(f"{what}{plant.states[i]} ({'–' if unit in ('', '1') else unit})"))
     ax.set_xlabel(labels[0])
     ax.set_ylabel(labels[1])
     ax.xaxis.set_major_locator(MaxNLocator(5))

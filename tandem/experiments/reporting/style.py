@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lbmpc.plants import Description
+from run_log.reporting.canvas import words
 from run_log.reporting.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
 from tandem.experiments.study.results import CaseResult
 
@@ -76,14 +77,14 @@ def legend_above(ax: Axes, height: float = 1.0, columns: int = 2, space: float =
 
 
 def full_name(plant: Description, index: int) -> str:
-    """Of a state, in words where the plant has them."""
-    return plant.names.get(plant.states[index], plant.states[index])
+    """Of a state, in words where the plant has them; for a picture."""
+    return words(plant.names.get(plant.states[index], plant.states[index]))
 
 
 def named(plant: Description, index: int) -> str:
     """A state for an axis: its full name, and its unit where it has one."""
     unit = plant.units.get(plant.states[index], "")
-    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else unit})"
+    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else words(unit)})"
 
 
 def png(made: Figure) -> bytes:

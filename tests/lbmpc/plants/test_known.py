@@ -81,6 +81,8 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
     "a period of nothing": ({"period": 0.0}, "period is 0.0: give the seconds from x to"),
     "a negative period": ({"period": -0.1}, "period is -0.1"),
     "a period in words": ({"period": "fast"}, "period is 'fast'"),
+    "a name that is none": ({"names": {"x1": 3}}, "names is {'x1': 3}: give texts by name"),
+    "a unit that nobody asked for": ({"units": {"x9": 3}}, "units is .*'x9': 3}: give texts by name"),
     "no W": ({"W": None}, "W is missing: give the half-widths .* x1, x2"),
     "an infinite W": ({"W": [0.1, INF]}, "W of x2 is inf"),
     "no bounds and no scale": (
@@ -371,6 +373,12 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         np.testing.assert_array_equal(
             getattr(build_model(again, period), name), getattr(build_model(known, period), name)
         )
+
+
+def test_a_number_is_written_the_same_with_and_without_a_point() -> None:
+    with_point = sampled(period=1.0, poles=(-1.0, -2.0), scale={"u1": 1.0}).to_builtins()
+    without = sampled(period=1, poles=(-1, -2), scale={"u1": 1}).to_builtins()
+    assert json.dumps(without) == json.dumps(with_point)
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,14 @@ from examples.quadrotor.quadrotor import QUADROTOR
 from examples.tanks.tanks import TANKS
 from lbmpc.model import build_model
 from node_runtime.config.loading import load
+from node_runtime.config.plant import load_plant
 from run_log.reporting.summary import summarise
 from run_log.run import Run
 from run_log.writing.save import save
 from tandem.cli import main
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
+from tandem.plant_file import source, write_new
 from tests.helpers.paths import ROOT
 
 Capture = pytest.CaptureFixture[str]
@@ -194,3 +196,15 @@ def test_what_cannot_be_given_together_is_refused(logs: list[str], tmp_path: Pat
         assert message in refused(capsys, *logs, "--out", str(tmp_path / out))
     assert (tmp_path / "found.py").read_text() == "kept"
     assert "cannot be read" in refused(capsys, str(tmp_path / "none.mcap"))
+
+
+def test_names_of_a_strangers_come_back_from_the_file(tmp_path: Path) -> None:
+    states = ("höhe 😀", 'b" or c\\', "d'\"", "\u202ee\n")
+    fields = {"A": -np.eye(4), "B": np.ones((4, 1)), "W": np.ones(4), "states": states, "scale": {"u1": 1.0}}
+    fields["scale"] |= dict.fromkeys(states, 2.0)
+    text = source(fields, ['"""\nimport nothing # \\', "a log of \udcff\u202e.mcap", ""])
+    write_new(tmp_path / "found.py", text)
+    known = load_plant(f"{tmp_path / 'found.py'}:PLANT")
+    assert known.states == states
+    assert known.scale[states[0]] == 2.0
+    assert "\u202e" not in text

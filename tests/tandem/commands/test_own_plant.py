@@ -210,7 +210,6 @@ def test_bounds_and_equilibrium_of_the_configuration_are_in_the_log(
             "plant.model: {here}/tanks.py:TANK: {here}/tanks.py has nothing called 'TANK'",
         ),
         ("plant.model=tanks.py:TANK", "did you mean 'TANKS'?"),
-        ("plant.model=tanks.py", "which plant of it? write {here}/tanks.py:TANKS"),
         ("plant.model=bad.py:PLANT", "plant.model: {here}/bad.py, line 2: RuntimeError: no licence"),
         ("plant.model=odd.py:PLANT", "x_e is [1.0]: it needs 2 entries, one for each of upper, lower"),
         (

@@ -31,7 +31,7 @@ from lbmpc.plants import PLANTS
 from lbmpc.sets import construct as construction
 from lbmpc.sets.certificate import CertificateError, model_of
 from lbmpc.sets.geometry.polytope import SetError
-from node_runtime.config.loading import load, override
+from node_runtime.config.loading import load
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import topics
@@ -324,10 +324,12 @@ def test_sets_that_are_installed_are_in_force_where_the_cache_is_not_believed(
     write_sets(read_sets(SHIPPED / "moore_greitzer-20Hz-regions.json.gz"), work.sets, 0o666)
     work.sets.chmod(0o666)
     assert find_sets(config, model, tmp_path).certificate.model.plant == "moore_greitzer"
-    # Somebody's own file may have the same name and matrices, and another h.
-    own = override(config, ['plant.model="own.py:MOORE_GREITZER"'])
-    with pytest.raises(ConfigError, match="none are there for this plant"):
-        find_sets(own, model, tmp_path)
+    # Somebody's own plant may have the same name and matrices, and another h.
+    theirs = model.require_equations("this test")
+    cubic = replace(theirs, rhs=lambda x, u: [dx + (x[0] - theirs.x_e[0]) ** 3 for dx in theirs.rhs(x, u)])
+    for own in (replace(model, equations=cubic), replace(model, equations=None)):
+        with pytest.raises(ConfigError, match="none are there for this plant"):
+            find_sets(config, own, tmp_path)
     assert "chmod -R go-w" in caplog.text
 
 
