@@ -31,7 +31,7 @@ class Identify(Command):
 
     EXTRAS = "log"
 
-    files: Annotated[Positional[list[Path]], arg(metavar="LOG")]
+    files: Annotated[Positional[list[Path]], arg(metavar="LOG...", help_behavior_hint="(required)")]
     """Logs of one plant at one rate."""
     out: Annotated[Path | None, arg(metavar="FILE.py", help_behavior_hint="(default: none is written)")] = (
         None

@@ -123,7 +123,8 @@ def network_finding(config: Config) -> Finding | None:
 
 
 def _factor(largest: float, given: float) -> str:
-    return f"{largest / given:.2g}" if given > 0.0 else "infinity (W is 0)"
+    # Two digits, and 130 rather than 1.3e+02.
+    return f"{float(f'{largest / given:.2g}'):g}" if given > 0.0 else "infinity (W is 0)"
 
 
 def _stability(model: Model) -> Finding:

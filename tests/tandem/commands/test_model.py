@@ -150,6 +150,12 @@ def beside(**extra: Any) -> Plant:
 
 NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
     "W that h exceeds": (PENDULUM, TEN, "W", r"h is larger somewhere in X and U: .*rate by a factor of \d"),
+    "W that h exceeds by far": (
+        replace(PENDULUM, W=np.array([0.01, 0.001])),
+        TEN,
+        "W",
+        r"rate by a factor of \d\d0\. What",
+    ),
     "W of zero": (beside(), TEN, "W", r"angle by a factor of infinity \(W is 0\)"),
     "x0 outside of X": (
         replace(PENDULUM, x0=np.array([1.5, 0.0])),
