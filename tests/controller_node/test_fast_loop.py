@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import cast
@@ -35,7 +36,7 @@ class BusThatWritesDown:
         self.bad = RejectedMessages()
         self.said: list[tuple[str, m.Message | None]] = []
 
-    def queue(self, topic: Topic, capacity: int) -> Mailbox:
+    def queue(self, topic: Topic, capacity: int, arrived: threading.Condition | None = None) -> Mailbox:
         return Mailbox(topic.name, capacity)
 
     def serve(self, name: str, handler: object) -> None:

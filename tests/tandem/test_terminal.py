@@ -198,7 +198,7 @@ def test_a_second_ctrl_c_while_drawing_keeps_the_figures(
         raise Impatient
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", pressed)
-    assert Run(json=True)._conclude(files, None, True, True) == 130
+    assert Run(json=True)._conclude(Config(), files, None, True, True) == 130
     said = capsys.readouterr()
     result = json.loads(said.out)
     assert result["ticks"] == 12
@@ -214,7 +214,7 @@ def test_a_picture_that_fails_costs_neither_table_nor_exit_code(
         raise RuntimeError("latex was not able to process the following string:\nb'lp'\nand so on")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fails)
-    assert Run(json=True)._conclude(files, None, True, True) == 0
+    assert Run(json=True)._conclude(Config(), files, None, True, True) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)["ticks"] == 12
     assert "no picture: " in said.err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from typing import Any, cast
@@ -177,7 +178,7 @@ class Silent:
     def __init__(self, config: Config):
         self.config, self.bad, self.run_id, self.published = config, RejectedMessages(), "trainer", 0
 
-    def queue(self, topic: Topic, capacity: int) -> Mailbox:
+    def queue(self, topic: Topic, capacity: int, arrived: threading.Condition | None = None) -> Mailbox:
         return Mailbox(topic.name, capacity)
 
     def publish(self, _topic: Topic, _message: object) -> None:
