@@ -12,6 +12,7 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
+from lbmpc.estimator.kalman import KalmanEstimator, unobservable
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
@@ -29,7 +30,7 @@ from lbmpc.solver.solution import Solution
 from lbmpc.targets import TargetSelector
 from network_model.description import NetworkDescription
 from network_model.registry import get_architecture, name_of
-from node_runtime.config.plant import plant_of, true_plant_of
+from node_runtime.config.plant import in_half_widths, plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol.topics import WEIGHTS_LIMIT
@@ -133,6 +134,7 @@ def build_network_oracle(config: Config, plant: Description) -> DnnOracle:
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config),
         describe_filter(config, description.features),
+        None if config.estimator.kind == "none" else math.exp(-config.period / adaptation.kalman.memory),
     )
 
 
@@ -253,11 +255,36 @@ def build_controller(
             real_time=chosen.mode == "real_time",
             input_delay=seconds,
             targets=build_targets(config, problem, realise),
+            estimator=build_estimator(config, model),
         )
     except ModelError as error:
         raise ConfigError(f"controller: {error}") from error
     _warm_up(controller, solver, config.seed)
     return controller, solver
+
+
+def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
+    """The estimator of the configuration; None: a sample is the state.
+
+    Raises:
+        ConfigError: no sample ever tells of a state.
+    """
+    settings, plant = config.estimator, model.plant
+    if settings.kind == "none":
+        return None
+    names = plant.states if settings.measured is None else settings.measured
+    measured = np.array(sorted({plant.states.index(name) for name in names}))
+    if unseen := unobservable(model, measured):
+        raise ConfigError(
+            f"estimator.measured = {', '.join(names)}: what is measured never tells of "
+            f"{', '.join(plant.states[i] for i in unseen)}, which would have to be measured too"
+        )
+    given = given_disturbance(config)
+    process = plant.W * config.period if given is None else given
+    if settings.process is not None:
+        process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
+    noise = in_half_widths(settings.noise, plant) * plant.x_scale
+    return KalmanEstimator(model, measured, noise, process, settings.correlation)
 
 
 def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:

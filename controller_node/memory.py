@@ -128,4 +128,4 @@ class Memory:
 
 def _lasts(name: str) -> bool:
     """Whether a new process can go on with this array. Not with a plan, or with a state whose successor it missed."""
-    return name == "delay" or name.startswith("oracle.")
+    return name == "delay" or name.startswith(("oracle.", "estimator."))

@@ -162,7 +162,8 @@ class Translation:
             return None
         # The label of tick t is complete at tick t + 1.
         x, u, h, past = label.x.tolist(), label.u.tolist(), label.h.tolist(), label.past.tolist()
-        return m.Sample(tick.seq - 1, x, u, h, past)
+        variance = label.variance.tolist() if label.variance.any() else []
+        return m.Sample(tick.seq - 1, x, u, h, past, variance)
 
     def _weights(
         self, tick: m.Tick, network: LearnedNetwork, hidden_sha256: str

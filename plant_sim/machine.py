@@ -27,6 +27,10 @@ REMEMBERED_S = 1.0
 """Seconds for which one that failed is a trouble."""
 
 
+class NotMeasured(Exception):
+    """What `read` may raise where there is no sample this time, and nothing is wrong."""
+
+
 class Guarded:
     """Calls them, never both at a time, and counts what goes wrong. `trouble` may be asked by any thread."""
 
@@ -86,6 +90,8 @@ class Guarded:
             result = function()
         except PlantError:
             raise
+        except NotMeasured:
+            return None
         except Exception as error:  # not our code: whatever it raises, the machine still needs an input
             if self._simulated:
                 raise

@@ -12,6 +12,8 @@ from node_runtime.config.plant import initial_state, plant_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import run_process
 from plant_sim.gateway import Gateway
+from plant_sim.machine import NotMeasured
+from plant_sim.sensors import Sensors
 from plant_sim.simulator import Motion
 
 log = logging.getLogger(__name__)
@@ -30,9 +32,13 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 
 def _live(config: Config, stopping: threading.Event) -> int:
     motion, gateway = motion_of(config), Gateway(None, config, simulated=True)
+    sensors = Sensors(config, gateway.known)
 
     def read() -> np.ndarray:
-        return motion.read(gateway.due)
+        x = sensors.measure(motion.read(gateway.due), gateway.due)
+        if x is None:
+            raise NotMeasured
+        return x
 
     def write(u: np.ndarray) -> None:
         motion.write(u, gateway.due)

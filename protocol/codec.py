@@ -188,6 +188,7 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
                 expect("x", sample.x, d)
                 expect("u", sample.u, m_inputs)
                 expect("h", sample.h, d)
+                expect("variance", sample.variance or None, d)
                 for i, pair in enumerate(sample.past):
                     expect(f"past[{i}]", pair, d + m_inputs)
         case m.OutputWeights():

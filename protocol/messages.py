@@ -236,6 +236,8 @@ class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     h: list[float]
     past: list[list[float]] = msgspec.field(default_factory=list)
     """The k - 1 pairs (x, u) before this one, oldest first, as the controller's network saw them; empty for k = 1."""
+    variance: list[float] = msgspec.field(default_factory=list)
+    """Of h; empty where the label is exact, as what was measured is taken to be."""
 
 
 class Samples(Message, frozen=True):

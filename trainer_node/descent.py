@@ -17,10 +17,12 @@ import torch
 from torch.optim.adam import adam
 
 from network_model.description import NetworkDescription
-from trainer_node.network import ACTIVATIONS, BACKWARD, Network, build_loss
+from trainer_node.network import ACTIVATIONS, BACKWARD, Loss, Network, build_loss
 
 CACHED_ROWS = 2048
 """Samples of a stack on a CPU: with more at once every step goes to memory, and is slower than one by one."""
+LOOK_EVERY = 10
+"""Steps between two looks at what is held out."""
 LANES = 256
 """Plants of a stack on a GPU."""
 
@@ -37,6 +39,8 @@ class Problem:
     """(M, d)."""
     K: np.ndarray
     """(1 + n_L, d), fixed."""
+    held_out: tuple[np.ndarray, np.ndarray] | None = None
+    """Windows and h of samples that are not trained on and say when to stop; None: all steps are taken."""
 
 
 class Descent(NamedTuple):
@@ -64,12 +68,31 @@ def shape_of(description: NetworkDescription) -> Hashable:
 
 
 def descend(problem: Problem, steps: int, learning_rate: float) -> Descent:
-    """`steps` of Adam on one network."""
+    """`steps` of Adam on one network; of those up to where it was best on what is held out, where there is such."""
     network = problem.network
     loss = build_loss(network, problem.window, problem.h, problem.K)
+    if problem.held_out is not None:
+        held_out = build_loss(network, *problem.held_out, problem.K)
+        before = held_out.value()
+        after = _best(network, loss, held_out, steps, learning_rate)
+        return Descent(network.hidden(), before, after)
     before = loss.value()
     _adam(network.flat, loss.gradient, steps, learning_rate)
     return Descent(network.hidden(), before, loss.value())
+
+
+def _best(network: Network, loss: Loss, held_out: Loss, steps: int, learning_rate: float) -> float:
+    """Leave the network where `held_out` was lowest on the way, and return that."""
+    best = [held_out.value(), network.flat.detach().clone()]
+
+    def look(taken: int) -> None:
+        if taken % LOOK_EVERY == 0 and (now := held_out.value()) < best[0]:
+            best[:] = now, network.flat.detach().clone()
+
+    _adam(network.flat, loss.gradient, steps, learning_rate, look)
+    with torch.no_grad():
+        network.flat.copy_(best[1])
+    return best[0]
 
 
 def descend_together(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
@@ -90,8 +113,8 @@ def descend_together(problems: Sequence[Problem], steps: int, learning_rate: flo
 
 
 def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
-    if len(problems) == 1:
-        return [descend(problems[0], steps, learning_rate)]
+    if len(problems) == 1 or any(problem.held_out is not None for problem in problems):
+        return [descend(problem, steps, learning_rate) for problem in problems]
     stack = _Dense(problems) if problems[0].network.dense else _Mapped(problems)
     before = stack.values().tolist()
     _adam(stack.flat, stack.gradient, steps, learning_rate)
@@ -103,12 +126,16 @@ def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> l
 
 
 def _adam(
-    parameter: torch.Tensor, gradient: Callable[[], torch.Tensor], steps: int, learning_rate: float
+    parameter: torch.Tensor,
+    gradient: Callable[[], torch.Tensor],
+    steps: int,
+    learning_rate: float,
+    look: Callable[[int], None] = lambda _taken: None,
 ) -> None:
     with torch.no_grad():
         moments, squares = torch.zeros_like(parameter), torch.zeros_like(parameter)
         taken = torch.zeros((), device=parameter.device)
-        for _ in range(steps):
+        for number in range(steps):
             slope = gradient()
             # What torch.optim.Adam calls. The class would import the rest of torch, over a second.
             adam(
@@ -127,6 +154,7 @@ def _adam(
                 eps=1e-8,
                 maximize=False,
             )
+            look(number + 1)
 
 
 class _Stack(ABC):

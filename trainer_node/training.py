@@ -26,6 +26,10 @@ BASES = 8
 """Sets of hidden layers remembered, newest last: one of them must be what the controller's K belongs to."""
 LEAP = 1000
 """From one version to the next where somebody else sends weights too: more than a stranger sends meanwhile."""
+HELD_OUT = 0.25
+"""Share of the samples drawn that is not trained on, where labels are noisy."""
+GAIN = 0.05
+"""By how much of the labels' own variance the loss must fall."""
 FARTHEST = 10**8
 """How far versions may run ahead of the adopted: a controller refuses those that are 1e9 ahead."""
 
@@ -96,6 +100,8 @@ class Trainer:
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
         self._fresh = 0
+        # What the labels' variance adds to the loss.
+        self._noise = 0.0
         self._step = 1
         self.resume(hidden, version)
 
@@ -151,7 +157,19 @@ class Trainer:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
         windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
+        if samples[-1].variance:
+            self._noise = self._noise_of(np.array(samples[-1].variance))
         return self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
+
+    def _noise_of(self, variance: np.ndarray) -> float:
+        """What labels of this variance, (d,), add to the loss. Raises `ValueError` for what is none."""
+        with np.errstate(over="ignore"):
+            noise = float((variance / np.array(self.description.output_scale) ** 2).sum())
+        if variance.shape != (self.description.states,) or not (
+            (variance >= 0.0).all() and math.isfinite(noise)
+        ):
+            raise ValueError("no variance")
+        return noise
 
     def due(self) -> bool:
         """Whether enough new samples came since the last training began."""
@@ -161,7 +179,8 @@ class Trainer:
         """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
 
         M samples are drawn from the buffer, and `steps` Adam steps taken on all of them, in float32. Adam
-        starts afresh each time.
+        starts afresh each time. Where labels have a variance, a quarter of the samples is held out: the steps count up
+        to where these were predicted best, and the old layers stay where that is within the noise.
 
         Args:
             output: K_{T_k}, (1 + n_L, d), and the hash of the hidden layers it was adapted to.
@@ -188,7 +207,11 @@ class Trainer:
             return None
         xu, h = self.buffer.sample(self.config.batch, self._draws)
         self._network.load(self._bases[output.hidden_sha256])
-        return Draw(Problem(self._network, xu, h, K), output, for_run)
+        if self._noise == 0.0:
+            return Draw(Problem(self._network, xu, h, K), output, for_run)
+        kept = len(xu) - max(1, round(HELD_OUT * len(xu)))
+        held_out = xu[kept:], h[kept:]
+        return Draw(Problem(self._network, xu[:kept], h[:kept], K, held_out), output, for_run)
 
     def finish(self, draw: Draw, descent: Descent) -> HiddenWeights | None:
         """The last part of `train`: judge what the Adam steps found, and take it over or leave it."""
@@ -236,7 +259,9 @@ class Trainer:
             return "norm bound"
         if not math.isfinite(descent.after):
             return "not finite"
-        return None if descent.after < descent.before else "loss not lower"
+        # Within what the labels' noise alone comes to there is nothing to gain, and its fit would cost.
+        gain = descent.before - descent.after
+        return None if gain > GAIN * self._noise else "loss not lower"
 
     def _take(self, hidden: list[np.ndarray]) -> None:
         self.hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]

@@ -15,16 +15,15 @@ from rich.table import Table
 from node_runtime.config.loading import load
 from run_log.reporting.summary import summarise
 from run_log.run import Run
-from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
 from verification.attacks import Forge, crude, drift, elsewhere, follow_attacked, noise, random, reversed_sign
 
 STEPS = 200
 SEEDS = range(3)
-DISTURBANCES: dict[str, Faults] = {
-    "none": Faults(),
-    "noise of 3e-4 on z and y": Faults(noise=[3e-4, 3e-4, 0.0, 0.0]),
-    "noise of 1e-3 on z and y": Faults(noise=[1e-3, 1e-3, 0.0, 0.0]),
+DISTURBANCES: dict[str, list[str]] = {
+    "none": [],
+    "noise of 3e-4 on z and y": ["plant.sensors.noise={z=6e-4, y=6e-4}"],
+    "noise of 1e-3 on z and y": ["plant.sensors.noise={z=2e-3, y=2e-3}"],
 }
 ATTACKS: dict[str, Forge] = {
     "NaN, huge, wrong shape, reversed, random": crude,
@@ -45,8 +44,8 @@ def measure(seeds: range) -> Table:
         "what is sent", "when", "trial", "adopted", "refused", "rolled back", "J", "overshoot", "outside"
     )
     for trial in (True, False):
-        for name, faults in DISTURBANCES.items():
-            runs = [follow(load(None, _settings(seed, trial)), STEPS, faults).run for seed in seeds]
+        for name, sensors in DISTURBANCES.items():
+            runs = [follow(load(None, [*_settings(seed, trial), *sensors]), STEPS).run for seed in seeds]
             _row(table, (name, "-"), trial, runs)
         for name, forge in ATTACKS.items():
             for when, (every, instead) in SENT.items():

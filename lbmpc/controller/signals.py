@@ -47,6 +47,8 @@ class Label:
     """The oracle's estimate before it learned this sample."""
     past: np.ndarray
     """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
+    variance: np.ndarray
+    """Of h, (d,); zeros where a sample is the state."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbmpc.controller.fallback import Plan
+from lbmpc.estimator.base import EstimatorState
 from lbmpc.oracles.base import OracleState
 
 
@@ -17,7 +18,7 @@ class ControllerState:
     plan: Plan
     """Shifted solution: warm start of the next solve and fallback."""
     pending_x: np.ndarray
-    """x_t whose label is still to come, (d,)."""
+    """x_t, as it was estimated, whose label is still to come, (d,)."""
     pending: tuple[int, int]
     """Its (source, sequence); sequence -1 when none is pending."""
     predicted: np.ndarray
@@ -27,6 +28,7 @@ class ControllerState:
     oracle: OracleState
     target: np.ndarray
     """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
+    estimator: EstimatorState
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -38,6 +40,7 @@ class ControllerState:
             "predicted": self.predicted,
             "delay": np.array([self.delay]),
             **({"target": self.target} if self.target.size else {}),
+            **{f"estimator.{name}": array for name, array in self.estimator.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -45,10 +48,10 @@ class ControllerState:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
         """Raises KeyError when an array is missing."""
         source, sequence = (int(value) for value in arrays["pending"])
-        prefix = "oracle."
-        oracle = {
-            name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)
-        }
+        oracle, estimator = (
+            {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+            for prefix in ("oracle.", "estimator.")
+        )
         plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
             plan,
@@ -58,4 +61,5 @@ class ControllerState:
             float(arrays["delay"][0]),
             oracle,
             arrays.get("target", np.zeros(0)),
+            estimator,
         )

@@ -16,6 +16,7 @@ from lbmpc.controller.backup_policy import BackupPlanner, Policy
 from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
+from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
 from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.problem import Problem
@@ -68,6 +69,7 @@ class Controller:
         real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
         input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
         targets: finds where plans aim; None: at the equilibrium.
+        estimator: the state from what is measured; None: a sample is the state.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class Controller:
         real_time: bool = False,
         input_delay: float = 0.0,
         targets: TargetSelector | None = None,
+        estimator: Estimator | None = None,
     ):
         self.problem, self._solver, self.real_time = problem, solver, real_time
         self._targets = targets
@@ -87,6 +90,7 @@ class Controller:
         guard = problem.guard
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
         self.oracle = problem.oracle
+        self.estimator = Samples(self.model.d) if estimator is None else estimator
         self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
 
     def initial_state(self, seed: int) -> ControllerState:
@@ -96,7 +100,8 @@ class Controller:
         nothing = np.zeros(self.model.d)
         s = self._with_past(oracle, nothing)
         target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target)
+        memory = self.estimator.initial_state()
+        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -120,8 +125,8 @@ class Controller:
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        seen = self._without_absurd(seen)
-        label, oracle = self._learn(state, seen)
+        estimator, seen, estimate = self._estimate(state, self._without_absurd(seen))
+        label, oracle = self._learn(state, seen, estimate)
         rolled_back = ""
         if label is not None:
             oracle, rolled_back = self.oracle.confirm(oracle)
@@ -144,7 +149,10 @@ class Controller:
         )
         x, u = s[: self.model.d], plan.u[0]
         predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        after = ControllerState(shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target))
+        estimator = self.estimator.commanded(estimator, u)
+        after = ControllerState(
+            shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target), estimator
+        )
         return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
 
     def _without_absurd(self, seen: Observation) -> Observation:
@@ -156,10 +164,22 @@ class Controller:
             seen = replace(seen, applied=None, pieces=())
         return seen
 
-    def _learn(self, state: ControllerState, seen: Observation) -> tuple[Label | None, OracleState]:
+    def _estimate(
+        self, state: ControllerState, seen: Observation
+    ) -> tuple[EstimatorState, Observation, Estimate | None]:
+        """The estimator's memory, what was seen with the estimate in the place of x, and what else is known of it."""
+        if seen.x is None:
+            return self.estimator.missed(state.estimator, state.delay), seen, None
+        measured = Measured(seen.x, seen.source, seen.sequence, seen.applied, seen.pieces)
+        memory, estimate = self.estimator.update(state.estimator, measured)
+        return memory, seen if estimate.x is seen.x else replace(seen, x=estimate.x), estimate
+
+    def _learn(
+        self, state: ControllerState, seen: Observation, estimate: Estimate | None
+    ) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
         follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
-        if seen.x is None:
+        if seen.x is None or estimate is None:
             return None, state.oracle
         if seen.applied is None or not follows:
             # What came before x is not known, at the start and after a gap.
@@ -167,10 +187,10 @@ class Controller:
             u = np.zeros(self.model.m) if acting is None else acting
             return None, self.oracle.begin(state.oracle, seen.x, u)
         x, u = state.pending_x, seen.applied
-        h = self.model.label(x, u, seen.x, seen.pieces)
-        past = self.oracle.past(state.oracle)
-        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u), past)
-        return label, self.oracle.learn(state.oracle, x, u, h)
+        h = self.model.label(x, u, estimate.reached, seen.pieces)
+        past, variance = self.oracle.past(state.oracle), estimate.variance
+        label = Label(x, u, h, self.oracle.estimate(state.oracle, x, u), past, variance)
+        return label, self.oracle.learn(state.oracle, x, u, h, variance)
 
     def _delay(self, delay: float, seen: Observation) -> float:
         """The plant reports when the last command took over from the one before; its average, at most half a period."""

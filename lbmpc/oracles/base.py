@@ -28,6 +28,8 @@ import numpy as np
 from network_model.description import NetworkDescription
 
 OracleState = dict[str, np.ndarray]
+Variance = np.ndarray | float
+"""Of a label, (d,), or one for all states; 0 where it is exact."""
 Realise = Callable[[ca.Function], ca.Function]
 """Turns a CasADi function into the one that is called, a compiler for instance."""
 
@@ -118,8 +120,13 @@ class Oracle(ABC):
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """h_hat(x, u) of this state, with the past that it remembers, (d,)."""
 
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
-        """The state after one labelled sample, (x, u) now in its past; the state given is left as it was."""
+    def learn(
+        self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
+    ) -> OracleState:
+        """The state after one labelled sample, (x, u) now in its past; the state given is left as it was.
+
+        variance: of h.
+        """
         return state
 
     def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:

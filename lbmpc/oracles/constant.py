@@ -12,7 +12,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from lbmpc.oracles.base import Oracle, OracleState, by_point
+from lbmpc.oracles.base import Oracle, OracleState, Variance, by_point
 
 
 class ConstantOracle(Oracle):
@@ -47,6 +47,8 @@ class ConstantOracle(Oracle):
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return state["h_hat"]
 
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
+    def learn(
+        self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
+    ) -> OracleState:
         # Written so that it is h itself for a gain of 1, without rounding.
         return {"h_hat": (1.0 - self.gain) * state["h_hat"] + self.gain * h}

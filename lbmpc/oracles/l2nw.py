@@ -11,7 +11,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from lbmpc.oracles.base import Oracle, OracleState, by_point
+from lbmpc.oracles.base import Oracle, OracleState, Variance, by_point
 
 
 class L2nwOracle(Oracle):
@@ -90,7 +90,9 @@ class L2nwOracle(Oracle):
         weights = table[:, -1] * np.exp(-(distance**2).sum(axis=1) / 2)
         return weights @ table[:, n : n + self.d] / (self.regularisation + weights.sum())
 
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
+    def learn(
+        self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
+    ) -> OracleState:
         window, position = state["window"].copy(), int(state["next"][0])
         window[position] = np.concatenate([np.concatenate([x, u])[list(self.variables)], h, [1.0]])
         return {"window": window, "next": np.array([(position + 1) % self.window], dtype=np.int64)}

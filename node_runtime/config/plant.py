@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from node_runtime.config.reference import is_reference, load, sha256_of
-from node_runtime.config.sections import Config, ReferenceConfig
+from node_runtime.config.sections import Config, ReferenceConfig, Shares
 from node_runtime.config.strict import ConfigError, did_you_mean
 
 
@@ -90,6 +90,7 @@ def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P
     if plant is None:
         _with_parameters(config, found)
     _check_reference(config.reference, found)
+    _check_names_of_states(config, found)
     return found
 
 
@@ -236,6 +237,32 @@ def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
             raise ConfigError(
                 f"reference.values: {name} = {value:g} is outside of X, {plant.x_min[i]:g} to {plant.x_max[i]:g}"
             )
+
+
+def _check_names_of_states(config: Config, plant: Described) -> None:
+    sensors, estimator = config.plant.sensors, config.estimator
+    for key, names in (
+        ("plant.sensors.noise", sensors.noise),
+        ("plant.sensors.quantisation", sensors.quantisation),
+        ("plant.sensors.bias", sensors.bias),
+        ("plant.sensors.stuck", sensors.stuck),
+        ("estimator.noise", estimator.noise),
+        ("estimator.process", estimator.process),
+        ("estimator.measured", estimator.measured),
+    ):
+        for name in names if isinstance(names, list | dict) else ():
+            if name not in plant.states:
+                hint = did_you_mean(name, plant.states, f"it has {', '.join(plant.states)}")
+                raise ConfigError(f"{key}: {plant.name} has no state {name!r}; {hint}")
+    if estimator.measured is not None and not estimator.measured:
+        raise ConfigError("estimator.measured is empty: name the states that a sample measures")
+
+
+def in_half_widths(shares: Shares, plant: Described) -> np.ndarray:
+    """One share for each state, (d,)."""
+    if isinstance(shares, dict):
+        return np.array([shares.get(name, 0.0) for name in plant.states], dtype=float)
+    return np.full(len(plant.states), float(shares))
 
 
 def _with_parameters(config: Config, plant: P) -> P:

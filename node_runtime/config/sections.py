@@ -45,6 +45,32 @@ Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
 """Lower and upper; None: there is none. In TOML that is -inf or inf."""
 
 
+Share = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
+Instant = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+"""Seconds from a beginning, or 0."""
+Shares = Share | dict[str, Share]
+"""Shares of half-widths: one for every state, or by the state's name, and then 0 for those that are not named."""
+
+
+class SensorsConfig(Section, frozen=True):
+    """How the simulated plant is measured: what the true state is not."""
+
+    noise: Shares = 0.0
+    """Standard deviation, in half-widths."""
+    correlation: Instant = 0.0
+    """Seconds in which the noise forgets itself, by a factor of e; 0: it is white."""
+    quantisation: Shares = 0.0
+    """Step between two values that can be measured, in half-widths."""
+    bias: dict[str, Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]] = msgspec.field(default_factory=dict)
+    """Added to what is measured of a state, in half-widths, by its name."""
+    bias_at: Instant = 0.0
+    """Seconds after the first sample from which on there is a bias."""
+    stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
+    """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
+    dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    """Share of samples that are lost, at random."""
+
+
 class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"
     """A plant that comes with Tandem, or a reference to one's own: "tanks.py:TANKS", "mypackage:PLANT"."""
@@ -61,6 +87,7 @@ class PlantConfig(Section, frozen=True):
     to what moves in the plant's place: other equations, or an object with `step`."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
+    sensors: SensorsConfig = SensorsConfig()
 
 
 class SolverConfig(Section, frozen=True):
@@ -116,6 +143,21 @@ class ControllerConfig(Section, frozen=True):
     """File from which the controller takes its memory when it is started again; "": none."""
     solver: SolverConfig = SolverConfig()
     backup: BackupConfig = BackupConfig()
+
+
+class EstimatorConfig(Section, frozen=True):
+    """Of the state, from what is measured."""
+
+    kind: literals.EstimatorName = "none"
+    """"none": a sample is the state; "kalman": a filter of the nominal model and a disturbance of each state."""
+    measured: list[str] | None = None
+    """States that a sample measures; of the others its numbers count nothing. None: all."""
+    noise: Shares = 0.01
+    """Standard deviation of what is measured, in half-widths."""
+    process: Shares | None = None
+    """Standard deviation of h, in half-widths per second of period; None: `controller.W`, or else the plant's own."""
+    correlation: Seconds = 1.0
+    """Seconds in which h becomes another along the motion, by a factor of e."""
 
 
 class ReferenceConfig(Section, frozen=True):
@@ -295,6 +337,7 @@ class Config(Section, frozen=True):
     plant: PlantConfig = PlantConfig()
     controller: ControllerConfig = ControllerConfig()
     reference: ReferenceConfig = ReferenceConfig()
+    estimator: EstimatorConfig = EstimatorConfig()
     network: NetworkConfig = NetworkConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
     constant: ConstantConfig = ConstantConfig()

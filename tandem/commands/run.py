@@ -32,7 +32,10 @@ class Run(Configured):
     """Run router, recorder, trainer, plant and controller here, watch them, and leave a log and a picture."""
 
     EXTRAS = "trainer,log"
-    KEYS = (("oracle", "controller.oracle"), ("rate", "rate"), ("seed", "seed"), ("log", "log.path"))
+    KEYS = (
+        *(("oracle", "controller.oracle"), ("rate", "rate"), ("seed", "seed")),
+        *(("noise", "plant.sensors.noise"), ("log", "log.path")),
+    )
 
     seconds: Annotated[
         float | None, arg(metavar="S", help_behavior_hint="(default: 20; with --no-plant until Ctrl-C)")
@@ -46,6 +49,8 @@ class Run(Configured):
     """Samples a second."""
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
     """Of everything random."""
+    noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint=FROM_CONFIG)] = None
+    """Noise in what is measured of every state, its standard deviation as a share of the half-width: 0.01."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
     """The log; a file of that name is moved aside, never overwritten. The picture lies beside it."""
     no_trainer: bool = False

@@ -24,7 +24,7 @@ class Simulate(Configured):
     EXTRAS = "trainer,log"
     KEYS = (
         *(("oracle", "controller.oracle"), ("tightening", "controller.tightening")),
-        *(("seed", "seed"), ("x0", "plant.x0")),
+        *(("seed", "seed"), ("x0", "plant.x0"), ("noise", "plant.sensors.noise")),
     )
 
     oracle: Annotated[
@@ -48,6 +48,8 @@ class Simulate(Configured):
         list[float] | None, arg(metavar="X...", help_behavior_hint="(default: the plant's own)")
     ] = None
     """Initial state, in the plant's own units."""
+    noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint=FROM_CONFIG)] = None
+    """Noise in what is measured of every state, its standard deviation as a share of the half-width: 0.01."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
     """Write the run's log too, in the format of a live run."""
 

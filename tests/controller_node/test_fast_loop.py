@@ -37,7 +37,7 @@ class BusThatWritesDown:
         self.said: list[tuple[str, m.Message | None]] = []
 
     def queue(self, topic: Topic, capacity: int, arrived: threading.Condition | None = None) -> Mailbox:
-        return Mailbox(topic.name, capacity)
+        return Mailbox(topic.name, capacity, arrived=arrived)
 
     def serve(self, name: str, handler: object) -> None:
         pass

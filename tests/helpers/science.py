@@ -79,17 +79,23 @@ def features(oracle: DnnOracle, state: OracleState, x: np.ndarray, u: np.ndarray
     return oracle.features_of(oracle.hidden(state), np.vstack([oracle.past(state), np.concatenate([x, u])]))
 
 
-def adapt(K: np.ndarray, phi: np.ndarray, error: np.ndarray, gamma: float, bounds: np.ndarray) -> np.ndarray:
+def adapt(
+    K: np.ndarray,
+    phi: np.ndarray,
+    error: np.ndarray,
+    gamma: float | np.ndarray,
+    bounds: np.ndarray,
+) -> np.ndarray:
     """One step of the law, as the paper writes it. `lbmpc.oracles.dnn.last_layer` is held to this.
 
     Args:
         K: output weights K_t, (n, d).
         phi: features phi_j(x_t, u_t) of the hidden weights in force when u_t was applied, (n,), phi[0] = 1.
         error: xtilde_{t+1} = h_hat_t(x_t, u_t) - h(x_t, u_t), (d,), in the units of K' phi.
-        gamma: learning rate, 0 < gamma < 1.
+        gamma: learning rate, 0 < gamma < 1; or one for each column, (d,).
         bounds: Wbar_i, (d,), in the same units.
 
     Returns:
         K_{t+1}, (n, d).
     """
-    return project_columns(K - (gamma / (phi @ phi)) * np.outer(phi, error), bounds)
+    return project_columns(K - np.outer(phi, error) * (gamma / (phi @ phi)), bounds)

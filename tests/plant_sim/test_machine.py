@@ -11,7 +11,7 @@ import pytest
 from lbmpc.plants import PlantError
 from node_runtime.realtime import clock
 from plant_sim import machine
-from plant_sim.machine import Guarded
+from plant_sim.machine import Guarded, NotMeasured
 from tests.helpers.live import wait_for
 
 
@@ -128,3 +128,14 @@ def test_a_call_that_does_not_return_is_a_trouble_that_others_see(monkeypatch: p
         go_on.set()
         calling.join()
     assert one.trouble() == ""
+
+
+def test_a_sample_that_is_lost_on_purpose_is_no_failure() -> None:
+    def lost() -> np.ndarray:
+        raise NotMeasured
+
+    for simulated in (True, False):
+        one = Guarded(lost, lambda _u: None, 2, 0.05, simulated)
+        assert one.read(0.0) is None
+        assert one.counts["reads failed"] == 0
+        assert one.trouble() == ""

@@ -301,3 +301,65 @@ def test_a_training_is_quick() -> None:
         trained(trainer)
         taken.append(time.thread_time() - start)
     assert min(taken) < 0.3, taken
+
+
+def noisy(number: int, deviation: float, share: float = 1.0) -> list[Sample]:
+    """The samples of a smooth h, `share` of it, whose labels err by so much of the output scale."""
+    rng, scale = np.random.default_rng(8), np.array(DESCRIPTION.output_scale)
+    variance = ((deviation * scale) ** 2).tolist()
+    return [
+        msgspec.structs.replace(
+            sample,
+            h=(share * np.array(sample.h) + deviation * scale * rng.normal(size=4)).tolist(),
+            variance=variance,
+        )
+        for sample in samples(0, number)
+    ]
+
+
+def trained_on(labels: list[Sample], weights: np.ndarray) -> tuple[Trainer, HiddenWeights | None]:
+    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
+    trainer.add("controller-1", labels)
+    return trainer, trainer.train(output(trainer, weights=weights), "controller-1")
+
+
+def test_noise_is_not_trained_on_and_an_h_that_exceeds_it_is() -> None:
+    still = np.zeros_like(K)
+    still[1:] = 0.05 * np.random.default_rng(1).normal(size=K[1:].shape)
+    trainer, found = trained_on(noisy(80, 1.0, share=0.0), still)
+    assert found is None
+    assert trainer.counters["kept: loss not lower"] == 1
+    # The same numbers, and nobody says that they are noise: they are fitted.
+    exact = [msgspec.structs.replace(sample, variance=[]) for sample in noisy(80, 1.0, share=0.0)]
+    _, fitted = trained_on(exact, still)
+    assert fitted is not None
+    assert fitted.loss_after < 0.99 * fitted.loss_before
+    _, learned = trained_on(noisy(300, 0.1), K)
+    assert learned is not None
+    assert learned.loss_after < 0.9 * learned.loss_before
+
+
+def test_what_is_held_out_says_where_to_stop() -> None:
+    """The loss in the message is that of the layers that are sent, on samples that they were not trained on."""
+    _, learned = trained_on(noisy(60, 0.3), K)
+    assert learned is not None
+    assert learned.samples == 45
+    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
+    trainer.add("controller-1", noisy(60, 0.3))
+    draw = trainer.begin(output(trainer), "controller-1")
+    assert draw is not None
+    assert draw.problem.held_out is not None
+    window, h = draw.problem.held_out
+    network = Network(DESCRIPTION)
+    network.load([layer.numpy().astype(float) for layer in learned.layers])
+    h_hat = h_hat_of(network, network.tensor(window), network.tensor(K)).numpy(force=True)
+    error = (h_hat - h) / DESCRIPTION.output_scale
+    np.testing.assert_allclose(learned.loss_after, (error**2).sum() / len(h), rtol=1e-4)
+
+
+@pytest.mark.parametrize("variance", [[-1.0] * 4, [float("nan")] * 4, [1.0], [1e306] * 4])
+def test_a_variance_that_is_none_is_a_bad_sample(variance: list[float]) -> None:
+    trainer = make(number=30)
+    (bad,) = samples(50, 1)
+    assert trainer.add("controller-1", [msgspec.structs.replace(bad, variance=variance)]) == 0
+    assert trainer.counters["bad samples"] == 1

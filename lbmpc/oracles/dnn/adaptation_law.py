@@ -30,7 +30,13 @@ class AdaptationLaw(ABC):
 
     @abstractmethod
     def expression(
-        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+        self,
+        phi: ca.MX,
+        K: ca.MX,
+        error: ca.MX,
+        variance: ca.MX,
+        settings: Mapping[str, ca.MX],
+        memory: Mapping[str, ca.MX],
     ) -> dict[str, ca.MX]:
         """K and what is remembered after one sample.
 
@@ -38,6 +44,7 @@ class AdaptationLaw(ABC):
             phi: features phi_j(x_t, u_t), (f,), phi[0] = 1.
             K: K_t transposed, (d, f).
             error: xtilde_{t+1} = h_hat_t(x_t, u_t) - h(x_t, u_t), (d,), in the units of K' phi.
+            variance: of the label, (d,), in those units squared; 0: it is exact.
             settings: of `settings`.
             memory: of `remembers`.
 

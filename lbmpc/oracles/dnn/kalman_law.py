@@ -1,9 +1,10 @@
 """The last layer as Bayesian linear regression: a Kalman filter for its weights, projected in its own norm.
 
 Every label is h = K' phi with an error of variance r, in units of the output scale; that is the same for all columns of
-K, so they share one covariance Sigma.
+K, so they share one covariance Sigma. r is the configured variance, for what the features cannot explain, and the
+largest of those that come with the label: r_t below is at least r.
 
-    s_t = r + phi' Sigma_t phi
+    s_t = r_t + phi' Sigma_t phi
     Kbar_{t+1} = K_t - Sigma_t phi xtilde_{t+1}' / s_t,    Sigmabar_{t+1} = Sigma_t - Sigma_t phi phi' Sigma_t / s_t
     Sigma_{t+1} = a Sigmabar_{t+1} + (1 - a) p I,          Sigma_0 = p I
     K_{t+1}^(i) = argmin (k - Kbar^(i))' Sigma_{t+1}^-1 (k - Kbar^(i))   over   |k| <= Wbar_i
@@ -14,15 +15,15 @@ keeps Sigma above (1 - a) p I: rounding cannot make it indefinite.
 **Counterpart of Lemma 1.** For any W* with |W*^(i)| <= Wbar_i and any features, those of changing hidden layers too,
 let eps_t = h(x_t, u_t) - W*' phi and V_t = trace (K_t - W*)' Sigma_t^-1 (K_t - W*). Then
 
-    (i)    s_t <= r + p |phi|^2
-    (ii)   V_{t+1} - V_t <= |eps_t|^2 / r - |xtilde_{t+1}|^2 / s_t
-    (iii)  sum |xtilde_{t+1}|^2 / s_t  <=  V_0 + sum |eps_t|^2 / r,     V_0 = |K_0 - W*|_F^2 / p <= 4 sum Wbar_i^2 / p
+    (i)    s_t <= r_t + p |phi|^2
+    (ii)   V_{t+1} - V_t <= |eps_t|^2 / r_t - |xtilde_{t+1}|^2 / s_t
+    (iii)  sum |xtilde_{t+1}|^2 / s_t  <=  V_0 + sum |eps_t|^2 / r_t,     V_0 = |K_0 - W*|_F^2 / p <= 4 sum Wbar_i^2 / p
 
-Proof. Completing the square in k, with Sigmabar^-1 = Sigma_t^-1 + phi phi' / r, gives for each column
+Proof. Completing the square in k, with Sigmabar^-1 = Sigma_t^-1 + phi phi' / r_t, gives for each column
 
-    (k - k_t)' Sigma_t^-1 (k - k_t) + (h - k' phi)^2 / r  =  (k - kbar)' Sigmabar^-1 (k - kbar) + xtilde^2 / s_t.
+    (k - k_t)' Sigma_t^-1 (k - k_t) + (h - k' phi)^2 / r_t  =  (k - kbar)' Sigmabar^-1 (k - kbar) + xtilde^2 / s_t.
 
-At k = W* the first term is V_t, the second |eps|^2 / r, the third V of Kbar in the norm of Sigmabar^-1. From
+At k = W* the first term is V_t, the second |eps|^2 / r_t, the third V of Kbar in the norm of Sigmabar^-1. From
 Sigmabar <= Sigma_t <= p I follows Sigmabar <= Sigma_{t+1} <= p I: (i), and the norm of Sigma_{t+1}^-1 is not larger. In
 that norm the projection onto a convex set which contains W* brings nothing farther from W*: (ii). The sum is (iii).
 
@@ -50,7 +51,7 @@ class Kalman:
     prior_variance: float
     """p, of each entry of K before the first sample."""
     label_variance: float
-    """r, of each entry of a label."""
+    """r, of each entry of a label, besides what comes with it."""
     kept: float
     """a, the share of what is known that one sample later still counts, 0 < a < 1."""
 
@@ -77,11 +78,17 @@ class KalmanLaw(AdaptationLaw):
         }
 
     def expression(
-        self, phi: ca.MX, K: ca.MX, error: ca.MX, settings: Mapping[str, ca.MX], memory: Mapping[str, ca.MX]
+        self,
+        phi: ca.MX,
+        K: ca.MX,
+        error: ca.MX,
+        variance: ca.MX,
+        settings: Mapping[str, ca.MX],
+        memory: Mapping[str, ca.MX],
     ) -> dict[str, ca.MX]:
         Sigma = memory["Sigma"]
         along = Sigma @ phi
-        s = settings["label_variance"] + ca.dot(phi, along)
+        s = settings["label_variance"] + ca.mmax(variance) + ca.dot(phi, along)
         # The product of one vector with itself is symmetric to the last bit, and so is Sigma for ever.
         root = along / ca.sqrt(s)
         less = settings["kept"] * (Sigma - root @ root.T)

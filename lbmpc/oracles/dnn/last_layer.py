@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from lbmpc.casadi_buffers import Bound
-from lbmpc.oracles.base import OracleState, Realise
+from lbmpc.oracles.base import OracleState, Realise, Variance
 from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw
 from lbmpc.oracles.dnn.expressions import NetworkExpressions
 
@@ -50,13 +50,15 @@ class LastLayer:
         past: np.ndarray,
         u: np.ndarray,
         h: np.ndarray,
+        variance: Variance = 0.0,
     ) -> OracleState:
-        """K, (1 + n_L, d), and what the law remembers beside it, after the label h (d,) of the same.
+        """K, (1 + n_L, d), and what the law remembers beside it, after the label h (d,) of the same, with its variance.
 
         state: has both from before.
         """
         self._load(self._learn, hidden, state["K"], x, past, u)
         self._learn.inputs["h"][:, 0] = h
+        self._learn.inputs["variance"][:, 0] = variance
         for name in self._law.remembers:
             self._learn.inputs[name][:] = state[name]
         self._learn()
@@ -90,28 +92,29 @@ class LastLayer:
 
 
 def build_last_layer(net: NetworkExpressions, law: AdaptationLaw) -> tuple[ca.Function, ca.Function]:
-    """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, the law's) -> K_next and the law's.
+    """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, variance, the law's) -> K_next and the law's.
 
     K is (d, 1 + n_L) there.
     """
     features, d = net.description.features, net.d
     su = ca.MX.sym("su", d + (net.pairs - 1) * (d + net.m) + net.m)
     hidden, K = ca.MX.sym("hidden", net.parameters - features * d), ca.MX.sym("K", d, features)
-    h = ca.MX.sym("h", d)
+    h, variance = ca.MX.sym("h", d), ca.MX.sym("variance", d)
     settings = {name: ca.MX.sym(name, len(numbers)) for name, numbers in law.settings().items()}
     memory = {name: ca.MX.sym(name, features, features) for name in law.remembers}
     parts = net.split(ca.vertcat(hidden, ca.vec(K)))
     phi = ca.vertcat(1, net.activation(su, parts))
     unit = K @ phi
-    after = law.expression(phi, K, unit - h / net.output_scale, settings, memory)
+    error, spread = unit - h / net.output_scale, variance / net.output_scale**2
+    after = law.expression(phi, K, error, spread, settings, memory)
     estimate = ca.Function(
         "estimate", [su, hidden, K], [unit * net.output_scale], ["su", "hidden", "K"], ["h_hat"]
     )
     learn = ca.Function(
         "learn",
-        [su, hidden, K, h, *settings.values(), *memory.values()],
+        [su, hidden, K, h, variance, *settings.values(), *memory.values()],
         [ca.densify(value) for value in after.values()],
-        ["su", "hidden", "K", "h", *settings, *memory],
+        ["su", "hidden", "K", "h", "variance", *settings, *memory],
         [f"{name}_next" for name in after],
     )
     return estimate, learn

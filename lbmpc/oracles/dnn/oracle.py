@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from lbmpc.oracles.base import HiddenSet, LearnedNetwork, OracleState, Realise, Verdict
-from lbmpc.oracles.dnn import rollback
+from lbmpc.oracles.base import HiddenSet, LearnedNetwork, OracleState, Realise, Variance, Verdict
+from lbmpc.oracles.dnn import evidence, rollback
 from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw, project_columns, refit
 from lbmpc.oracles.dnn.adoption import IN_USE, NEWEST, Adoption, Refit
 from lbmpc.oracles.dnn.expressions import NetworkExpressions
@@ -35,6 +35,8 @@ class DnnOracle(NetworkExpressions):
         refit: what happens to K when hidden layers are adopted; None: it is kept.
         trial: what hidden layers must show before and after they are adopted; None: nothing.
         kalman: the last layer learns by this filter; None: by the gradient law.
+        fading: h_hat weighs in the prediction what noisy labels bear out, and so much of an earlier label counts one
+            label later; None: it counts whole, as exact labels let it.
     """
 
     name = "dnn"
@@ -49,6 +51,7 @@ class DnnOracle(NetworkExpressions):
         refit: Refit | None = None,
         trial: Trial | None = None,
         kalman: Kalman | None = None,
+        fading: float | None = None,
     ):
         super().__init__(description)
         self.gamma = gamma
@@ -57,6 +60,7 @@ class DnnOracle(NetworkExpressions):
         self.law: AdaptationLaw = (
             GradientLaw(gamma, self.bounds) if kalman is None else KalmanLaw(kalman, self.bounds)
         )
+        self.fading = fading
         self._adoption = Adoption(self, self.bounds, refit, trial)
         self._last_layer: LastLayer | None = None
 
@@ -71,6 +75,8 @@ class DnnOracle(NetworkExpressions):
         if self.refit is not None:
             state["samples"] = np.zeros((self.refit.window, self.pairs * (self.d + self.m) + self.d))
             state["sampled"] = np.zeros(1, dtype=np.int64)
+        if self.fading is not None:
+            state |= evidence.nothing(self.d)
         if self.trial is not None:
             state |= empty(self.trial, self.pairs * (self.d + self.m) + self.d)
             state |= rollback.nothing(hidden, {name: state[name] for name in ("K", *self.law.remembers)})
@@ -97,18 +103,25 @@ class DnnOracle(NetworkExpressions):
         return state["past"] if self.pairs > 1 else np.zeros((0, self.d + self.m))
 
     def theta(self, state: OracleState) -> np.ndarray:
-        return self.pack(self.hidden(state), state["K"])
+        return self.pack(self.hidden(state), self._counting(state))
 
     def compile(self, realise: Realise) -> None:
         """Let `realise` turn what every tick calls into something faster; the virtual machine runs it otherwise."""
         self._last_layer = LastLayer(self, self.law, realise)
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return self._every_tick().estimate(self.hidden(state), state["K"], x, self._before(state), u)
+        return self._every_tick().estimate(
+            self.hidden(state), self._counting(state), x, self._before(state), u
+        )
 
-    def learn(self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray) -> OracleState:
+    def learn(
+        self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
+    ) -> OracleState:
         before = self._before(state)
-        learned = {**state, **self._every_tick().learn(self.hidden(state), state, x, before, u, h)}
+        learned = {**state, **self._every_tick().learn(self.hidden(state), state, x, before, u, h, variance)}
+        if self.fading is not None:
+            h_hat = self._every_tick().estimate(self.hidden(state), state["K"], x, before, u)
+            learned |= evidence.with_label(state, h, h_hat, variance, self.fading)
         if self.pairs > 1:
             learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
         if self.refit is not None or self.trial is not None:
@@ -131,6 +144,10 @@ class DnnOracle(NetworkExpressions):
     def network(self, state: OracleState) -> LearnedNetwork:
         version = state["version"]
         return LearnedNetwork(self.hidden(state), state["K"], int(version[IN_USE]), int(version[NEWEST]))
+
+    def _counting(self, state: OracleState) -> np.ndarray:
+        """K as it counts in the prediction, (1 + n_L, d)."""
+        return state["K"] if self.fading is None else state["K"] * evidence.weight(state)
 
     def _every_tick(self) -> LastLayer:
         if self._last_layer is None:

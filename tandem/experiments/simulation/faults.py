@@ -44,6 +44,4 @@ class Faults(Section, frozen=True):
     """How long a training takes; none begins while one goes on."""
     trainer_dies_at: NonNegative | None = None
     """Seconds; what it had not sent by then is lost."""
-    noise: list[NonNegative] | None = None
-    """Standard deviation of what is measured of each state, in its unit."""
     drift: Drift | None = None

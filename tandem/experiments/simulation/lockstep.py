@@ -25,6 +25,7 @@ from node_runtime.config.plant import files_of, initial_state, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
+from plant_sim.sensors import Sensors
 from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from protocol import topics
@@ -141,12 +142,11 @@ class LockStep:
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         self.plant = self._started_plant(initial_state(config, self.core.plant))
         self.changes = self._changes()
-        self.noise = self._noise()
+        self.sensors = Sensors(config, self.core.plant)
         if faults.command_seconds >= config.period:
             raise ConfigError(
                 f"faults.command_seconds = {faults.command_seconds:g} is not less than a period, {config.period:g} s"
             )
-        self.draws = np.random.default_rng([config.seed, 0x4015E])
         self.trainer = self._trainer() if config.trainer.enabled else None
         self.on_the_way: list[tuple[int, m.HiddenWeights]] = []
         self.log: list[tuple[Topic, m.Message, int]] = []
@@ -173,12 +173,6 @@ class LockStep:
             return self.faults.drift.plants(self.true)
         except (KeyError, PlantError) as error:
             raise ConfigError(f"faults.drift: {error.args[0]}") from error
-
-    def _noise(self) -> np.ndarray | None:
-        noise, states = self.faults.noise, self.core.plant.d
-        if noise is not None and len(noise) != states:
-            raise ConfigError(f"faults.noise has {len(noise)} entries, the plant has {states} states")
-        return None if noise is None else np.array(noise)
 
     def _trainer(self) -> Trainer | None:
         snapshot = self.core.memory.hidden_snapshot(-1)
@@ -256,7 +250,7 @@ class LockStep:
             skipped=0,
             lateness=0.0,
             late=False,
-            state_verdict="fresh",
+            state_verdict="missing" if state is None else "fresh",
             state=state,
             weights=weights,
             truth=dict(truth),
@@ -315,11 +309,10 @@ class LockStep:
         dies = self.faults.trainer_dies_at
         return dies is not None and seq * self.config.period > dies
 
-    def _measured(self, true: m.PlantState) -> m.PlantState:
-        if self.noise is None:
-            return true
-        noisy = np.array(true.x) + self.noise * self.draws.standard_normal(len(self.noise))
-        return msgspec.structs.replace(true, x=noisy.tolist())
+    def _measured(self, true: m.PlantState) -> m.PlantState | None:
+        """The sample as its controller gets it; None where it is lost."""
+        x = self.sensors.measure(np.array(true.x), true.t)
+        return None if x is None else msgspec.structs.replace(true, x=x.tolist())
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
         self.log.append(self._noted(topic, message, seq))

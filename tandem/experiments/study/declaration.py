@@ -129,7 +129,7 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def draws(self) -> bool:
         """Whether two seeds are two different runs."""
-        return _draws(self.config, self.faults)
+        return _draws(self.config)
 
     def config_of(self, seed: int, x0: list[float] | None) -> Config:
         plant = self.config.plant if x0 is None else msgspec.structs.replace(self.config.plant, x0=x0)
@@ -225,7 +225,7 @@ def _resolve(
                 config=config,
                 varied=varied,
                 words=words,
-                seeds=seeds if _draws(config, faults) else seeds[:1],
+                seeds=seeds if _draws(config) else seeds[:1],
                 x0s=x0s,
                 steps=_said(levels, "steps", STEPS),
                 episodes=episodes,
@@ -236,8 +236,9 @@ def _resolve(
     return made
 
 
-def _draws(config: Config, faults: Faults) -> bool:
-    return config.controller.oracle == "dnn" or faults.noise is not None
+def _draws(config: Config) -> bool:
+    sensors = config.plant.sensors
+    return config.controller.oracle == "dnn" or bool(sensors.noise or sensors.dropouts)
 
 
 def _said(levels: Sequence[Runs], key: str, otherwise: Any) -> Any:

@@ -55,9 +55,11 @@ class Lemma(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def measure(run: Run, oracle: DnnOracle) -> Lemma | None:
-    """From the log alone. None where the lemma says nothing: no sample, or a last layer under another law."""
+    """From the log alone. None where the lemma says nothing: no sample, labels with a variance, or another law."""
     samples = {sample.seq: sample for sample in run.samples}
     weights = [w for w in run.output_weights if w.seq in samples]
+    if any(sample.variance for sample in samples.values()):
+        return None
     if not weights or not isinstance(oracle.law, GradientLaw) or oracle.gamma == 0.0:
         return None
     hidden = _hidden_by_hash(run, oracle)

@@ -68,7 +68,7 @@ def _job(config: Config, case: Resolved) -> Job:
     faults = case.faults
     if config.controller.oracle != "dnn":
         faults = msgspec.structs.replace(faults, training_seconds=0.0, trainer_dies_at=None)
-    return Job(config=_what_counts(config, faults), steps=case.steps, episodes=case.episodes, faults=faults)
+    return Job(config=_what_counts(config), steps=case.steps, episodes=case.episodes, faults=faults)
 
 
 def _floor(config: Config, case: Resolved) -> Job:
@@ -77,7 +77,7 @@ def _floor(config: Config, case: Resolved) -> Job:
     return _job(msgspec.structs.replace(config, controller=controller), case)
 
 
-def _what_counts(config: Config, faults: Faults) -> Config:
+def _what_counts(config: Config) -> Config:
     """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
     unread, oracle = ["name", "bus", "log", "realtime"], config.controller.oracle
     if oracle != "constant":
@@ -86,7 +86,7 @@ def _what_counts(config: Config, faults: Faults) -> Config:
         unread.append("l2nw")
     if oracle != "dnn":
         unread += ["network", "adaptation", "trainer"]
-        if faults.noise is None:
+        if not (config.plant.sensors.noise or config.plant.sensors.dropouts):
             unread.append("seed")
     default = Config()
     return msgspec.structs.replace(config, **{name: getattr(default, name) for name in unread})

@@ -6,8 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lbmpc.oracles import DnnOracle
+from lbmpc.oracles.dnn import evidence
 from lbmpc.oracles.dnn.adaptation_law import project_columns
-from tests.helpers.science import adapt
+from tests.helpers.science import adapt, compressor, describe, features, function
 
 
 class Case:
@@ -85,3 +87,93 @@ def test_without_noise_the_error_on_a_repeated_point_shrinks_by_one_minus_gamma(
 def test_projection_scales_a_long_column_and_leaves_a_short_one() -> None:
     K = project_columns(np.array([[3.0, 0.1], [4.0, 0.0]]), np.array([1.0, 1.0]))
     np.testing.assert_allclose(K, [[0.6, 0.1], [0.8, 0.0]])
+
+
+def test_a_label_without_a_variance_takes_the_papers_step_to_the_bit_and_one_within_its_noise_takes_none() -> (
+    None
+):
+    oracle, rng = DnnOracle(describe(compressor(), [8]), gamma=0.6), np.random.default_rng(3)
+    state, x, u = oracle.initial_state(rng), np.full(4, 0.1), np.array([0.2])
+    for _ in range(5):
+        h = 0.01 * rng.normal(size=4)
+        exact = oracle.learn(state, x, u, h)["K"]
+        assert exact.tobytes() == oracle.learn(state, x, u, h, np.zeros(4))["K"].tobytes()
+        phi = features(oracle, state, x, u)
+        error = (oracle.estimate(state, x, u) - h) / oracle.output_scale
+        np.testing.assert_allclose(exact, adapt(state["K"], phi, error, 0.6, oracle.bounds), atol=1e-15)
+        wide = oracle.learn(state, x, u, h, (oracle.output_scale * error / 2.9) ** 2)["K"]
+        np.testing.assert_array_equal(wide, state["K"])
+        state = {**state, "K": exact}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    gamma=st.floats(0.05, 0.95),
+    deviation=st.sampled_from([1e-4, 1e-3, 1e-2, 0.1]),
+    within=st.booleans(),
+)
+def test_lemma_1_where_labels_have_a_variance(
+    seed: int, gamma: float, deviation: float, within: bool
+) -> None:
+    """On the oracle itself; `within`: no error of a label is larger than three of its deviations."""
+    oracle = DnnOracle(describe(compressor(), [6], scale=0.02), gamma=gamma, column_bound=0.03)
+    rng = np.random.default_rng(seed)
+    state = oracle.initial_state(rng)
+    state["K"] = project_columns(rng.normal(size=state["K"].shape), oracle.bounds)
+    ideal = project_columns(rng.normal(size=state["K"].shape), oracle.bounds)
+    start, corrected = ((state["K"] - ideal) ** 2).sum(), 0.0
+    for _ in range(40):
+        x, u = rng.uniform(-0.5, 0.5, 4), rng.uniform(-1, 1, 1)
+        phi = features(oracle, state, x, u)
+        deviations = deviation * rng.uniform(0.2, 1.0, 4)
+        draw = rng.uniform(-3.0, 3.0, 4) if within else 5.0 * rng.normal(size=4)
+        epsilon = draw * deviations / oracle.output_scale
+        label = ideal.T @ phi + epsilon
+        error = state["K"].T @ phi - label
+        variance = (deviations / oracle.output_scale) ** 2
+        step = gamma * np.maximum(0.0, 1.0 - 9.0 * variance / error**2)
+        after = oracle.learn(state, x, u, label * oracle.output_scale, deviations**2)
+        np.testing.assert_allclose(after["K"], adapt(state["K"], phi, error, step, oracle.bounds), atol=1e-12)
+        before, now = ((state["K"] - ideal) ** 2).sum(), ((after["K"] - ideal) ** 2).sum()
+        assert now <= 4.0 * (oracle.bounds**2).sum() * (1 + 1e-12)  # (i)
+        bound = (step * (epsilon**2 - (1.0 - step) * error**2)).sum() / (phi @ phi)
+        assert now - before <= bound + 1e-10 * (1.0 + before)  # (ii)
+        gone = ((step * error) ** 2).sum() / (phi @ phi)
+        if within:
+            assert now - before <= -(1.0 - gamma) / gamma * gone + 1e-10 * (1.0 + before)  # (iii)
+        corrected, state = corrected + gone, after
+    if within:
+        assert corrected <= gamma / (1.0 - gamma) * start + 1e-8
+
+
+def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
+    rng = np.random.default_rng(0)
+    state = evidence.nothing(3)
+    np.testing.assert_array_equal(evidence.weight(state), 0.0)
+    variance = np.array([1e-4, 1e-4, 1e-12])
+    for _ in range(200):
+        h_hat = 0.02 * rng.normal(size=3)
+        # A true prediction, one that has nothing to do with h, a true one of exact labels.
+        h = np.array([h_hat[0], 0.0, h_hat[2]]) + np.sqrt(variance) * rng.normal(size=3)
+        state = evidence.with_label(state, h, h_hat, variance, 0.98)
+    good, bad, exact = evidence.weight(state)
+    assert good > 0.75
+    assert bad < 0.1
+    assert abs(exact - 1.0) < 1e-3
+
+
+def test_the_prediction_and_its_parameters_have_that_weight_and_training_has_the_whole_K() -> None:
+    oracle = DnnOracle(describe(compressor(), [8]), fading=0.95)
+    plain = DnnOracle(describe(compressor(), [8]))
+    state = oracle.initial_state(np.random.default_rng(1))
+    x, u = np.full(4, 0.1), np.array([0.2])
+    assert not oracle.estimate(state, x, u).any()
+    for _ in range(10):
+        state = oracle.learn(state, x, u, np.array([0.01, -0.01, 0.0, 1e-4]), np.full(4, 1e-8))
+    weight = evidence.weight(state)
+    assert 0.5 < weight[0] <= 1.0
+    np.testing.assert_allclose(oracle.estimate(state, x, u), weight * plain.estimate(state, x, u), rtol=1e-12)
+    value = function(oracle)(x, u, oracle.theta(state))[0]
+    np.testing.assert_allclose(np.array(value)[:, 0], oracle.estimate(state, x, u), rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(oracle.network(state).K, state["K"])

@@ -30,19 +30,21 @@ MODEL = compressor()
 FILTER = Kalman(prior_variance=0.02, label_variance=0.05, kept=0.99)
 
 
-Step = Callable[[OracleState, np.ndarray, np.ndarray], OracleState]
+Step = Callable[[OracleState, np.ndarray, np.ndarray, np.ndarray | float], OracleState]
 
 
 def stepping(law: KalmanLaw, features: int, d: int) -> Step:
-    """(state, phi, error) -> state, as an oracle does it."""
+    """(state, phi, error, the label's variance) -> state, as an oracle does it."""
     phi, K, error = ca.MX.sym("phi", features), ca.MX.sym("K", d, features), ca.MX.sym("error", d)
-    Sigma = ca.MX.sym("Sigma", features, features)
+    Sigma, variance = ca.MX.sym("Sigma", features, features), ca.MX.sym("variance", d)
     numbers = {name: ca.DM(value) for name, value in law.settings().items()}
-    after = law.expression(phi, K, error, numbers, {"Sigma": Sigma})
-    f = ca.Function("f", [phi, K, error, Sigma], [after["K"], after["Sigma"]])
+    after = law.expression(phi, K, error, variance, numbers, {"Sigma": Sigma})
+    f = ca.Function("f", [phi, K, error, variance, Sigma], [after["K"], after["Sigma"]])
 
-    def step(state: OracleState, phi: np.ndarray, error: np.ndarray) -> OracleState:
-        K, Sigma = f(phi, state["K"].T, error, state["Sigma"])
+    def step(
+        state: OracleState, phi: np.ndarray, error: np.ndarray, variance: np.ndarray | float = 0.0
+    ) -> OracleState:
+        K, Sigma = f(phi, state["K"].T, error, variance, state["Sigma"])
         return law.bounded({"K": np.array(K).T, "Sigma": np.array(Sigma)})
 
     return step
@@ -75,13 +77,16 @@ class Case:
         phi = np.concatenate([[1.0], np.tanh(self.turned @ self.rng.normal(size=n))])
         epsilon = self.noise * self.rng.uniform() * self.rng.normal(size=self.d)
         error = self.state["K"].T @ phi - (self.ideal.T @ phi + epsilon)
-        s = self.filter.label_variance + phi @ self.state["Sigma"] @ phi
-        assert s <= self.filter.label_variance + self.filter.prior_variance * (phi @ phi) * (1 + 1e-9)  # (i)
-        self.state = self.step_law(self.state, phi, error)
+        # Some labels come with a variance of their own.
+        variance = self.rng.uniform(size=self.d) * self.rng.choice([0.0, 0.01, 1.0])
+        r = self.filter.label_variance + variance.max()
+        s = r + phi @ self.state["Sigma"] @ phi
+        assert s <= r + self.filter.prior_variance * (phi @ phi) * (1 + 1e-9)  # (i)
+        self.state = self.step_law(self.state, phi, error, variance)
         norms = np.linalg.norm(self.state["K"], axis=0)
         assert (norms <= self.bounds * (1 + 1e-12)).all()
         self.projected += int((norms > self.bounds * (1 - 1e-9)).any())
-        return float(error @ error) / s, float(epsilon @ epsilon) / self.filter.label_variance, s
+        return float(error @ error) / s, float(epsilon @ epsilon) / r, s
 
     def lyapunov(self) -> float:
         missing = self.state["K"] - self.ideal
@@ -150,7 +155,7 @@ def test_a_million_updates_leave_the_covariance_symmetric_and_positive() -> None
     law = KalmanLaw(Kalman(1.0, 1e-8, 1 - 1e-9), np.array([1.0]))
     phi, Sigma = ca.MX.sym("phi", f), ca.MX.sym("Sigma", f, f)
     numbers = {name: ca.DM(value) for name, value in law.settings().items()}
-    after = law.expression(phi, ca.MX(1, f), ca.MX(1, 1), numbers, {"Sigma": Sigma})["Sigma"]
+    after = law.expression(phi, ca.MX(1, f), ca.MX(1, 1), ca.MX(1, 1), numbers, {"Sigma": Sigma})["Sigma"]
     folded = ca.Function("f", [Sigma, phi], [after]).expand().fold(many)
     # Nearly always the same direction, as at rest.
     phis = np.vstack([np.ones(many), 1e-6 * rng.normal(size=(f - 1, many))])

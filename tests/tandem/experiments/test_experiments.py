@@ -115,8 +115,8 @@ def run_small(path: Path, out: Path, processes: int) -> Finished:
         ("z = [0.4, 0.6]", "zz = [0.4]", "x0s.some.grid = 'zz' is not known; did you mean 'z'?"),
         (
             "log = true",
-            "faults.nose = 1",
-            "unknown key 'case[3].faults.nose'; did you mean 'case[3].faults.noise'?",
+            "faults.drifts = 1",
+            "unknown key 'case[3].faults.drifts'; did you mean 'case[3].faults.drift'?",
         ),
         ('reference = "dnn"', 'reference = "dn"', "reference = 'dn' is not known; did you mean 'dnn'?"),
     ],

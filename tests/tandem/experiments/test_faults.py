@@ -114,13 +114,13 @@ def test_the_three_starts_of_K() -> None:
 
 
 def test_noise_is_in_what_is_measured_and_not_in_the_truth() -> None:
-    noise = [0.001, 0.001, 0.0, 0.0]
-    run = follow(config("controller.oracle=linear"), 40, Faults(noise=noise)).run
+    noisy = config("controller.oracle=linear", "plant.sensors.noise={z=0.002, y=0.002}")
+    run = follow(noisy, 40).run
     measured = np.array([tick.state.x for tick in run.ticks if tick.state is not None])
     difference = measured - states(run)[:-1]
     assert 0.0005 < difference[:, :2].std() < 0.0015
     assert not difference[:, 2:].any()
-    again = follow(config("controller.oracle=linear"), 40, Faults(noise=noise)).run
+    again = follow(noisy, 40).run
     np.testing.assert_array_equal(states(run), states(again))
     assert replay(run).equal
 
@@ -216,8 +216,8 @@ def test_who_learns_is_not_told_of_a_drift() -> None:
 def test_faults_that_do_not_fit_the_plant_are_named() -> None:
     with pytest.raises(ConfigError, match=r"faults\.drift: .* no parameter 'bta'; did you mean 'beta'"):
         follow(config(), 5, Faults(drift=Drift(to={"bta": 2.0}, at=0.0)))
-    with pytest.raises(ConfigError, match="2 entries, the plant has 4 states"):
-        follow(config(), 5, Faults(noise=[0.1, 0.1]))
+    with pytest.raises(ConfigError, match=r"plant\.sensors\.noise: .* no state 'zz'; did you mean 'z'"):
+        follow(config("plant.sensors.noise={zz=0.1}"), 5)
 
 
 def test_lemma_1_holds_on_a_real_run() -> None:

@@ -179,7 +179,7 @@ class Silent:
         self.config, self.bad, self.run_id, self.published = config, RejectedMessages(), "trainer", 0
 
     def queue(self, topic: Topic, capacity: int, arrived: threading.Condition | None = None) -> Mailbox:
-        return Mailbox(topic.name, capacity)
+        return Mailbox(topic.name, capacity, arrived=arrived)
 
     def publish(self, _topic: Topic, _message: object) -> None:
         self.published += 1

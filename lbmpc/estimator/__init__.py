@@ -1,0 +1,1 @@
+"""The state from what is measured, and the labels that go with it."""

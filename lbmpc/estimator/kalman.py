@@ -1,0 +1,185 @@
+"""A Kalman filter of the nominal model with a disturbance of each state.
+
+    x_{t+1} = A x_t + B u_t + delta_t,    delta_{t+1} = rho delta_t + w_t,    y_t = C x_t + v_t
+
+delta stands for h along the motion: a process of its own standard deviation, the natural scale of W, that becomes
+another in so many seconds. Without it the filter would trust a model that is wrong by h, and its estimates would be
+off by what h adds up to in the filter's memory. Nothing learned is in here: what the oracle learns from these estimates
+does not come back as a label.
+
+The covariance is a memory, not the stationary one: at the start, and after lost samples, less is known.
+
+**Labels.** Of a measured state i, h_i(x_t, u_t) is y_{t+1} - A x_t - B u_t with x_t the estimate *before* that
+measurement. Its error is v_{t+1} - A (x_t - xhat_t), of variance R_i + (A P_t A')_i; as the innovations of a filter are
+white, so are the errors of consecutive labels, as far as the process above describes h. No delta is in it, so a label
+is not pulled towards what was believed. Of a state that nobody measures only delta is known; its variance counts as
+often as neighbouring labels say the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import schur
+
+from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
+from lbmpc.model import Model
+from lbmpc.plants.linear_motion import Pieces, balanced
+
+LEAST = 1e-6
+"""Half-widths: a standard deviation below this counts as this."""
+UNKNOWN = 1.0
+"""Half-widths: standard deviation of a state that nobody measures, before the first sample."""
+LONGEST_GAP = 100
+"""Periods without a sample after which nothing is known any more."""
+RANK, PART = 1e-9, 1e-6
+"""What counts as nothing: of the largest singular value, and of a mode."""
+LASTS = 1.0 - 1e-6
+"""|eigenvalue| from which on a mode does not fade."""
+
+
+class KalmanEstimator(Estimator):
+    """Of the state and of a disturbance.
+
+    Args:
+        model: the nominal model.
+        measured: indices of the states that are measured.
+        noise: standard deviation of what is measured, (d,), in units of the states.
+        process: that of h, (d,).
+        correlation: seconds in which h becomes another, by a factor of e.
+    """
+
+    noisy = True
+
+    def __init__(
+        self, model: Model, measured: np.ndarray, noise: np.ndarray, process: np.ndarray, correlation: float
+    ):
+        d = model.d
+        self._model, self._measured = model, measured
+        units = self._units = balanced(model.plant)[:d]
+        least = LEAST * model.plant.x_scale
+        self._R = (np.maximum(noise, least) / units)[measured] ** 2
+        sigma = np.maximum(process, least * model.period) / units
+        rho = self._kept = float(np.exp(-model.period / correlation))
+        self._F = np.block(
+            [[model.A * units / units[:, None], np.eye(d)], [np.zeros((d, d)), rho * np.eye(d)]]
+        )
+        self._Q = np.diag(np.concatenate([np.zeros(d), (1.0 - rho**2) * sigma**2]))
+        x = UNKNOWN * model.plant.x_scale / units
+        self._unknown = np.diag(np.concatenate([x, sigma]) ** 2)
+        inputs = model.B * model.plant.u_scale / units[:, None]
+        self._any_input = np.zeros((2 * d, 2 * d))
+        self._any_input[:d, :d] = inputs @ inputs.T
+        # Of an unmeasured state: how many labels in a row say the same.
+        self._repeats = (1.0 + rho) / (1.0 - rho)
+
+    def initial_state(self) -> EstimatorState:
+        d = self._model.d
+        return {
+            "x": np.zeros(d),
+            "disturbance": np.zeros(d),
+            "covariance": self._unknown,
+            "sample": np.array([0, -1], dtype=np.int64),
+            "inputs": np.zeros((2, self._model.m)),
+        }
+
+    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+        source, sequence = state["sample"].tolist()
+        periods = seen.sequence - sequence
+        known = sequence >= 0 and seen.source == source and periods <= LONGEST_GAP
+        if seen.applied is None or not known:
+            after = self._begun(state, seen)
+            estimate = Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+        elif periods <= 0:
+            # The period was counted as missed, and its sample comes late.
+            after = self._corrected(state, seen.y[self._measured])
+            estimate = Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+        else:
+            after, estimate = self._followed(state, seen, seen.applied, periods)
+        return {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}, estimate
+
+    def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
+        source, sequence = state["sample"].tolist()
+        if sequence < 0:
+            return state
+        first, then = state["inputs"]
+        pieces = ((delay, first), (self._model.period - delay, then)) if delay > 0.0 else ()
+        after = self._predicted(state, self._nominal(state["x"], then, pieces))
+        return {**after, "sample": np.array([source, sequence + 1], dtype=np.int64)}
+
+    def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
+        return {**state, "inputs": np.stack([state["inputs"][1], u])}
+
+    def _begun(self, state: EstimatorState, seen: Measured) -> EstimatorState:
+        """After a sample of which nothing is known that came before."""
+        begun = {**self.initial_state(), "inputs": state["inputs"]}
+        begun["x"][self._measured] = seen.y[self._measured]
+        return self._corrected(begun, seen.y[self._measured])
+
+    def _followed(
+        self, state: EstimatorState, seen: Measured, u: np.ndarray, periods: int
+    ) -> tuple[EstimatorState, Estimate]:
+        """After a sample so many periods behind the one before, under u, (m,), in the last of them."""
+        measured, d = self._measured, self._model.d
+        for _ in range(periods - 1):
+            # What acted then is not known.
+            state = self._predicted(state, self._nominal(state["x"], u, ()))
+            state = {**state, "covariance": state["covariance"] + self._any_input}
+        nominal, before = self._nominal(state["x"], u, seen.pieces), state["covariance"][:d, :d]
+        after = self._corrected(self._predicted(state, nominal), seen.y[measured])
+        reached = nominal + after["disturbance"]
+        reached[measured] = seen.y[measured]
+        variance = np.diag(after["covariance"])[d:] * self._repeats
+        A = self._F[measured, :d]
+        variance[measured] = self._R + ((A @ before) * A).sum(axis=1)
+        return after, Estimate(after["x"], reached, variance * self._units**2)
+
+    def _nominal(self, x: np.ndarray, u: np.ndarray, pieces: Pieces) -> np.ndarray:
+        """Where the nominal model leads within a period, (d,)."""
+        return self._model.A.dot(x) + (self._model.within.answer(pieces) if pieces else self._model.B.dot(u))
+
+    def _predicted(self, state: EstimatorState, nominal: np.ndarray) -> EstimatorState:
+        P = self._F @ state["covariance"] @ self._F.T + self._Q
+        return {
+            **state,
+            "x": nominal + state["disturbance"],
+            "disturbance": self._kept * state["disturbance"],
+            "covariance": 0.5 * (P + P.T),
+        }
+
+    def _corrected(self, state: EstimatorState, y: np.ndarray) -> EstimatorState:
+        d, P, measured = self._model.d, state["covariance"], self._measured
+        S = P[np.ix_(measured, measured)] + np.diag(self._R)
+        gain = np.linalg.solve(S, P[measured]).T
+        moved = gain @ ((y - state["x"][measured]) / self._units[measured])
+        # Joseph's form: rounding cannot make it indefinite.
+        left = np.eye(2 * d)
+        left[:, measured] -= gain
+        P = left @ P @ left.T + (gain * self._R) @ gain.T
+        return {
+            **state,
+            "x": state["x"] + self._units * moved[:d],
+            "disturbance": state["disturbance"] + self._units * moved[d:],
+            "covariance": 0.5 * (P + P.T),
+        }
+
+
+def unobservable(model: Model, measured: np.ndarray) -> list[int]:
+    """Indices of the states of which no sample ever tells all, and which do not come to rest by themselves either.
+
+    They have a part in a mode of A that does not fade and that what is `measured` does not see.
+    """
+    d, units = model.d, balanced(model.plant)[: model.d]
+    # A and (A - I) / T have the same unseen modes, and at a short period this has more digits.
+    slope = (model.A * units / units[:, None] - np.eye(d)) / model.period
+    slope = slope / max(np.abs(slope).sum(axis=1).max(), 1e-300)
+    rows = [np.eye(d)[measured]]
+    for _ in range(d - 1):
+        rows.append(rows[-1] @ slope)
+    _left, sizes, right = np.linalg.svd(np.vstack(rows))
+    unseen = right[int((sizes > RANK * sizes[0]).sum()) :].T
+    if not unseen.size:
+        return []
+    inner = unseen.T @ (model.A * units / units[:, None]) @ unseen
+    # Of an invariant subspace, not of eigenvectors: two integrators in a row have one of those.
+    _form, vectors, count = schur(inner, sort=lambda re, im: np.hypot(re, im) >= LASTS)
+    return np.flatnonzero((np.abs(unseen @ vectors[:, :count]) > PART).any(axis=1)).tolist()

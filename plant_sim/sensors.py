@@ -1,0 +1,69 @@
+"""Sensors of a simulated plant that err: noise, white or coloured, quantisation, bias, lost samples, a stuck value."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lbmpc.plants import Description
+from node_runtime.config.plant import in_half_widths
+from node_runtime.config.sections import Config
+
+SENSORS = 0x4015E
+"""Besides the seed, so that nothing else of a run draws the same numbers."""
+
+
+class Sensors:
+    """What is measured of a true state. The same calls give the same numbers.
+
+    Args:
+        config: has `plant.sensors` and the seed.
+        plant: its states and half-widths.
+    """
+
+    def __init__(self, config: Config, plant: Description):
+        self._settings, self._scale = config.plant.sensors, plant.x_scale
+        settings, names = self._settings, plant.states
+        self._noise = in_half_widths(settings.noise, plant) * self._scale
+        self._step = in_half_widths(settings.quantisation, plant) * self._scale
+        self._bias = in_half_widths(settings.bias, plant) * self._scale
+        self._stuck_from = np.array([settings.stuck.get(name, math.inf) for name in names])
+        self._draws = np.random.default_rng([config.seed, SENSORS])
+        self._last: tuple[float, np.ndarray] | None = None
+        self._first: float | None = None
+        self._held = np.full(len(names), math.nan)
+
+    @property
+    def perfect(self) -> bool:
+        """Whether what is measured is the true state."""
+        settings = self._settings
+        err = self._noise.any() or self._step.any() or self._bias.any() or settings.stuck or settings.dropouts
+        return not err
+
+    def measure(self, x: np.ndarray, t: float) -> np.ndarray | None:
+        """What is measured of x, (d,), at t, seconds, plant units; None where the sample is lost. t must not fall."""
+        if self.perfect:
+            return x
+        self._first = t if self._first is None else self._first
+        since = t - self._first
+        seen = x + self._noise * self._drawn(t)
+        if since >= self._settings.bias_at:
+            seen = seen + self._bias
+        coarse = self._step > 0.0
+        seen[coarse] = np.rint(seen[coarse] / self._step[coarse]) * self._step[coarse]
+        stuck = since >= self._stuck_from
+        self._held = np.where(stuck & ~np.isnan(self._held), self._held, np.where(stuck, seen, math.nan))
+        seen = np.where(stuck, self._held, seen)
+        lost = self._settings.dropouts > 0.0 and self._draws.uniform() < self._settings.dropouts
+        return None if lost else seen
+
+    def _drawn(self, t: float) -> np.ndarray:
+        """Noise of variance 1, (d,)."""
+        drawn, correlation = self._draws.standard_normal(len(self._scale)), self._settings.correlation
+        if correlation > 0.0 and self._last is not None:
+            at, before = self._last
+            kept = math.exp(-(t - at) / correlation)
+            drawn = kept * before + math.sqrt(1.0 - kept * kept) * drawn
+        self._last = t, drawn
+        return drawn

@@ -1,0 +1,99 @@
+"""Noise and an estimator in the whole loop: what is judged is the truth, and a log says all again, byte for byte."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller_node.core import ControllerCore
+from lbmpc.plants import get_plant
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
+from run_log.replaying.replay import replay
+from run_log.run import Run
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow, simulate
+
+PLANT = get_plant("moore_greitzer")
+SETTINGS = [
+    "controller.solver.compile=never",
+    "controller.horizon=15",
+    "controller.keyframe_every=20",
+    "network.hidden=[6]",
+    "trainer.steps=20",
+    "plant.x0=[0.4, 1.6, 1.1547, 0]",
+    "plant.sensors.noise=0.01",
+    "estimator.kind=kalman",
+]
+
+
+def config(*more: str) -> Config:
+    return load(None, [*SETTINGS, *more])
+
+
+def true(run: Run) -> np.ndarray:
+    return np.array([state.x for state in run.plant_states])
+
+
+@pytest.fixture(scope="module")
+def lossy() -> Run:
+    return follow(
+        config("plant.sensors.dropouts=0.1", "adaptation.law=kalman"), 80, Faults(command_seconds=0.01)
+    ).run
+
+
+def test_it_replays_byte_for_byte_from_the_beginning_and_from_the_middle(lossy: Run) -> None:
+    lost = [tick.seq for tick in lossy.ticks if tick.state is None]
+    assert 2 <= len(lost) <= 20
+    assert all(lossy.ticks[seq].state_verdict == "missing" for seq in lost)
+    assert replay(lossy).equal
+    middle = replay(lossy, from_tick=45)
+    assert middle.equal
+    assert middle.first_tick > 20
+
+
+def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
+    assert len(lossy.samples) > 40
+    for sample in lossy.samples:
+        assert len(sample.variance) == 4
+        # At least the noise of one measurement.
+        assert (np.array(sample.variance) >= (0.01 * PLANT.x_scale) ** 2 * (1 - 1e-9)).all()
+    exact = simulate(config("estimator.kind=none"), 10)
+    assert all(sample.variance == [] for sample in exact.samples)
+    assert not any(name.startswith("estimator") for name in exact.keyframes[0].arrays)
+    assert "oracle.evidence" not in exact.keyframes[0].arrays
+
+
+def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) -> None:
+    core = ControllerCore(config("adaptation.law=kalman"), "controller-a")
+    core.memory.restore(lossy.keyframes[2])
+    again = ControllerCore(config("adaptation.law=kalman"), "controller-b")
+    again.memory.go_on(core.memory.lasting(), "controller-a")
+    for name in ("x", "disturbance", "covariance", "sample"):
+        np.testing.assert_array_equal(again.memory.state.estimator[name], core.memory.state.estimator[name])
+    # From there both go on alike, and a log of either replays.
+    for tick in lossy.ticks[60:70]:
+        core.step(tick)
+        again.step(tick)
+    np.testing.assert_array_equal(again.memory.state.estimator["x"], core.memory.state.estimator["x"])
+
+
+def test_half_of_the_states_measured_and_a_wrong_start_is_survived() -> None:
+    settings = ["controller.oracle=linear", 'estimator.measured=["z", "y"]']
+    begun = [0.4, 1.6, 1.1547 + 0.3, 5.0]
+    outcome = follow(config(*settings, f"plant.x0={begun}"), 200)
+    assert outcome.lost is None
+    assert (np.abs(true(outcome.run)[-20:] - PLANT.x_e) < 0.1 * PLANT.x_scale).all()
+
+
+def test_learning_costs_little_more_than_the_nominal_model_where_noise_exceeds_h() -> None:
+    def J(*more: str) -> float:
+        run = simulate(config("controller.horizon=20", *more), 150)
+        off, inputs = true(run)[:-1] - PLANT.x_e, np.array([r.u for r in run.results]) - PLANT.u_e
+        return float((off**2).sum() + (inputs**2).sum()) / 20.0
+
+    linear = J("controller.oracle=linear")
+    assert J() < 1.05 * linear
+    assert J("adaptation.law=kalman") < 1.05 * linear
+    # What it was without any of it.
+    assert J("estimator.kind=none") > 3.0 * linear
