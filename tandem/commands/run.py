@@ -151,7 +151,7 @@ class Run(Configured):
     def _conclude(
         self, config: Config, files: RunFiles, trouble: str | None, logged: bool, began: bool
     ) -> int:
-        """Figures and picture from the log, with the equations that `config` names.
+        """Figures and picture from the log, with the equations that `config` names if they moved here.
 
         Raises:
             Impatient: the figures are not waited for.
@@ -189,7 +189,8 @@ class Run(Configured):
                 ran = read_run(parts[0] if parts else files.log)
                 # A file may have changed since, and then nothing is said of the motion between samples.
                 with suppress(ConfigError):
-                    ran.truth = true_plant_of(config, get_plant, get_truth)
+                    # What a machine does between them nobody knows.
+                    ran.truth = None if self.no_plant else true_plant_of(config, get_plant, get_truth)
                 summary = summarise(ran)
             result = summary_table.of(summary)
             self.console.print(summary_table.table(summary))

@@ -18,21 +18,25 @@ from rich.text import Text
 
 from lbmpc.plants import get_plant
 from node_runtime.bus.mailbox import Delivery
+from node_runtime.config.loading import load
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.reading.reader import read_run
+from run_log.writing.save import save
 from tandem import terminal
 from tandem.cli import main
 from tandem.commands.processes import PrintableLog
 from tandem.commands.run import Run
 from tandem.console import PlainConsole
+from tandem.experiments.simulation.lockstep import simulate
 from tandem.live import view
 from tandem.live.files import RunFiles
 from tandem.live.monitor import Monitor, Snapshot
 from tandem.live.screen import Screen
 from tandem.live.supervisor import Impatient
 from tandem.terminal import Refused
+from tests.helpers.paths import ROOT
 
 NASTY = "a\x1b]0;owned\x9b31m\u202eb [red]c :smile:"
 SHOWN = r"a\u001b]0;owned\u009b31m\u202eb [red]c :smile:"
@@ -205,6 +209,19 @@ def test_a_second_ctrl_c_while_drawing_keeps_the_figures(
     assert "interrupted while drawing; `tandem report" in result["error"]
     assert "ticks" in said.err
     assert not files.picture.exists()
+
+
+def test_nothing_is_said_of_a_machine_between_its_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = load(ROOT / "examples" / "tanks" / "tanks.toml", ["controller.oracle=linear"])
+    save(simulate(config, 5), tmp_path / "run.mcap")
+    monkeypatch.setattr("run_log.reporting.report.picture", lambda _run, path: path)
+    for no_plant in (False, True):
+        ran = Run(json=True, no_plant=no_plant)
+        assert ran._conclude(config, RunFiles.of(tmp_path / "run.mcap"), None, True, True) == 0
+        figures = json.loads(capsys.readouterr().out)
+        assert (figures["excess_between_samples"] is None) == no_plant
 
 
 def test_a_picture_that_fails_costs_neither_table_nor_exit_code(

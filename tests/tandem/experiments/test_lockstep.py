@@ -92,8 +92,8 @@ def test_a_run_is_bit_identical_for_a_seed_and_differs_for_another() -> None:
 
 def test_another_rate_settles_too() -> None:
     # To compile a solver that nothing else uses takes longer than the run without.
-    settings = ["rate=50", "controller.horizon=150", "controller.solver.compile=never"]
-    summary = summarise(simulate(load(None, settings), 500))
+    settings = ["rate=30", "controller.horizon=90", "controller.solver.compile=never"]
+    summary = summarise(simulate(load(None, settings), 300))
     assert summary.constraint_violations == 0
     assert summary.settled_s is not None
 
