@@ -19,7 +19,6 @@ from run_log.reporting.summary import summarise
 from run_log.run import Run
 from run_log.writing.save import save
 from tandem.cli import main
-from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
 from tandem.plant_file import source, write_new
 from tests.helpers.paths import ROOT
@@ -46,11 +45,12 @@ def a_small_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def ran(file: Path | None, settings: list[str], steps: int, noise: list[float] | None = None) -> Run:
-    return follow(load(file, [*QUICK, *settings]), steps, Faults(noise=noise)).run
+def ran(file: Path | None, settings: list[str], steps: int, noise: float = 0.0) -> Run:
+    sensors = [f"plant.sensors.noise={noise}"]  # of half-widths
+    return follow(load(file, [*QUICK, *settings, *sensors]), steps).run
 
 
-def tanks_logs(folder: Path, noise: list[float] | None = None) -> list[str]:
+def tanks_logs(folder: Path, noise: float = 0.0) -> list[str]:
     files = []
     for x0, r in FEEDBACKS:
         files.append(str(folder / f"run{len(files)}.mcap"))
@@ -145,7 +145,7 @@ def test_a_quadrotor_in_wind_is_found_from_five_short_flights(tmp_path: Path, ca
 
 def test_noise_widens_w_and_the_errors(logs: list[str], tmp_path: Path, capsys: Capture) -> None:
     quiet = identified(capsys, *logs)
-    noisy = identified(capsys, *tanks_logs(tmp_path, noise=[0.05, 0.05]))
+    noisy = identified(capsys, *tanks_logs(tmp_path, noise=0.05 / 9.5))
     assert (np.array(noisy["W"]) > np.array(quiet["W"])).all()
     # The noise of two samples, per second.
     assert noisy["held_out"]["rms"][1] == pytest.approx(0.05 * np.sqrt(1.9) / 9.5 / 5.0, rel=0.3)
@@ -178,7 +178,7 @@ def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> No
     save(ran(TANKS_FILE, [], 20), tmp_path / "short.mcap")
     text = refused(capsys, str(tmp_path / "short.mcap"))
     assert re.search("19 samples are too few: .* has 4 numbers .*, and 40 samples are the least", text)
-    save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=[1.0, 1.0]), tmp_path / "noisy.mcap")
+    save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
     assert "is what no model explains, as measuring noise is" in refused(capsys, str(tmp_path / "noisy.mcap"))
 
 
