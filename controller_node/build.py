@@ -20,7 +20,7 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
+from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
@@ -39,6 +39,8 @@ WEIGHTS = WEIGHTS_LIMIT // 4
 """Hidden weights at most, float32 each."""
 FILTERED = 512
 """Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
+COARSE = 0.05
+"""Share of a time scale. K_0 stands for nothing yet; where a period is longer it would move predictions far."""
 SHORTEST_WATCH = 8
 """Samples, also where the loop is slow."""
 
@@ -60,14 +62,14 @@ def build_plant(config: Config) -> Known | Plant:
     return plant_of(config, get_plant)
 
 
-def describe_network(config: Config, plant: Description) -> NetworkDescription:
-    """The network of the configuration for this plant; its inputs and h are scaled by the half-widths.
+def describe_network(config: Config, model: Model) -> NetworkDescription:
+    """The network of the configuration for this model; inputs and h are scaled by the half-widths.
 
     Raises:
         ValueError: the sizes or the options do not fit the architecture, there is none of that name, or the network
             is larger than a message.
     """
-    network = config.network
+    network, plant = config.network, model.plant
     name = name_of(network.architecture)
     architecture = get_architecture(name)
     description = NetworkDescription(
@@ -76,7 +78,7 @@ def describe_network(config: Config, plant: Description) -> NetworkDescription:
         hidden=network.hidden,
         activations=[network.activation] * len(network.hidden),
         input_scale=[*plant.x_scale.tolist(), *plant.u_scale.tolist()],
-        output_scale=(network.output_scale * config.period * plant.x_scale).tolist(),
+        output_scale=(network.output_scale * model.period / model.time_scale * plant.x_scale).tolist(),
         max_layer_norm=network.max_layer_norm,
         architecture=name,
         window=architecture.window if network.window is None else network.window,
@@ -114,22 +116,22 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
         settings = config.l2nw
         bandwidth = settings.bandwidth * np.concatenate([plant.x_scale, plant.u_scale])[list(indices)]
         return L2nwOracle(plant.d, plant.m, indices, settings.window, bandwidth, settings.regularisation)
-    return build_network_oracle(config, plant)
+    return build_network_oracle(config, model)
 
 
-def build_network_oracle(config: Config, plant: Description) -> DnnOracle:
+def build_network_oracle(config: Config, model: Model) -> DnnOracle:
     """The network oracle of the configuration, whichever oracle it names. Raises `ConfigError`."""
     try:
-        description = describe_network(config, plant)
+        description = describe_network(config, model)
     except ValueError as error:
         raise ConfigError(f"network: {error}") from error
-    adaptation, per_period = config.adaptation, config.period * plant.x_scale
+    adaptation, share = config.adaptation, model.period / model.time_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
     return DnnOracle(
         description,
         adaptation.gamma if adaptation.enabled else 0.0,
-        adaptation.column_bound * per_period,
-        adaptation.initial_scale * per_period,
+        adaptation.column_bound * (share * model.plant.x_scale),
+        adaptation.initial_scale * (min(share, COARSE) * model.plant.x_scale),
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config),

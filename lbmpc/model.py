@@ -76,6 +76,16 @@ class Model:
         return self.A + self.B @ self.K
 
     @cached_property
+    def time_scale(self) -> float:
+        """Seconds in which the loop under K forgets: the slowest time constant of A + BK, to the nearest power of two.
+
+        What counts as much h for a plant of milliseconds is little for one of minutes. Rounded, it stays the same under
+        small changes of the weights.
+        """
+        slowest = max(float(np.abs(np.linalg.eigvals(self.closed_loop)).max()), 1e-300)
+        return float(np.exp2(np.rint(np.log2(-self.period / math.log(slowest)))))
+
+    @cached_property
     def cost_scale(self) -> float:
         """What the cost is counted in: x'|P|x + u'Ru with every state and input at its half-width.
 

@@ -182,8 +182,8 @@ class NetworkConfig(Section, frozen=True):
     activation: Activation = "tanh"
     """Of every hidden layer; must be bounded, since the last one is."""
     output_scale: Positive = 0.4
-    """h that counts as 1 for the network, in half-widths of each state per second of period: h of a sampled plant grows
-    with the period."""
+    """h that counts as 1 for the network, in half-widths of each state per time scale of the plant: that of the slowest
+    mode under K, `lbmpc.model.Model.time_scale`, 1 s for the compressor."""
     max_layer_norm: Positive = 100.0
 
 
@@ -233,7 +233,7 @@ class AdaptationConfig(Section, frozen=True):
     gamma: Unit = 0.8
     """Learning rate of the gradient law, 0 < gamma < 1."""
     column_bound: Positive = 2.0
-    """Bound on the norm of each column of K, as h, in half-widths of its state per second of period."""
+    """Bound on the norm of each column of K, as h, in half-widths of its state per time scale of the plant."""
     initial_scale: NonNegative = 1.2e-2
     """Standard deviation of the entries of K_0, likewise."""
     start: literals.StartName = "random"

@@ -38,9 +38,10 @@ TABLE = (
     Process("plant", "plant", "end the run", 30.0),
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
-# In the order of stopping, with the seconds that each may take. The recorder hears the others' last words; the router
-# carries them.
-STOP_S = {"controller": 4.0, "plant": 4.0, "trainer": 6.0, "recorder": 15.0, "router": 4.0}
+# In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
+# unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
+# them.
+STOP_S = ({"controller": 4.0, "plant": 4.0}, {"trainer": 6.0}, {"recorder": 15.0}, {"router": 4.0})
 
 
 def command_line(command: str, config: Path) -> list[str]:

@@ -283,24 +283,24 @@ class Supervisor:
         """In order, politely, then not. The screen keeps the last moment of the run."""
         ended = time.monotonic()
         last = self._end = self.monitor.snapshot(ended)
-        for name, patience_s in STOP_S.items():
-            child = self.children.get(name)
-            if child is None or not child.alive():
-                continue
-            child.signal(signal.SIGTERM)
-            self._show(replace(last, phase=f"the {name} to stop"))
-            deadline = time.monotonic() + patience_s
-            while child.alive() and time.monotonic() < deadline:
-                self._listen(0.01)
-            if child.alive():
-                child.signal(signal.SIGKILL)
-                how = f"did not stop within {patience_s:g} s and was killed"
-            elif child.exit_code() != 0:
-                how = f"ended with {child.how_it_ended()}"
-            else:
-                continue
-            self.monitor.say(f"the {name} {how}", time.monotonic(), "bad")
-            self.recorder_died |= name == "recorder"
+        for together in STOP_S:
+            told = {name: child for name in together if (child := self.children.get(name)) and child.alive()}
+            for child in told.values():
+                child.signal(signal.SIGTERM)
+            asked = time.monotonic()
+            for name, child in told.items():
+                self._show(replace(last, phase=f"the {name} to stop"))
+                while child.alive() and time.monotonic() < asked + together[name]:
+                    self._listen(0.01)
+                if child.alive():
+                    child.signal(signal.SIGKILL)
+                    how = f"did not stop within {together[name]:g} s and was killed"
+                elif child.exit_code() != 0:
+                    how = f"ended with {child.how_it_ended()}"
+                else:
+                    continue
+                self.monitor.say(f"the {name} {how}", time.monotonic(), "bad")
+                self.recorder_died |= name == "recorder"
         # With what was still on its way: the last tick, and anything that went wrong in stopping.
         frozen = ("states", "inputs", "source", "processes", "phase")
         whole = self.monitor.snapshot(ended)

@@ -84,7 +84,6 @@ class ModelCheck(Configured):
         from tandem.commands.model.findings import (
             disturbance_finding,
             findings,
-            network_finding,
             weights_finding,
         )
         from tandem.model_tables import matrix_tables
@@ -118,7 +117,8 @@ class ModelCheck(Configured):
         said = list(findings(model, horizon, x0, step))
         if sampled is not None:
             said.append(disturbance_finding(known, W, sampled))
-        said += [f for f in (weights_finding(model), network_finding(config)) if f is not None]
+        if (weights := weights_finding(model)) is not None:
+            said.append(weights)
         self.say("")
         self.console.print(_findings_table(said))
         faults = [finding.text for finding in said if finding.verdict == "fault"]

@@ -23,7 +23,6 @@ from lbmpc.analysis import (
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.plants import Known, PlantError
 from lbmpc.plants.matrices import unmoved_modes
-from node_runtime.config.sections import Config
 from tandem.model_tables import percent, poles_text
 
 Verdict = Literal["ok", "note", "fault"]
@@ -31,8 +30,6 @@ FOLLOWED = 10.0
 """Seconds for which the safe input is followed, or two horizons if that is longer."""
 CHEAP = 1e-3
 """Of what the dearest input costs at its half-width: a performance state that costs less there is not cared for."""
-THROWN = 0.1
-"""Half-widths in a sample."""
 WEAK = 0.1
 """Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
 
@@ -101,25 +98,6 @@ def weights_finding(model: Model) -> Finding | None:
         "will hardly be used. controller.Q and R count squares of the plant's own units"
     )
     return Finding("note", "weights", text)
-
-
-def network_finding(config: Config) -> Finding | None:
-    """How far the network of the first sample may throw a prediction, where that is much; None where it is not.
-
-    A column of K_0 has 1 + n entries of standard deviation `adaptation.initial_scale`, and the features are about 1 at
-    most.
-    """
-    adaptation = config.adaptation
-    if config.controller.oracle != "dnn" or adaptation.start != "random":
-        return None
-    drawn = adaptation.initial_scale * config.period * math.sqrt(1 + config.network.hidden[-1])
-    if drawn < THROWN:
-        return None
-    text = (
-        f"its first weights are drawn at random, and may predict {drawn:.2g} half-widths of motion in a sample of "
-        f'{config.period:.3g} s that is not there. Set adaptation.start = "zero"'
-    )
-    return Finding("note", "network", text)
 
 
 def _factor(largest: float, given: float) -> str:

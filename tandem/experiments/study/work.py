@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from controller_node.build import build_network_oracle, build_plant
+from controller_node.build import build_model, build_network_oracle
 from node_runtime.config.sections import Config
 from node_runtime.whole_file import read_regular, require_regular, write_whole
 from run_log.reporting.motion import trajectory
@@ -106,7 +106,7 @@ def _traces(run: Run) -> Traces:
 def _lemma(run: Run, config: Config) -> Lemma | None:
     if config.controller.oracle != "dnn":
         return None
-    return measure(run, build_network_oracle(config, build_plant(config)))
+    return measure(run, build_network_oracle(config, build_model(config)))
 
 
 def read(path: Path, detail: bool) -> Record | None:

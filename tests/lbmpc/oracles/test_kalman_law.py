@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller_node.build import build_network_oracle, build_plant, describe_filter
+from controller_node.build import build_model, build_network_oracle, describe_filter
 from controller_node.codegen.compiler import Compiler
 from controller_node.core import ControllerCore
 from lbmpc.oracles import DnnOracle
@@ -231,7 +231,7 @@ def config(*more: str) -> Config:
 
 
 def oracle_of(settings: Config) -> DnnOracle:
-    return build_network_oracle(settings, build_plant(settings))
+    return build_network_oracle(settings, build_model(settings))
 
 
 def test_refusals_and_rollbacks_replay_and_bring_the_covariance_back() -> None:

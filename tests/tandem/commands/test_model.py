@@ -193,12 +193,6 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "horizon",
         r"2 steps \(10 s\); advised: \d+ steps",
     ),
-    "a network that begins with a leap": (
-        TANKS,
-        ("--rate", "0.2"),
-        "network",
-        r"may predict 0.48 half-widths of motion in a sample of 5 s .* Set adaptation.start = \"zero\"",
-    ),
     "weights in units that hide a state": (
         PENDULUM,
         (*TEN, "--set", "controller.Q=[1e-4, 1]"),
@@ -212,13 +206,6 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         r"from \d+ of 500 states the motion cannot be followed",
     ),
 }
-
-
-def test_an_oracle_without_a_network_is_told_nothing_of_one(mine: Any, capsys: Capture) -> None:
-    mine(TANKS)
-    _code, found = checked(capsys, "mine", "--rate", "0.2", "--set", "controller.oracle=constant")
-    assert "network" not in found["notes"]
-    assert "weights" not in found["notes"]
 
 
 @pytest.mark.parametrize("case", NOTES)
