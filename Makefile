@@ -6,7 +6,8 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper examples bench test compose-test wheel-test remote-test faults fuzz soak lint format clean
+.PHONY: help setup run simulate paper examples bench test compose-test wheel-test remote-test
+.PHONY: faults fuzz soak lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile

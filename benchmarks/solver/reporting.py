@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import wrap
 
 from rich.table import Table
 
@@ -101,10 +102,13 @@ def write(report: Report, path: Path, command: str) -> Path:
 def _text(report: Report, command: str, picture: str) -> str:
     facts = ", ".join(f"{name} {value}" for name, value in report.versions.items())
     machine = report.machine
-    lines = [
+    measured = (
         f"`{command}`, on {machine['processor']}, {machine['cores']} cores, {machine['system']}; {facts}; "
         f"{'; '.join(note for note in report.notes if note)}. "
-        f"Load of the machine at the end of the run: {report.load:.1f}.",
+        f"Load of the machine at the end of the run: {report.load:.1f}."
+    )
+    lines = [
+        *wrap(measured, 120, break_long_words=False, break_on_hyphens=False),
         "",
         f"![Time of one solve over the horizon and over the width of the network]({picture})",
         "",
