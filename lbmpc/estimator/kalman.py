@@ -51,13 +51,12 @@ class KalmanEstimator(Estimator):
         correlation: seconds in which h becomes another, by a factor of e.
     """
 
-    noisy = True
-
     def __init__(
         self, model: Model, measured: np.ndarray, noise: np.ndarray, process: np.ndarray, correlation: float
     ):
         d = model.d
         self._model, self._measured = model, measured
+        self.sees_all = len(measured) == d
         units = self._units = balanced(model.plant)[:d]
         least = LEAST * model.plant.x_scale
         self._R = (np.maximum(noise, least) / units)[measured] ** 2
