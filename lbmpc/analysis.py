@@ -126,11 +126,8 @@ def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float
         outside = np.flatnonzero((x < plant.x_min) | (x > plant.x_max))
         if outside.size:
             return Kept(k * model.period, plant.states[int(outside[0])])
-        u = plant.safe_input
-        if plant.safe_gain is not None:
-            u = np.clip(u + plant.safe_gain @ (x - plant.x_e), plant.u_min, plant.u_max)
         try:
-            x = step(x, u, model.period)
+            x = step(x, plant.safe_input_at(x), model.period)
         except PlantError as error:
             return Kept(k * model.period, str(error))
     return Kept(steps * model.period, "")
