@@ -1,69 +1,27 @@
-"""The live controller, as a process on a real bus: what it publishes, whom it obeys, how it waits and ends."""
+"""The live controller, as a process on a real bus: what it publishes, whose weights it takes, and how it ends."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 import pytest
-import zenoh
 
 from controller_node import node
 from controller_node.core import ControllerCore
-from controller_node.outbox import BATCH, Outbox
-from lbmpc.plants import get_plant
 from network_model.description import NetworkDescription, hash_layers
-from node_runtime.bus.zenoh_bus import Bus, session_config
+from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
-from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import one_blas_thread
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
 
-PLANT = get_plant("moore_greitzer")
 SETTINGS = ("controller.horizon=20", "controller.keyframe_every=20", "network.hidden=[8, 8]")
-
-
-# -- the outbox ------------------------------------------------------------------------------------------
-
-
-def sample(seq: int) -> m.Sample:
-    return m.Sample(seq, [0.0], [0.0], [float(seq)])
-
-
-def seqs(answer: list[bytes]) -> list[int]:
-    batches = [codec.decode(topics.SAMPLES, payload) for payload in answer]
-    assert all(isinstance(batch, m.Samples) and batch.seq == batch.samples[-1].seq for batch in batches)
-    return [one.seq for batch in batches if isinstance(batch, m.Samples) for one in batch.samples]
-
-
-def test_the_outbox_gives_what_is_newer_and_the_newest_of_that() -> None:
-    outbox = Outbox("controller-a", capacity=1500)
-    assert outbox.answer({}) == []
-    for seq in range(0, 4000, 2):
-        outbox.add(sample(seq))
-    assert seqs(outbox.answer({})) == list(range(1000, 4000, 2))
-    assert seqs(outbox.answer({"since": "3990"})) == [3992, 3994, 3996, 3998]
-    assert seqs(outbox.answer({"since": "3991", "last": "2"})) == [3996, 3998]
-    assert seqs(outbox.answer({"run": "controller-a", "since": "", "last": "3"})) == [3994, 3996, 3998]
-    assert outbox.answer({"run": "controller-b"}) == []
-    assert outbox.answer({"since": "3998"}) == []
-    assert outbox.answer({"last": "0"}) == []
-    assert max(len(batch.samples) for batch in outbox.batches(outbox.since(-1))) == BATCH
-
-
-@pytest.mark.parametrize("parameters", [{"since": "seven"}, {"last": "1.5"}, {"sinse": "7"}])
-def test_a_wrong_question_to_the_outbox_is_a_message_for_a_person(parameters: dict[str, str]) -> None:
-    with pytest.raises(ValueError, match=r"whole number|unknown parameter 'sinse'"):
-        Outbox("controller-a").answer(parameters)
-
-
-# -- one live run ----------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -243,179 +201,6 @@ def test_a_run_says_what_it_is(run: Run) -> None:
     ]
     assert run.counters["ticks"] == len(run.of(topics.TICK))
     assert "Traceback" not in run.said
-
-
-# -- a plant that misbehaves -----------------------------------------------------------------------------
-
-
-class Script:
-    """A plant played by the test: it sends what it likes, in step with the controller's answers."""
-
-    def __init__(self, config: Config, run_id: str = "plant-a"):
-        self.bus = Bus(config, "plant", run_id)
-        self.bus.open()
-        self.run_id = run_id
-        self.seq = -1
-        self.key = topics.PLANT_STATE.key(config.name)
-        self.stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
-        self.began = clock.now()
-
-    def state(self, **changes: object) -> m.PlantState:
-        good = m.PlantState(
-            run_id=self.run_id,
-            seq=self.seq + 1,
-            t=clock.now(),
-            x=PLANT.x0.tolist(),
-            applied=None,
-            source="hold",
-            command_seq=-1,
-        )
-        return msgspec.structs.replace(good, **changes)
-
-    def send(self) -> m.PlantState:
-        state = self.state()
-        self.seq += 1
-        self.bus.publish(topics.PLANT_STATE, state)
-        return state
-
-    def forge(self, payload: bytes | m.Message) -> None:
-        self.stranger.put(self.key, payload if isinstance(payload, bytes) else codec.encode(payload))
-
-    def period(self, config: Config) -> None:
-        """Wait until the next state is due."""
-        due = self.began + np.ceil((clock.now() - self.began) / config.period + 0.01) * config.period
-        clock.sleep_until(float(due))
-
-    def close(self) -> None:
-        self.stranger.close()
-        self.bus.close()
-
-
-@pytest.mark.live
-def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
-    config = live_config(*SETTINGS)
-    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = BusListener(bus)
-        script = Script(config)
-        with Process("controller_node.node", config) as process:
-            waiting = health_of("controller", status="ready", note="no plant: waiting for its states")
-            ear.until(waiting)
-            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
-            # Whoever comes first is followed.
-            good = [script.send().seq]
-            ear.until(lambda message: isinstance(message, m.Tick))
-            for _ in range(20):
-                script.period(config)
-                script.forge(script.state(run_id="plant-b"))
-                good.append(script.send().seq)
-                script.forge(b"junk")
-                script.forge(script.state(x=[float("nan")] * 4))
-                script.forge(script.state(x=[0.0]))
-                script.forge(script.state(seq=0))
-            wait_for(lambda: any(tick.seq >= 15 for tick in ear.of(topics.TICK)))
-            # Silence, then what piled up, all at once and old.
-            silent = clock.now()
-            ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "missing")
-            for k in range(3):
-                old = script.state(t=silent - 5.0 + k * config.period)
-                script.seq += 1
-                script.bus.publish(topics.PLANT_STATE, old)
-            ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "stale")
-            # The plan comes to its end, the controller waits, and goes on when the plant is back.
-            ear.until(waiting)
-            ticks_before = ear.of(topics.TICK)[-1].seq
-            again: list[int] = []
-            while all(
-                tick.seq <= ticks_before for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"
-            ):
-                script.period(config)
-                again.append(script.send().seq)
-            process.signal(signal.SIGTERM)
-            assert process.end() == 0
-        script.close()
-    ticks: list[m.Tick] = ear.of(topics.TICK)
-    assert [tick.seq for tick in ticks] == list(range(len(ticks)))
-    assert {tick.state.run_id for tick in ticks if tick.state} == {"plant-a"}
-    assert {tick.state.seq for tick in ticks if tick.state_verdict == "fresh"} <= {*good, *again}
-    by_seq = {tick.seq: tick for tick in ticks}
-    for command in ear.of(topics.COMMAND):
-        if by_seq[command.seq].state_verdict != "fresh":
-            assert command.state_seq == -1
-            assert command.mode != "solver"
-    counters = ear.of(topics.HEALTH["controller"])[-1].counters
-    for reason in ("malformed", "not finite", "wrong size", "out of order", "foreign"):
-        assert counters[f"bad plant/state: {reason}"] >= 15, reason
-        assert process.said.count(f"bad plant/state: {reason}") == 1
-    assert counters["states missing"] >= 15
-
-
-@pytest.mark.live
-def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None:
-    """The plant's clock has lost five seconds: no ticks without a state meanwhile, and control afterwards."""
-    config = live_config(*SETTINGS)
-    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = BusListener(bus)
-        script = Script(config)
-
-        def played(behind: float, until: Callable[[], bool]) -> None:
-            end = clock.now() + HANG_S
-            while not until() and clock.now() < end:
-                script.period(config)
-                script.bus.publish(topics.PLANT_STATE, script.state(t=clock.now() - behind))
-                script.seq += 1
-
-        def fresh() -> list[m.Tick]:
-            return [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"]
-
-        with Process("controller_node.node", config) as process:
-            ear.until(health_of("controller", status="ready", note="no plant: waiting for its states"))
-            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
-            played(0.0, lambda: len(fresh()) > 10)
-            before = len(fresh())
-            played(5.0, lambda: len(fresh()) > before + 10)
-            process.signal(signal.SIGTERM)
-            assert process.end() == 0
-        script.close()
-    notes = [health.note for health in ear.of(topics.HEALTH["controller"])]
-    assert notes.count("no plant: its states come too late to act on") >= 1
-    assert "taken for punctual" in process.said
-    late = [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "stale"]
-    # The length of the plan, and nothing after it.
-    assert len(late) <= config.controller.horizon
-    assert len(fresh()) > before + 10
-
-
-@pytest.mark.live
-def test_another_plant_is_followed_after_silence() -> None:
-    config = live_config(*SETTINGS, "bus.follow_silence=0.3")
-    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = BusListener(bus)
-
-        def fresh_from(run_id: str) -> m.Tick:
-            tick = ear.until(
-                lambda message: (
-                    isinstance(message, m.Tick)
-                    and message.state_verdict == "fresh"
-                    and message.state is not None
-                    and message.state.run_id == run_id
-                )
-            )
-            assert isinstance(tick, m.Tick)
-            return tick
-
-        with Process("controller_node.node", config) as process:
-            run_ids = []
-            for _ in range(2):
-                with Process("plant_sim.node", config):
-                    state = ear.until(lambda m_: isinstance(m_, m.PlantState) and m_.run_id not in run_ids)
-                    run_ids.append(state.run_id)
-                    fresh_from(state.run_id)
-                    # It is released by a command that answers it, although the controller has run before.
-                    ear.until(lambda m_: isinstance(m_, m.PlantState) and m_.source == "command")
-            process.signal(signal.SIGINT)
-            assert process.end() == 0
-    ticks = ear.of(topics.TICK)
-    assert [tick.seq for tick in ticks] == list(range(len(ticks)))
 
 
 @pytest.mark.live

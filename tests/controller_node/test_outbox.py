@@ -1,14 +1,16 @@
-"""The ring of samples answers what a list of them would, and takes its memory at the first one."""
+"""The ring of samples answers what a list of them would, takes its memory at the first one, and is asked on the bus."""
 
 from __future__ import annotations
 
 import tracemalloc
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller_node.outbox import Outbox
-from protocol.messages import Sample
+from controller_node.outbox import BATCH, Outbox
+from protocol import codec, topics
+from protocol.messages import Sample, Samples
 
 
 def sample(seq: int, pairs: int = 1) -> Sample:
@@ -47,3 +49,30 @@ def test_a_controller_that_runs_for_hours_needs_no_more_memory() -> None:
     tracemalloc.stop()
     # Two thousand Samples would be over a megabyte.
     assert after - before < 20_000
+
+
+def seqs(answer: list[bytes]) -> list[int]:
+    batches = [codec.decode(topics.SAMPLES, payload) for payload in answer]
+    assert all(isinstance(batch, Samples) and batch.seq == batch.samples[-1].seq for batch in batches)
+    return [one.seq for batch in batches if isinstance(batch, Samples) for one in batch.samples]
+
+
+def test_the_outbox_gives_what_is_newer_and_the_newest_of_that() -> None:
+    outbox = Outbox("controller-a", capacity=1500)
+    assert outbox.answer({}) == []
+    for seq in range(0, 4000, 2):
+        outbox.add(sample(seq))
+    assert seqs(outbox.answer({})) == list(range(1000, 4000, 2))
+    assert seqs(outbox.answer({"since": "3990"})) == [3992, 3994, 3996, 3998]
+    assert seqs(outbox.answer({"since": "3991", "last": "2"})) == [3996, 3998]
+    assert seqs(outbox.answer({"run": "controller-a", "since": "", "last": "3"})) == [3994, 3996, 3998]
+    assert outbox.answer({"run": "controller-b"}) == []
+    assert outbox.answer({"since": "3998"}) == []
+    assert outbox.answer({"last": "0"}) == []
+    assert max(len(batch.samples) for batch in outbox.batches(outbox.since(-1))) == BATCH
+
+
+@pytest.mark.parametrize("parameters", [{"since": "seven"}, {"last": "1.5"}, {"sinse": "7"}])
+def test_a_wrong_question_to_the_outbox_is_a_message_for_a_person(parameters: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"whole number|unknown parameter 'sinse'"):
+        Outbox("controller-a").answer(parameters)

@@ -16,18 +16,17 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.problem import build_problem
 from lbmpc.sets import check as checker
-from lbmpc.sets.certificate import Certificate, CertificateError, Kind, Piece, decode, encode, require_match
+from lbmpc.sets.certificate import Certificate, CertificateError, Piece, decode, encode, require_match
 from lbmpc.sets.check import check
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.sets.construct import construct, points_in, volume_fraction
 from lbmpc.sets.geometry.operations import body
-from lbmpc.sets.geometry.polytope import EmptySetError, SetError
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.approach import one_period
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
-from tests.helpers.plants.pendulum import PENDULUM, pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum, two_inputs
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
@@ -147,13 +146,6 @@ def test_a_certificate_of_the_wrong_shape_is_no_certificate(
 ) -> None:
     with pytest.raises(CertificateError, match=says):
         decode(encode(changed(family, 0, **fields)))
-
-
-def test_there_is_no_set_where_there_is_none() -> None:
-    with pytest.raises(EmptySetError, match=r"kept in X for \d+ steps"):
-        construct(MODEL, "given", START, W=np.array([0.05, 1.0]))
-    with pytest.raises(SetError, match="no way of the true plant"):
-        construct(MODEL, "regions", np.array([0.99, 1.9]))
 
 
 def test_work_that_was_done_is_not_done_again(family: Certificate) -> None:
@@ -409,30 +401,3 @@ def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
     assert "is not given by 2 of its 4 rows" in check(false).reason
     monkeypatch.setattr(checker, "_bases", lambda *_a: np.array([[0], [1], [2], [3]]))
     assert "is not given by 2 of its 4 rows" in check(false).reason
-
-
-def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
-    """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
-    fast = replace(
-        two_inputs().equations,
-        name="fast",
-        rhs=lambda x, u: [-1000.0 * x[0] + u[0], x[1] + u[1]],
-    )
-    certificate = construct(build_model(fast, 0.1), "given", np.zeros(2), W=np.array([0.01, 0.01]))
-    assert check(certificate).ok
-
-
-@pytest.mark.parametrize(
-    ("changes", "open_end"),
-    [
-        ({"x_min": np.array([-1.0, -np.inf]), "x_max": np.array([1.0, np.inf])}, "rate below, rate above"),
-        ({"x_max": np.array([1.0, np.inf])}, "rate above"),
-        ({"u_min": np.array([-np.inf])}, "torque below"),
-    ],
-)
-@pytest.mark.parametrize("kind", ["box", "regions", "given"])
-def test_a_plant_without_bounds_is_told_which_it_needs(changes: dict, open_end: str, kind: Kind) -> None:
-    plant = replace(PENDULUM, scale={"rate": 2.0, "torque": 3.0}, **changes)
-    with pytest.raises(SetError, match=rf"not bounded: {open_end}\. .*Give the plant such bounds") as refused:
-        construct(build_model(plant, 0.1), kind, np.zeros(2))
-    assert "`scale` is no bound" in str(refused.value)

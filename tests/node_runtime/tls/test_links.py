@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import ssl
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -20,11 +18,9 @@ from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime import clock
-from node_runtime.rejected import RejectedMessages
-from node_runtime.router import open_router, open_to_all
+from node_runtime.router import open_router
 from node_runtime.tls import access_control, credentials
 from node_runtime.tls.client import refusal
-from node_runtime.tls.zenoh_log import MAX_NAMES, Refusals
 from protocol import rights, topics
 from protocol.topics import Topic
 from tandem import certificate_authority
@@ -190,12 +186,6 @@ def test_an_ipv6_router_that_its_certificate_does_not_name_is_refused(tmp_path: 
         Bus(override(router, [f'bus.tls.keys="{tmp_path}/keys/trainer"']), "trainer", "t-1").open()
 
 
-def test_an_address_with_a_zone_is_refused_where_certificates_are_needed() -> None:
-    with pytest.raises(ConfigError, match="no certificate can name an address with a zone"):
-        session_config("client", "tls/[fe80::1%2]:7448", 1000)
-    session_config("client", "tcp/[fe80::1%2]:7447", 1000)
-
-
 @pytest.mark.parametrize(
     ("role", "authority", "says"),
     [
@@ -279,6 +269,7 @@ def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
 
 
 # -- who is let in and does more than it may -------------------------------------------------------------------------
+
 
 FOREIGN = [
     (role, topic)
@@ -428,90 +419,3 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
         controller._put(topics.SAMPLES, b"later")
         wait_for(lambda: b"later" in [one.payload for one in heard[0].drain()])
         assert b"later" not in [one.payload for one in heard[1].drain()]
-
-
-# -- what needs no router --------------------------------------------------------------------------------------------
-
-
-def test_every_key_that_a_role_may_use_is_of_its_plant():
-    control = access_control.access_control("jet1")
-    of_plain, *of_roles = control["rules"]
-    assert control["default_permission"] == "deny"
-    assert of_plain["id"] == "plain"
-    for rule in of_roles:
-        assert all(key.startswith("tandem/jet1/") for key in rule["key_exprs"]), rule
-        assert "delete" not in rule["messages"]
-    assert {"id": "plain", "link_protocols": ["tcp"]} in control["subjects"]
-    for subject in control["subjects"][1:]:
-        assert subject["link_protocols"] == ["tls", "quic"]
-        assert subject["cert_common_names"] == [f"{subject['id']}.jet1"]
-    json.dumps(access_control.size_limits("jet1"))
-
-
-def test_a_router_lets_other_machines_in_with_certificates_only():
-    for assignment, says in (
-        ('bus.remote="tcp/0.0.0.0:7448"', "with certificates only"),
-        ('bus.remote="tls/0.0.0.0:7448"', r"bus\.tls\.keys is missing"),
-    ):
-        with ExitStack() as stack, pytest.raises(ConfigError, match=says):
-            stack.enter_context(open_router(live_config(assignment)))
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "is_open"),
-    [
-        ("tcp/127.0.0.1:7447", False),
-        ("tcp/localhost:7447", False),
-        ("tcp/[::1]:7447", False),
-        ("tcp/0.0.0.0:7447", True),
-        ("tcp/[::]:7447", True),
-        ("tcp/10.0.0.5:7447", True),
-        ("tcp/router:7447", True),
-        ("tls/0.0.0.0:7447", False),
-    ],
-)
-def test_which_plain_endpoints_others_may_reach(endpoint: str, is_open: bool):
-    assert open_to_all(endpoint) is is_open
-
-
-def test_zenoh_s_questions_to_itself_are_no_denials():
-    bad = RejectedMessages()
-    refusals = Refusals(bad)
-    head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
-    who = "a6 on Interface(lo)+CertCommonName(trainer.jet1)+Transport(Tls)+a6 is unauthorized to "
-    for text in (
-        "ACL (ingress): caching permissions for `tandem/jet1/controller/samples` ...",
-        who + "Put (ingress) on tandem/jet1/controller/samples",
-        who + "Declare Liveliness Subscriber (ingress) on tandem/jet1/controller/samples",
-        "Using cached result: a6 is authorized to Declare Subscriber (ingress) on tandem/jet1/controller/samples",
-    ):
-        assert refusals.read(head + text)
-    assert bad.total == 0
-    assert refusals.read(
-        head + "Using cached result: a6 is unauthorized to Put (ingress) on tandem/jet1/controller/tick"
-    )
-    assert refusals.read(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
-    assert bad.counters() == {
-        "bad from trainer.jet1: denied, put controller/tick": 1,
-        "bad from trainer.jet1: denied, put elsewhere": 1,
-    }
-    assert not refusals.read("a line of somebody else")
-
-
-def test_who_was_denied_is_known_after_any_number_of_sessions():
-    """A health check alone opens one every few seconds."""
-    bad = RejectedMessages()
-    refusals = Refusals(bad)
-    head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
-    who = "+CertCommonName({})+Transport(Tls)+a6 is {}authorized to "
-    for k in range(MAX_NAMES + 500):
-        refusals.read(
-            head
-            + f"{k:x} on Interface(lo)"
-            + who.format("operator.jet1", "")
-            + "Put (ingress) on tandem/jet1/x"
-        )
-    last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
-    refusals.read(last + "Put (ingress) on tandem/jet1/controller/command")
-    assert bad.counters() == {"bad from trainer.jet1: denied, put controller/command": 1}
-    assert len(refusals._names) == MAX_NAMES

@@ -11,14 +11,14 @@ import msgspec
 import pytest
 
 from node_runtime.config.sections import Config
-from tests.trainer_node.test_node import Controller, config  # noqa: F401
+from tests.helpers.trainer_partner import Controller
 from trainer_node.main import main
 
 pytestmark = pytest.mark.live
 
 
 @pytest.fixture
-def fleet(config: Config) -> Iterator[Config]:  # noqa: F811
+def fleet(config: Config) -> Iterator[Config]:
     """A trainer of all jets in a thread."""
     stop = threading.Event()
     thread = threading.Thread(target=main, args=[config, stop, "jet*"])
@@ -29,7 +29,7 @@ def fleet(config: Config) -> Iterator[Config]:  # noqa: F811
     assert not thread.is_alive()
 
 
-def named(config: Config, name: str) -> Config:  # noqa: F811
+def named(config: Config, name: str) -> Config:
     return msgspec.structs.replace(config, name=name)
 
 

@@ -1,0 +1,172 @@
+"""Running: the same figures for any number of processes and after an interruption; a page that needs nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from run_log.reading.reader import read_run
+from run_log.replaying.replay import replay
+from tandem.experiments import experiment
+from tandem.experiments.experiment import Finished
+from tandem.experiments.study.declaration import load
+from tandem.experiments.study.plan import code_version, rows
+from tandem.experiments.study.runner import run_all, wanted
+from tandem.experiments.study.work import read, work
+from tests.helpers.experiments import PLANT, SMALL, cases
+from tests.helpers.paths import write_namesakes
+
+
+def run_small(path: Path, out: Path, processes: int) -> Finished:
+    return experiment.run(
+        load(path), str(path), PLANT, out, processes, "tandem experiment small.toml", repeats=1
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
+    folder = tmp_path_factory.mktemp("experiment")
+    path = folder / "small.toml"
+    path.write_text(SMALL)
+    return folder, run_small(path, folder / "out", 2)
+
+
+def test_figures_do_not_depend_on_the_number_of_processes(finished: tuple[Path, Finished]) -> None:
+    folder, _made = finished
+    plans = list(rows(cases(folder / "small.toml")))
+    wants = wanted(plans, {"comparison", "rows"}, folder / "no-logs")
+    few = {key: want for key, want in wants.items() if not want.logs}
+    run_all(few, folder / "alone", 1)
+    for key in few:
+        assert (folder / "alone" / f"{key}.json").read_bytes() == (
+            folder / "out/runs" / f"{key}.json"
+        ).read_bytes()
+
+
+def test_the_summary_has_what_it_promises(finished: tuple[Path, Finished]) -> None:
+    _folder, made = finished
+    told = json.loads(made.summary.read_text())
+    assert len(told["rows"]) == 10
+    promised = (
+        "case oracle seed x0 J regret deviation overshoot settled_s settled_by_state_s violations solve_ms "
+        "excess_between_samples iteration_limit_ticks soft_ticks fallback_ticks"
+    )
+    for row in told["rows"]:
+        assert set(promised.split()) <= row.keys()
+        assert len(row["x0"]) == 4
+        assert set(row["overshoot"]) == {"z", "y"}
+        assert row["excess_between_samples"] == 0.0
+        assert set(row["solve_ms"]) == {"p50", "p99", "max"}
+        assert row["J_by_episode"] == [row["J"]]
+        assert row["regret_by_episode"] == [row["regret"]]
+
+
+def test_the_page_needs_nothing_else(finished: tuple[Path, Finished]) -> None:
+    _folder, made = finished
+    html = made.report.read_text()
+    links = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"'>)\s]+)""", html)
+    assert links
+    assert all(link.startswith(("data:", "#")) for link in links)
+    assert "<script" not in html
+    assert html.count("<img") == 4
+    assert "tandem experiment small.toml --only rows" in html
+
+
+def test_the_log_of_a_run_replays(finished: tuple[Path, Finished]) -> None:
+    folder, made = finished
+    logs = sorted((folder / "out/logs").glob("*.mcap"))
+    assert len(logs) == made.logs == 2
+    assert replay(read_run(logs[0])).equal
+
+
+def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finished]) -> None:
+    folder, _made = finished
+    plans = list(rows(cases(folder / "small.toml")))
+    wants = wanted(
+        [plan for plan in plans if plan.case.name in ("linear", "l2nw")], set(), folder / "no-logs"
+    )
+    runs = folder / "again"
+    run_all(wants, runs, 1)
+    whole = {path.name: path.read_bytes() for path in runs.iterdir()}
+    missing, damaged = sorted(whole)[:2]
+    (runs / missing).unlink()
+    (runs / damaged).write_bytes(whole[damaged][:-20])
+    (runs / "x.1.partial").write_text("{")
+    told: list[tuple[int, int]] = []
+    run_all(wants, runs, 1, lambda done, total: told.append((done, total)))
+    assert told[0] == (len(wants) - 2, len(wants))
+    assert told[-1] == (len(wants), len(wants))
+    assert {path.name: path.read_bytes() for path in runs.iterdir()} == whole
+
+
+def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
+    # The other process reads the code anew; so must this one, where somebody edits while tests run.
+    code_version.cache_clear()
+    small.write_text(SMALL.replace("steps = 30", "steps = 150"))
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "tandem", "experiment", str(small), "--out", str(out), "--jobs", "1"]
+    command += ["--only", "comparison"]
+    # Who runs the tests in the background of a shell runs them with SIGINT ignored, and that is inherited.
+    started = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    runs = out / "runs"
+    while not list(runs.glob("*.json")):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            raise AssertionError(f"ended with {started.wait(0.02)}")
+    started.send_signal(signal.SIGINT)
+    said, _ = started.communicate(timeout=120)
+    assert started.returncode == 130, said
+    assert "goes on from there" in said
+    assert "Traceback" not in said
+    kept = {path.name: path.stat().st_mtime_ns for path in runs.glob("*.json")}
+    plans = [plan for plan in rows(cases(small)) if plan.case.group == "comparison"]
+    wants = wanted(plans, {"comparison"}, tmp_path)
+    assert 0 < len(kept) < len(wants)
+    run_all(wants, runs, 2)
+    assert {name: (runs / name).stat().st_mtime_ns for name in kept} == kept
+    assert len(list(runs.iterdir())) == len(wants)
+
+
+def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: Path) -> None:
+    small.write_text(SMALL.replace("steps = 30", "steps = 3", 1))
+    here = tmp_path / "here"
+    here.mkdir()
+    write_namesakes(here)
+    # As the installed `tandem`, whose own path begins with its folder.
+    program = "import sys; sys.path.remove(''); from tandem.cli import main; sys.exit(main())"
+    arguments = ("experiment", str(small), "--only", "rows", "--out", "out", "--jobs", "1")
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=here,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (here / "out" / "report.html").exists()
+
+
+def test_something_else_than_a_file_in_the_folder_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    want = next(want for want in wanted(list(rows(cases(path))), set(), tmp_path).values() if want.logs)
+    os.mkfifo(want.logs[0])
+    with pytest.raises(OSError, match="it is a pipe"):
+        work(msgspec.structs.replace(want.job, steps=2), "key", tmp_path, False, want.logs)
+    os.mkfifo(tmp_path / "key.json")
+    assert read(tmp_path / "key.json", False) is None
