@@ -31,7 +31,6 @@ EVERY = 1.0
 """Seconds between two files."""
 FIRST = 0.1
 """Seconds to the first one, and by how much each further one takes longer: most is learned at the beginning."""
-"""Seconds between two files."""
 MAGIC = b"tandem checkpoint 1\n"
 LARGEST = 256 * 1024 * 1024
 """Bytes of a file that is read at all."""

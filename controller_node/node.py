@@ -103,7 +103,12 @@ class ControllerNode:
         self._settings = core.config.controller
         self._period = core.config.period
         self._phase = phase(core.config)
-        self._backs_up = core.config.controller.backup.enabled and self._period >= BACKUP_FROM
+        # The plant feeds back every state: what it says of one that it does not measure would drive its inputs.
+        self._backs_up = (
+            self._settings.backup.enabled
+            and self._period >= BACKUP_FROM
+            and core.controller.estimator.sees_all
+        )
         if self._backs_up:
             core.ready_backup()
         self._weights_every = topics.OUTPUT_WEIGHTS.every(self._period)

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbmpc.model import LARGEST_GROWTH, Model
+from lbmpc.model import Model, growth_rate, longest_horizon
+from lbmpc.plants.description import PlantError
 
-STABLE = 1e-9
-"""How far above 0 rounding may leave a growth a step."""
 SETTLED = 0.2
 """Half-widths into which the feedback has brought every state from all of X when it counts as settled."""
 MOST_STEPS = 1000
 
 Step = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-"""(x, u, dt) -> x, in plant units: the true motion."""
+"""`lbmpc.plants.TrueMotion.step`: (x, u, dt) -> x, in plant units."""
 
 
 def poles(matrix: np.ndarray, period: float) -> np.ndarray:
@@ -40,14 +39,7 @@ def reach(model: Model, steps: int) -> np.ndarray:
 
 def growth(model: Model, steps: int) -> float:
     """Factor by which the fastest mode grows over so many steps; at least 1."""
-    radius = max(1.0, float(np.abs(np.linalg.eigvals(model.A)).max()))
-    return math.exp(min(700.0, steps * math.log(radius)))
-
-
-def longest_horizon(model: Model) -> int | None:
-    """Steps over which a prediction keeps half of its digits, as `lbmpc.model.require_horizon` asks; None: any."""
-    rate = math.log(max(1.0, float(np.abs(np.linalg.eigvals(model.A)).max())))
-    return int(math.log(LARGEST_GROWTH) / rate) if rate > STABLE else None
+    return math.exp(min(700.0, steps * growth_rate(model)))
 
 
 def settling_steps(model: Model) -> int:
@@ -85,12 +77,10 @@ class SampledDisturbance:
     """Samples from which the true motion could not be followed."""
 
 
-def sample_disturbance(
-    model: Model, step: Step, count: int, rng: np.random.Generator, lost: type[Exception]
-) -> SampledDisturbance:
+def sample_disturbance(model: Model, step: Step, count: int, rng: np.random.Generator) -> SampledDisturbance:
     """|h| = |x+ - A x - B u| of the true motion, at `count` points of X x U; half of them on its boundary.
 
-    A side without a bound is taken a half-width from (x_e, u_e). `lost` is what `step` raises where it cannot go on.
+    A side without a bound is taken a half-width from (x_e, u_e).
     """
     plant = model.plant
     rest, scale = np.concatenate([plant.x_e, plant.u_e]), np.concatenate([plant.x_scale, plant.u_scale])
@@ -109,7 +99,7 @@ def sample_disturbance(
         x, u = point[: model.d], point[model.d :]
         try:
             after = step(x, u, model.period)
-        except lost:
+        except PlantError:
             missing += 1
             continue
         h = np.abs(after - plant.x_e - model.step(x - plant.x_e, u - plant.u_e)) / model.period
@@ -128,9 +118,7 @@ class Kept:
     """The state that left X first, or why the motion could not be followed; "": it stayed."""
 
 
-def under_safe_input(
-    model: Model, step: Step, start: np.ndarray, seconds: float, lost: type[Exception]
-) -> Kept:
+def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float) -> Kept:
     """The true motion from `start`, (d,), plant units, under the safe input and gain, renewed every period."""
     plant, x = model.plant, np.array(start, dtype=float)
     steps = max(1, round(seconds / model.period))
@@ -138,11 +126,8 @@ def under_safe_input(
         outside = np.flatnonzero((x < plant.x_min) | (x > plant.x_max))
         if outside.size:
             return Kept(k * model.period, plant.states[int(outside[0])])
-        u = plant.safe_input
-        if plant.safe_gain is not None:
-            u = np.clip(u + plant.safe_gain @ (x - plant.x_e), plant.u_min, plant.u_max)
         try:
-            x = step(x, u, model.period)
-        except lost as error:
+            x = step(x, plant.safe_input_at(x), model.period)
+        except PlantError as error:
             return Kept(k * model.period, str(error))
     return Kept(steps * model.period, "")

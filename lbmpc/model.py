@@ -24,6 +24,8 @@ SAME_PERIOD = 1e-9
 """How far apart, as a share, two periods are that are the same: one over a rate is rounded."""
 LARGEST_GROWTH = 1e8
 """Of a prediction over the horizon: of 16 digits half are left."""
+STABLE = 1e-9
+"""How far above 0 rounding may leave a growth a step."""
 
 
 class ModelError(ValueError):
@@ -223,15 +225,22 @@ def _terminal_weight(
     return p
 
 
-def require_horizon(model: Model, horizon: int) -> None:
-    """Raises `ModelError` where the plant runs away so fast that a prediction of so many steps has no digits left.
+def growth_rate(model: Model) -> float:
+    """Of the fastest mode, a step: the logarithm of the largest |eigenvalue| of A; at least 0."""
+    return math.log(max(float(np.abs(np.linalg.eigvals(model.A)).max()), 1.0))
 
-    The largest |eigenvalue| of A to the power of the horizon may be `LARGEST_GROWTH` at most.
-    """
-    rate = math.log(max(float(np.abs(np.linalg.eigvals(model.A)).max()), 1.0))
-    if horizon * rate <= math.log(LARGEST_GROWTH):
+
+def longest_horizon(model: Model) -> int | None:
+    """Steps over which a prediction keeps half of its digits: it grows by `LARGEST_GROWTH` at most; None: any."""
+    rate = growth_rate(model)
+    return int(math.log(LARGEST_GROWTH) / rate) if rate > STABLE else None
+
+
+def require_horizon(model: Model, horizon: int) -> None:
+    """Raises `ModelError` where the plant runs away so fast that a prediction of so many steps has no digits left."""
+    rate, most = growth_rate(model), longest_horizon(model)
+    if most is None or horizon <= most:
         return
-    most = int(math.log(LARGEST_GROWTH) / rate)
     remedy = (
         f"at most {most} steps ({most * model.period:.3g} s)"
         if most

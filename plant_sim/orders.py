@@ -92,12 +92,8 @@ def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
     """The safe input; of one that depends on the state: until `ends`, and without its feedback where none is known."""
     if plant.safe_gain is None:
         return Drive(within(plant, plant.safe_input), "safe", math.inf)
-    u = plant.safe_input
-    if (x := measure()) is not None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            fed_back = u + plant.safe_gain @ (x - plant.x_e)
-        u = fed_back if np.isfinite(fed_back).all() else u
-    return Drive(within(plant, u), "safe", ends)
+    x = measure()
+    return Drive(within(plant, plant.safe_input if x is None else plant.safe_input_at(x)), "safe", ends)
 
 
 def within(plant: Description, u: list[float] | np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from trainer_node.network import ACTIVATIONS, BACKWARD, Loss, Network, build_los
 CACHED_ROWS = 2048
 """Samples of a stack on a CPU: with more at once every step goes to memory, and is slower than one by one."""
 LOOK_EVERY = 10
-"""Steps between two looks at what is held out."""
+"""Steps between two looks at what is held out; the last step is looked at too."""
 LANES = 256
 """Plants of a stack on a GPU."""
 
@@ -86,7 +86,7 @@ def _best(network: Network, loss: Loss, held_out: Loss, steps: int, learning_rat
     best = [held_out.value(), network.flat.detach().clone()]
 
     def look(taken: int) -> None:
-        if taken % LOOK_EVERY == 0 and (now := held_out.value()) < best[0]:
+        if (taken % LOOK_EVERY == 0 or taken == steps) and (now := held_out.value()) < best[0]:
             best[:] = now, network.flat.detach().clone()
 
     _adam(network.flat, loss.gradient, steps, learning_rate, look)

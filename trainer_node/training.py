@@ -100,7 +100,7 @@ class Trainer:
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
         self._fresh = 0
-        # What the labels' variance adds to the loss.
+        # What the variance of the newest labels adds to the loss; 0: they are exact.
         self._noise = 0.0
         self._step = 1
         self.resume(hidden, version)
@@ -157,9 +157,10 @@ class Trainer:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
         windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
-        if samples[-1].variance:
-            self._noise = self._noise_of(np.array(samples[-1].variance))
-        return self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
+        noise = self._noise_of(np.array(samples[-1].variance)) if samples[-1].variance else 0.0
+        new = self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
+        self._noise = noise
+        return new
 
     def _noise_of(self, variance: np.ndarray) -> float:
         """What labels of this variance, (d,), add to the loss. Raises `ValueError` for what is none."""

@@ -43,8 +43,8 @@ class Estimate(NamedTuple):
 class Estimator(ABC):
     """The state from what is measured."""
 
-    noisy: bool
-    """Whether labels have a variance."""
+    sees_all: bool
+    """Whether every state is measured."""
 
     @abstractmethod
     def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
@@ -66,7 +66,7 @@ class Estimator(ABC):
 class Samples(Estimator):
     """A sample is the state. It remembers nothing."""
 
-    noisy = False
+    sees_all = True
 
     def __init__(self, d: int):
         self._exact = np.zeros(d)

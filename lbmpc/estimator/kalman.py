@@ -9,11 +9,11 @@ does not come back as a label.
 
 The covariance is a memory, not the stationary one: at the start, and after lost samples, less is known.
 
-**Labels.** Of a measured state i, h_i(x_t, u_t) is y_{t+1} - A x_t - B u_t with x_t the estimate *before* that
-measurement. Its error is v_{t+1} - A (x_t - xhat_t), of variance R_i + (A P_t A')_i; as the innovations of a filter are
-white, so are the errors of consecutive labels, as far as the process above describes h. No delta is in it, so a label
-is not pulled towards what was believed. Of a state that nobody measures only delta is known; its variance counts as
-often as neighbouring labels say the same.
+**Labels.** Of a measured state i, h_i(xhat_t, u_t) is y_{t+1} - A xhat_t - B u_t with xhat_t the estimate *before* that
+measurement. Its error is v_{t+1} + A (x_t - xhat_t), of variance R_i + (A P_t A')_i: the filter's innovation, which is
+white as far as the process above describes h, less the error of delta. No delta is in the label, so it is not pulled
+towards what was believed. Of a state that nobody measures only delta is known; its variance counts as often as
+neighbouring labels say the same.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ LEAST = 1e-6
 UNKNOWN = 1.0
 """Half-widths: standard deviation of a state that nobody measures, before the first sample."""
 LONGEST_GAP = 100
-"""Periods without a sample after which nothing is known any more."""
+"""Periods, from one sample to the next, after which nothing is known any more."""
+LOST = 1e3
+"""Half-widths: nothing is known either where a prediction has this standard deviation. Of a plant that runs away it has
+no digits left soon after, and no end."""
 RANK, PART = 1e-9, 1e-6
 """What counts as nothing: of the largest singular value, and of a mode."""
 LASTS = 1.0 - 1e-6
@@ -48,13 +51,12 @@ class KalmanEstimator(Estimator):
         correlation: seconds in which h becomes another, by a factor of e.
     """
 
-    noisy = True
-
     def __init__(
         self, model: Model, measured: np.ndarray, noise: np.ndarray, process: np.ndarray, correlation: float
     ):
         d = model.d
         self._model, self._measured = model, measured
+        self.sees_all = len(measured) == d
         units = self._units = balanced(model.plant)[:d]
         least = LEAST * model.plant.x_scale
         self._R = (np.maximum(noise, least) / units)[measured] ** 2
@@ -66,6 +68,7 @@ class KalmanEstimator(Estimator):
         self._Q = np.diag(np.concatenate([np.zeros(d), (1.0 - rho**2) * sigma**2]))
         x = UNKNOWN * model.plant.x_scale / units
         self._unknown = np.diag(np.concatenate([x, sigma]) ** 2)
+        self._lost = (LOST * model.plant.x_scale / units) ** 2
         inputs = model.B * model.plant.u_scale / units[:, None]
         self._any_input = np.zeros((2 * d, 2 * d))
         self._any_input[:d, :d] = inputs @ inputs.T
@@ -84,17 +87,14 @@ class KalmanEstimator(Estimator):
 
     def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
         source, sequence = state["sample"].tolist()
-        periods = seen.sequence - sequence
-        known = sequence >= 0 and seen.source == source and periods <= LONGEST_GAP
-        if seen.applied is None or not known:
-            after = self._begun(state, seen)
-            estimate = Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+        periods, u = seen.sequence - sequence, seen.applied
+        if u is None or sequence < 0 or seen.source != source or periods > LONGEST_GAP:
+            after, estimate = self._begun(state, seen)
         elif periods <= 0:
             # The period was counted as missed, and its sample comes late.
-            after = self._corrected(state, seen.y[self._measured])
-            estimate = Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+            after, estimate = self._unlabelled(state, seen)
         else:
-            after, estimate = self._followed(state, seen, seen.applied, periods)
+            after, estimate = self._followed(state, seen, u, periods)
         return {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}, estimate
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
@@ -104,16 +104,26 @@ class KalmanEstimator(Estimator):
         first, then = state["inputs"]
         pieces = ((delay, first), (self._model.period - delay, then)) if delay > 0.0 else ()
         after = self._predicted(state, self._nominal(state["x"], then, pieces))
+        if self._is_lost(after):
+            return {**self.initial_state(), "inputs": state["inputs"]}
         return {**after, "sample": np.array([source, sequence + 1], dtype=np.int64)}
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}
 
-    def _begun(self, state: EstimatorState, seen: Measured) -> EstimatorState:
+    def _begun(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
         """After a sample of which nothing is known that came before."""
         begun = {**self.initial_state(), "inputs": state["inputs"]}
         begun["x"][self._measured] = seen.y[self._measured]
-        return self._corrected(begun, seen.y[self._measured])
+        return self._unlabelled(begun, seen)
+
+    def _unlabelled(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+        """After a sample of the time that the memory is of, which says nothing of the period before."""
+        after = self._corrected(state, seen.y[self._measured])
+        return after, Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+
+    def _is_lost(self, state: EstimatorState) -> bool:
+        return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()
 
     def _followed(
         self, state: EstimatorState, seen: Measured, u: np.ndarray, periods: int
@@ -124,6 +134,8 @@ class KalmanEstimator(Estimator):
             # What acted then is not known.
             state = self._predicted(state, self._nominal(state["x"], u, ()))
             state = {**state, "covariance": state["covariance"] + self._any_input}
+            if self._is_lost(state):
+                return self._begun(state, seen)
         nominal, before = self._nominal(state["x"], u, seen.pieces), state["covariance"][:d, :d]
         after = self._corrected(self._predicted(state, nominal), seen.y[measured])
         reached = nominal + after["disturbance"]

@@ -100,6 +100,15 @@ class Description:
                 new |= {f"{axis}_min": low, f"{axis}_max": high}
         return replace(self, **new) if new else self
 
+    def safe_input_at(self, x: np.ndarray) -> np.ndarray:
+        """What the plant's own hardware applies at x, (d,), when nobody commands it, (m,); inside U."""
+        u = self.safe_input
+        if self.safe_gain is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                fed_back = u + self.safe_gain @ (x - self.x_e)
+            u = fed_back if np.isfinite(fed_back).all() else u
+        return np.minimum(np.maximum(u, self.u_min), self.u_max)
+
     @property
     def d(self) -> int:
         return len(self.states)

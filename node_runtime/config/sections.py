@@ -107,7 +107,8 @@ class BackupConfig(Section, frozen=True):
     """Of the policy that the plant follows when its controller falls silent."""
 
     enabled: bool = True
-    """Up to 100 Hz; in a faster loop there is no time for it, and the plan is what the plant follows."""
+    """Up to 100 Hz, and where every state is measured: in a faster loop there is no time for it, and it feeds back all
+    states. Elsewhere the plan is what the plant follows."""
     margin: Annotated[float, msgspec.Meta(ge=0, lt=0.5)] = 0.0075
     """By how much X shrinks for it, as a share of its half-widths; less where that would cost the way back."""
 

@@ -165,6 +165,13 @@ def test_a_backup_follows_each_command_where_there_is_time(rate: str, times: int
     assert all(names[names.index(topics.BACKUP.name) - 1] == topics.COMMAND.name for _ in range(times))
 
 
+@pytest.mark.parametrize(("measured", "times"), [('["z", "y"]', 0), ('["z", "y", "r", "rdot"]', 2)])
+def test_a_backup_feeds_back_no_state_that_nobody_measures(measured: str, times: int) -> None:
+    loop = Loop("rate=20.0", "estimator.kind=kalman", f"estimator.measured={measured}")
+    loop.tick(2)
+    assert loop.bus.seqs(topics.BACKUP) == list(range(times))
+
+
 def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else() -> None:
     loop = Loop("controller.solver.mode=real_time", "controller.backup.enabled=false")
     loop.tick(3)

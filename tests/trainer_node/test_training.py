@@ -357,6 +357,33 @@ def test_what_is_held_out_says_where_to_stop() -> None:
     np.testing.assert_allclose(learned.loss_after, (error**2).sum() / len(h), rtol=1e-4)
 
 
+def test_of_a_few_steps_the_last_one_counts_too() -> None:
+    trainer = Trainer(DESCRIPTION, msgspec.structs.replace(CONFIG, steps=7), 5, "trainer-1", HIDDEN)
+    trainer.add("controller-1", noisy(300, 0.01))
+    learned = trainer.train(output(trainer), "controller-1")
+    assert learned is not None
+    assert learned.loss_after < learned.loss_before
+
+
+def test_the_newest_samples_say_whether_labels_are_noisy_and_a_bad_one_says_nothing() -> None:
+    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
+
+    def holds_out() -> bool:
+        draw = trainer.begin(output(trainer), "controller-1")
+        assert draw is not None
+        return draw.problem.held_out is not None
+
+    trainer.add("controller-1", samples(0, 40))
+    (bad,) = noisy(1, 1.0)
+    trainer.add("controller-1", [msgspec.structs.replace(bad, seq=90, h=[float("nan")] * 4)])
+    assert trainer.counters["bad samples"] == 1
+    assert not holds_out()
+    trainer.add("controller-1", [msgspec.structs.replace(bad, seq=91)])
+    assert holds_out()
+    trainer.add("controller-2", samples(100, 1))
+    assert not holds_out()
+
+
 @pytest.mark.parametrize("variance", [[-1.0] * 4, [float("nan")] * 4, [1.0], [1e306] * 4])
 def test_a_variance_that_is_none_is_a_bad_sample(variance: list[float]) -> None:
     trainer = make(number=30)

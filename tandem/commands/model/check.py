@@ -79,7 +79,7 @@ class ModelCheck(Configured):
         import numpy as np
 
         from lbmpc.analysis import advised_horizon, poles, reach, sample_disturbance
-        from lbmpc.plants import Known, PlantError, get_plant, get_truth, true_motion
+        from lbmpc.plants import Known, get_plant, get_truth, true_motion
         from node_runtime.config.plant import initial_state, true_plant_of
         from tandem.commands.model.findings import (
             disturbance_finding,
@@ -104,7 +104,7 @@ class ModelCheck(Configured):
         if not isinstance(true, Known):
             with self.console.status("asking the true motion for h"):
                 rng = np.random.default_rng(0)
-                sampled = sample_disturbance(model, step, SAMPLES, rng, PlantError)
+                sampled = sample_disturbance(model, step, SAMPLES, rng)
         if self.prove:
             bound = self._proved(model, own_truth=not config.plant.truth)
         moved = reach(model, horizon)

@@ -15,13 +15,12 @@ from lbmpc.analysis import (
     Step,
     advised_horizon,
     growth,
-    longest_horizon,
     poles,
     reach,
     under_safe_input,
 )
-from lbmpc.model import Model, ModelError, require_horizon
-from lbmpc.plants import Known, PlantError
+from lbmpc.model import Model, ModelError, longest_horizon, require_horizon
+from lbmpc.plants import Known
 from lbmpc.plants.matrices import unmoved_modes
 from tandem.model_tables import percent, poles_text
 
@@ -175,7 +174,7 @@ def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Fi
     seconds = max(FOLLOWED, 2.0 * horizon * model.period)
     law = "the safe input" if model.plant.safe_gain is None else "the safe input with its gain"
     for where, start in (("x0", x0), ("x_e", model.plant.x_e)):
-        kept = under_safe_input(model, step, start, seconds, PlantError)
+        kept = under_safe_input(model, step, start, seconds)
         if not kept.left:
             yield Finding("ok", f"safe from {where}", f"{law} keeps it in X for {seconds:.3g} s")
         elif kept.left in model.plant.states:

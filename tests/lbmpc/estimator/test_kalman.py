@@ -12,6 +12,7 @@ from lbmpc.model import Model, build_model
 from lbmpc.plants import Known
 from node_runtime.config.loading import load
 from node_runtime.config.strict import ConfigError
+from tests.helpers.plants.unstable import unstable
 from tests.helpers.science import compressor
 
 MODEL = compressor()
@@ -168,6 +169,26 @@ def test_the_late_sample_of_a_period_that_was_counted_as_missed_still_counts() -
     after, _ = kalman.update(missed, motion.sample())
     assert np.trace(after["covariance"]) < np.trace(missed["covariance"])
     assert after["sample"].tolist() == [7, motion.number]
+
+
+@pytest.mark.parametrize("gap", [60, 3000])
+@pytest.mark.parametrize("counted", [True, False])
+def test_of_a_plant_that_runs_away_nothing_is_known_after_a_while(gap: int, counted: bool) -> None:
+    """Somebody else holds it meanwhile, and the prediction would have no end."""
+    model = build_model(unstable(20.0), 0.05)
+    kalman = KalmanEstimator(model, np.arange(1), np.array([0.01]), np.array([0.01]), 1.0)
+    u = np.array([-0.3])
+    memory, _ = kalman.update(kalman.initial_state(), Measured(np.array([0.3]), 7, 0, None, ()))
+    for _ in range(gap if counted else 0):
+        memory = kalman.missed(kalman.commanded(memory, u), 0.0)
+        assert all(np.isfinite(array).all() for array in memory.values())
+    memory, estimate = kalman.update(memory, Measured(np.array([0.3]), 7, gap + 1, u, ()))
+    np.testing.assert_allclose(estimate.x, 0.3)
+    assert memory["sample"].tolist() == [7, gap + 1]
+    # And from there on all is as ever.
+    _, estimate = kalman.update(memory, Measured(np.array([0.3]), 7, gap + 2, u, ()))
+    np.testing.assert_allclose(estimate.x, 0.3)
+    assert np.isfinite(estimate.variance).all()
 
 
 def chain() -> Model:
