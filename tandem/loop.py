@@ -36,7 +36,6 @@ from protocol.messages import TickResult
 from run_log.reporting.summary import Summary, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import Run
-from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import LockStep
 
 if TYPE_CHECKING:
@@ -243,6 +242,8 @@ class Result:
         Raises:
             LogError: something is there already, or it cannot be written.
         """
+        from run_log.writing.save import save
+
         save(self.run, path)
         return Path(path)
 
