@@ -34,6 +34,7 @@ examples: $(READY)  ## every example, one of them live, with pictures into runs/
 	mkdir -p $(EXAMPLES)
 	cd $(EXAMPLES) && $(CURDIR)/$(BIN)/python $(CURDIR)/examples/compressor/compressor.py
 	$(BIN)/python examples/compare.py examples/tanks/tanks.toml --steps 60 --out $(EXAMPLES)/tanks.png
+	$(BIN)/python examples/compare.py examples/reactor/reactor.toml --steps 100 --episodes 3 --out $(EXAMPLES)/reactor.png
 	$(BIN)/python examples/compare.py examples/quadrotor/quadrotor.toml --steps 250 --out $(EXAMPLES)/quadrotor.png
 	$(BIN)/python examples/compare.py examples/mujoco_crane/crane.toml --steps 500 --out $(EXAMPLES)/crane.png
 	$(BIN)/python examples/compare.py examples/gymnasium_pendulum/pendulum.toml --steps 100 --out $(EXAMPLES)/pendulum.png
