@@ -211,6 +211,15 @@ def test_it_is_drawn_and_saved_as_any_run(tmp_path: Path) -> None:
     assert replay(read_run(result.save(tmp_path / "run.mcap"))).equal
 
 
+@pytest.mark.parametrize("before", ["plant.sensors.noise=0.02", "plant.sensors.noise={y=0.02}", "seed=3"])
+def test_a_table_of_names_takes_the_place_of_what_was_there(before: str) -> None:
+    config = load(None, [before, "plant.sensors.dropouts=0.1", "controller.solver.compile=never"])
+    sensors = Loop(
+        oracle="linear", config=config, plant={"sensors": {"noise": {"z": 0.01}}}
+    ).config.plant.sensors
+    assert (sensors.noise, sensors.dropouts) == ({"z": 0.01}, 0.1)
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
