@@ -20,8 +20,11 @@ class RejectedMessages:
         self._counts: dict[str, int] = {}
         self._lock = threading.Lock()
 
-    def count(self, topic: str, reason: str, detail: str = "") -> None:
-        """Count one message. `reason` is one of a few fixed texts; `detail` is only logged, for a person."""
+    def count(self, topic: str, reason: str, detail: str = "") -> bool:
+        """Count one message; whether it is the first of its kind.
+
+        `reason` is one of a few fixed texts; `detail` is only logged, for a person.
+        """
         key = f"bad {topic}: {reason}"
         with self._lock:
             if key not in self._counts and len(self._counts) >= MAX_KINDS:
@@ -31,6 +34,7 @@ class RejectedMessages:
         if seen == 0:
             told = printable(detail[:300]) or "no detail"
             log.warning("%s (%s); ignored, further ones are only counted", key, told)
+        return seen == 0
 
     def counters(self) -> dict[str, int]:
         """Keys like "bad plant/state: not finite"."""

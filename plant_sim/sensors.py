@@ -33,17 +33,12 @@ class Sensors:
         self._last: tuple[float, np.ndarray] | None = None
         self._first: float | None = None
         self._held = np.full(len(names), math.nan)
-
-    @property
-    def perfect(self) -> bool:
-        """Whether what is measured is the true state."""
-        settings = self._settings
         err = self._noise.any() or self._step.any() or self._bias.any() or settings.stuck or settings.dropouts
-        return not err
+        self._perfect = not err
 
     def measure(self, x: np.ndarray, t: float) -> np.ndarray | None:
         """What is measured of x, (d,), at t, seconds, plant units; None where the sample is lost. t must not fall."""
-        if self.perfect:
+        if self._perfect:
             return x
         self._first = t if self._first is None else self._first
         since = t - self._first

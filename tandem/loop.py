@@ -28,7 +28,7 @@ from lbmpc.plants import (
 from node_runtime.config import strict
 from node_runtime.config.loading import from_tree, to_tree
 from node_runtime.config.plant import plant_of, true_plant_of
-from node_runtime.config.sections import Config
+from node_runtime.config.sections import Config, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -36,15 +36,10 @@ from protocol.messages import TickResult
 from run_log.reporting.summary import Summary, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import Run
-from run_log.writing.save import save
 from tandem.experiments.simulation.lockstep import LockStep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-TABLES_OF_NAMES = ("plant.truth", "plant.bounds", "network.options")
-"""Their keys are no settings: a new table replaces the old one."""
 
 
 class Step(NamedTuple):
@@ -243,6 +238,8 @@ class Result:
         Raises:
             LogError: something is there already, or it cannot be written.
         """
+        from run_log.writing.save import save
+
         save(self.run, path)
         return Path(path)
 
@@ -267,11 +264,11 @@ def _resolved(
         file = config_file(config)
         tree, folder, where = strict.load_tree(file), file.parent, str(config)
     origins: dict[str, str] = {}
-    _merge(tree, settings, "", origins)
+    _merge(tree, settings, Config(), "", origins)
     for name, (key, value) in arguments.items():
         if value is not None:
             table, last = key.split(".")
-            _merge(tree, {table: {last: value}}, "", {})
+            _merge(tree, {table: {last: value}}, Config(), "", {})
             origins[key] = f"Loop({name}=)"
     return from_tree(tree, where, origins, folder)
 
@@ -289,14 +286,18 @@ def _name_of(given: object, moves: bool = False) -> object:
     return f"Loop:{name}"
 
 
-def _merge(tree: dict[str, Any], changes: Mapping[str, Any], above: str, origins: dict[str, str]) -> None:
+def _merge(
+    tree: dict[str, Any], changes: Mapping[str, Any], section: Section, above: str, origins: dict[str, str]
+) -> None:
+    """Lay `changes` over the tree of `section`. A table that is no section has names for keys, and replaces the old."""
     for name, value in changes.items():
         key = f"{above}{name}"
-        if isinstance(value, Mapping) and key not in TABLES_OF_NAMES:
+        inner = getattr(section, name, None)
+        if isinstance(value, Mapping) and isinstance(inner, Section):
             below = tree.setdefault(name, {})
             if not isinstance(below, dict):
                 raise ConfigError(f"{key} is a value, not a table")
-            _merge(below, value, f"{key}.", origins)
+            _merge(below, value, inner, f"{key}.", origins)
         else:
             tree[name] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
             origins[key] = "Loop"

@@ -44,20 +44,19 @@ def write_new(file: Path, text: str) -> None:
         raise Refused(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def source(fields: Mapping[str, Any], about: Sequence[str], name: str = "PLANT") -> str:
-    """The text of a file in which `name` is `Known.from_matrices(**fields)`.
+def source(fields: Mapping[str, Any], about: Sequence[str]) -> str:
+    """The text of a file in which PLANT is `Known.from_matrices(**fields)`.
 
     Args:
         fields: arguments of `Known.from_matrices`: arrays, tuples, mappings, texts, numbers; None is left out.
         about: lines of the file's docstring.
-        name: of the plant in the file.
     """
     # Names may be a stranger's, and files' names any bytes.
     lines = ['"""' + printable("\n".join(about)).replace("\\", "/").replace('"""', "'''") + '"""', ""]
     given = {key: _text(value, 4) for key, value in fields.items() if value is not None}
     if any("inf" in text for key, text in given.items() if key.endswith(("_min", "_max"))):
         lines += ["from math import inf", ""]
-    lines += ["from lbmpc.plants import Known", "", f"{name} = Known.from_matrices("]
+    lines += ["from lbmpc.plants import Known", "", "PLANT = Known.from_matrices("]
     for key, text in given.items():
         if key in COMMENTS:
             lines.append(f"    # {COMMENTS[key]}")

@@ -46,6 +46,8 @@ ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
 """What null means, where it is more than that there is no such figure."""
 OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s", "offset": "share"}
 """Which figure of each performance state these are."""
+WITH_A_REFERENCE = ("unreached_ticks", "target_distance", "offset")
+"""Rows that the table of another run has not."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -76,6 +78,8 @@ def table(summary: Summary) -> Table:
     if len(episodes) > 1:
         figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
     for name, value in figures.items():
+        if name in WITH_A_REFERENCE and value in (None, {}):
+            continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
     return shown

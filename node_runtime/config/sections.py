@@ -70,6 +70,11 @@ class SensorsConfig(Section, frozen=True):
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
 
+    @property
+    def random(self) -> bool:
+        """Whether two seeds are two different measurements."""
+        return bool(self.noise or self.dropouts)
+
 
 class PlantConfig(Section, frozen=True):
     model: str = "moore_greitzer"

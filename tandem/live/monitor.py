@@ -168,9 +168,8 @@ class Monitor:
             message = codec.decode(topic, delivery.payload)
             codec.check_dimensions(topic, message, self.plant.d, self.plant.m)
         except codec.BadMessage as error:
-            if f"bad {topic.name}: {error.reason}" not in self.bad.counters():
+            if self.bad.count(topic.name, error.reason, error.detail):
                 self.say(f"{error}; not obeyed", now, "bad")
-            self.bad.count(topic.name, error.reason, error.detail)
             return
         follower = self._followers.setdefault(topic.name, Follower(self.config.bus.follow_silence))
         verdict = follower.accept(message.run_id, message.seq, now)

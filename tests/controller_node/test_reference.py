@@ -17,6 +17,7 @@ from run_log.replaying.replay import replay
 from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.lockstep import simulate
+from tandem.summary_table import table
 
 STEPS, EVERY = 180, 25
 WRONG = [
@@ -99,6 +100,14 @@ def test_out_of_reach_is_counted_and_nothing_else_happens() -> None:
     assert found.target_distance is not None
     assert found.target_distance > 5e-4
     assert (found.constraint_violations, found.fallback_ticks) == (0, 0)
+
+
+def test_the_table_speaks_of_a_reference_where_there_is_one(constant: Run) -> None:
+    named, without = (
+        set(table(summarise(run)).columns[0].cells) for run in (constant, run_of("constant", steps=3))
+    )
+    assert named - without == {"unreached_ticks", "target_distance", "offset"}
+    assert without < named
 
 
 def test_without_a_reference_nothing_is_said_or_remembered() -> None:

@@ -22,6 +22,7 @@ COMMANDS = (
     "health",
     "config show",
     "architecture check",
+    *("model check", "model new", "identify"),
     *("sets compute", "sets check", "sets plot"),
 )
 KEYS = {

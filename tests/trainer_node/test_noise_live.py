@@ -21,6 +21,7 @@ SETTINGS = (
     "network.hidden=[8, 8]",
     "trainer.steps=20",
     "trainer.train_every=5",
+    "plant.sensors.noise={z=1.4e-3, y=1.4e-3}",
 )
 
 
@@ -31,7 +32,7 @@ def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
         open_router(config),
         Bus(config, "recorder", "recorder-a") as bus,
         Process("trainer_node.main", config),
-        Process("tests.helpers.noisy_plant", config),
+        Process("plant_sim.node", config),
     ):
         ear = BusListener(bus)
         with Process("controller_node.node", config):

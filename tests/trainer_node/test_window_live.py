@@ -9,8 +9,8 @@ import pytest
 from node_runtime.config.architecture import load_architecture
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
+from tests.helpers.launched import launched, small
 from tests.helpers.paths import ROOT
-from tests.tandem.live.test_supervisor import launched, small
 
 GRU = f"{ROOT / 'examples' / 'architecture' / 'gru.py'}:GRU"
 

@@ -137,7 +137,7 @@ class LockStep:
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER, given=given)
         truth = None if given is None else given.truth
-        self.true = self.first_true = true_plant_of(config, get_plant, get_truth) if truth is None else truth
+        self.true = true_plant_of(config, get_plant, get_truth) if truth is None else truth
         self.motion = self._motion(self.true)
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         self.plant = self._started_plant(initial_state(config, self.core.plant))
@@ -199,7 +199,7 @@ class LockStep:
         if last >= 0 and self.taken % self.config.controller.keyframe_every:
             log.append(self._noted(topics.KEYFRAME, self.core.memory.keyframe(last), last))
         run = gather(self.config, log)
-        run.plant, run.truth, run.files = self.core.plant, self.first_true, files_of(self.config)
+        run.plant, run.truth, run.files = self.core.plant, self.true, files_of(self.config)
         return run
 
     def start_again(self, lost: bool = False) -> None:
@@ -235,7 +235,7 @@ class LockStep:
         true = self.plant.sample(t)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
-            self.true = now = self.changes.pop(0)[1]
+            now = self.changes.pop(0)[1]
             self.motion = self._motion(now)
             self.plant.change(self.motion)
             truth = now.parameters

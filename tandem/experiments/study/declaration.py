@@ -237,8 +237,7 @@ def _resolve(
 
 
 def _draws(config: Config) -> bool:
-    sensors = config.plant.sensors
-    return config.controller.oracle == "dnn" or bool(sensors.noise or sensors.dropouts)
+    return config.controller.oracle == "dnn" or config.plant.sensors.random
 
 
 def _said(levels: Sequence[Runs], key: str, otherwise: Any) -> Any:

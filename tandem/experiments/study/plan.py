@@ -86,7 +86,7 @@ def _what_counts(config: Config) -> Config:
         unread.append("l2nw")
     if oracle != "dnn":
         unread += ["network", "adaptation", "trainer"]
-        if not (config.plant.sensors.noise or config.plant.sensors.dropouts):
+        if not config.plant.sensors.random:
             unread.append("seed")
     default = Config()
     return msgspec.structs.replace(config, **{name: getattr(default, name) for name in unread})
