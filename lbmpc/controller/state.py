@@ -9,6 +9,7 @@ import numpy as np
 from lbmpc.controller.fallback import Plan
 from lbmpc.estimator.base import EstimatorState
 from lbmpc.oracles.base import OracleState
+from lbmpc.references import Reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,8 @@ class ControllerState:
     target: np.ndarray
     """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
     estimator: EstimatorState
+    reference: Reference | None = None
+    """The one that was given, as of the next tick; None: the configured one."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -40,17 +43,21 @@ class ControllerState:
             "predicted": self.predicted,
             "delay": np.array([self.delay]),
             **({"target": self.target} if self.target.size else {}),
+            **{f"reference.{name}": array for name, array in self._reference_arrays().items()},
             **{f"estimator.{name}": array for name, array in self.estimator.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
+    def _reference_arrays(self) -> dict[str, np.ndarray]:
+        return {} if self.reference is None else self.reference.to_arrays()
+
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
-        """Raises KeyError when an array is missing."""
+        """Raises KeyError when an array is missing, ValueError where those of a reference are none."""
         source, sequence = (int(value) for value in arrays["pending"])
-        oracle, estimator = (
+        oracle, estimator, reference = (
             {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-            for prefix in ("oracle.", "estimator.")
+            for prefix in ("oracle.", "estimator.", "reference.")
         )
         plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
@@ -62,4 +69,5 @@ class ControllerState:
             oracle,
             arrays.get("target", np.zeros(0)),
             estimator,
+            Reference.from_arrays(reference, len(arrays["pending.x"])) if reference else None,
         )
