@@ -35,6 +35,8 @@ class Reference:
     """Periods until it is forgotten."""
     held: bool = False
     """Whether the plant is held where it was."""
+    source: int = 0
+    """Of who gave it: to say it again renews the lease, and nothing else."""
 
     def at(self, seconds: float) -> np.ndarray:
         """(p,) so many seconds after it was given."""
@@ -52,7 +54,7 @@ class Reference:
             "outputs": np.array(self.outputs, dtype=np.int64),
             "times": self.times,
             "values": self.values,
-            "count": np.array([self.passed, self.left, self.held], dtype=np.int64),
+            "count": np.array([self.passed, self.left, self.held, self.source], dtype=np.int64),
         }
 
     @classmethod
@@ -73,10 +75,25 @@ class Reference:
             raise ValueError("times")
         if values.dtype != np.float64 or values.shape != (len(times), len(outputs)):
             raise ValueError("values")
-        if count.dtype != np.int64 or count.shape != (3,) or count[0] < 0 or count[1] < FOR_EVER:
+        if count.dtype != np.int64 or count.shape != (4,) or count[0] < 0 or count[1] < FOR_EVER:
             raise ValueError("count")
-        passed, left, held = count.tolist()
-        return cls((*outputs.tolist(),), times, values, min(passed, LONGEST), left, bool(held))
+        passed, left, held, source = count.tolist()
+        return cls((*outputs.tolist(),), times, values, min(passed, LONGEST), left, bool(held), source)
+
+    def repeats(self, change: Change) -> bool:
+        """Whether that is what was asked for, said again."""
+        if change.source != self.source or self.held != (change.kind == "hold"):
+            return False
+        if self.held:
+            return True
+        times, values = change.points
+        k = len(times)
+        return (
+            change.outputs == self.outputs
+            and len(self.times) == k + (times[0] > 0.0)
+            and np.array_equal(self.times[-k:], times)
+            and np.array_equal(self.values[-k:], values)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +109,15 @@ class Change:
     """(k, p)"""
     lease: int = FOR_EVER
     """Periods."""
+    source: int = 0
+    """Of who asks."""
+
+    @property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times and values, of `set`."""
+        assert self.times is not None
+        assert self.values is not None
+        return self.times, self.values
 
 
 class Preview(NamedTuple):
@@ -123,20 +149,18 @@ def changed(
     """
     if change.kind == "configured":
         return None
+    if present is not None and present.repeats(change):
+        return replace(present, left=change.lease)
     if change.kind == "hold":
-        if present is not None and present.held:
-            return replace(present, left=change.lease)
-        return Reference(own, np.zeros(1), x[None, list(own)], left=change.lease, held=True)
-    assert change.times is not None
-    assert change.values is not None
-    times, values = change.times, change.values
+        return Reference(own, np.zeros(1), x[None, list(own)], 0, change.lease, True, change.source)
+    times, values = change.points
     if times[0] > 0.0:
         begin = aim.copy()
         if present is not None:
             begin[list(present.outputs)] = present.at(present.passed * period)
         times = np.concatenate([[0.0], times])
         values = np.vstack([begin[list(change.outputs)], values])
-    return Reference(change.outputs, times, values, left=change.lease)
+    return Reference(change.outputs, times, values, 0, change.lease, False, change.source)
 
 
 def preview(reference: Reference, ahead: float, period: float, n: int) -> Preview:

@@ -244,6 +244,12 @@ class TickResult(Message, frozen=True):
     target_u: list[float] = []
     target_distance: float | None = None
     """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
+    reference: dict[str, float] = {}
+    """Where the outputs should be in this tick, by name, plant units; empty where there are none."""
+    reference_verdict: str = "none"
+    """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
+    reference_from: str = ""
+    """run_id of who sent that; empty without one."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

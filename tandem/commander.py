@@ -49,7 +49,7 @@ class Commander:
         self._seq += 1
 
     def hear(self, seconds: float) -> m.Message | None:
-        """The next message of what it listens to; None: there was none for so long. What cannot be read is not heard."""
+        """The next of what it listens to; None: there was none for so long. What cannot be read is not heard."""
         assert self._mailbox is not None
         until = clock.now() + seconds
         while (left := until - clock.now()) > 0.0:
