@@ -53,7 +53,10 @@ def written(fields: dict[str, Any]) -> dict[str, Any]:
     Raises:
         PlantDefinitionError: a field has what JSON, or `read`, would not take.
     """
-    return msgspec.to_builtins(_typed({name: _plain(fields[name]) for name in FIELDS}))
+    given = {name: _plain(fields[name]) for name in FIELDS}
+    if given["dead_time"] == 0.0:
+        del given["dead_time"]
+    return msgspec.to_builtins(_typed(given))
 
 
 def read(data: object) -> dict[str, Any]:
