@@ -65,6 +65,7 @@ class Motion:
         samples = math.floor((self._t - self._first) / self._period + 1e-6) + 1
         t = self._first + samples * self._period
         if self._coming and self._coming[0][0] < t:
+            # Another input takes over before.
             return
         self._ahead = t, self._after(t)
 
@@ -127,8 +128,8 @@ class PlantSim:
     ):
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on.
 
-        dead_time: seconds, of the truth: from a command's arrival until it acts. Before the first the safe input acts, without its
-        gain.
+        dead_time: seconds, of the truth, from a command's arrival until it acts. Until the first does, the safe input
+            acts, without its gain.
         """
         self._shield = Shield(plant, period, plan_patience, run_id, held=True)
         self._motion = Motion(truth, x0, period, dead_time, plant.safe_input)

@@ -247,7 +247,7 @@ def test_a_state_with_a_line_comes_back_from_its_arrays() -> None:
 
 def test_what_cannot_be_with_a_dead_time_is_refused_by_name() -> None:
     delayed = model(0.1)
-    with pytest.raises(CertificateError, match="dead time of 0.1 s"):
+    with pytest.raises(CertificateError, match=r"dead time of 0\.1 s"):
         build_problem(delayed, LinearOracle(4, 1), 10, "invariant")
     with pytest.raises(ModelError, match="60 periods, and 50"):
         model(3.0)
