@@ -355,7 +355,7 @@ def test_looking_ahead_changes_nothing_behind_a_dead_time_of_whole_periods() -> 
         for k in range(12):
             due = 1e5 + k * PERIOD
             found.append(motion.read(due).tolist())
-            motion.write(np.array([U + 0.01 * (k % 5)]), due if k % 2 else due + 0.3 * PERIOD)
+            motion.write(np.array([U + 0.01 * (k % 5)]), due + (0.6 * PERIOD if k % 4 < 2 else 0.0))
             if ahead:
                 motion.look_ahead()
         return found
