@@ -15,7 +15,7 @@ Number = float | Literal["inf", "-inf"]
 """JSON has no infinity."""
 
 
-class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """Field by field as in `Known`; complex numbers are pairs of their real and imaginary parts."""
 
     name: str
@@ -40,6 +40,8 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     performance: list[int]
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
+    u_rate_max: list[Number] | None = None
+    """Missing in files that are older than it."""
 
 
 FIELDS = Written.__struct_fields__
@@ -58,8 +60,9 @@ def read(data: object) -> dict[str, Any]:
     """The fields of a `Known` from what JSON gave. Raises `PlantDefinitionError`: it is something else."""
     found = _typed(data)
     fields = msgspec.structs.asdict(found)
-    for name in ("x_min", "x_max", "u_min", "u_max"):
-        fields[name] = [float(value) for value in fields[name]]
+    for name in ("x_min", "x_max", "u_min", "u_max", "u_rate_max"):
+        if fields[name] is not None:
+            fields[name] = [float(value) for value in fields[name]]
     if found.poles is not None:
         fields["poles"] = [complex(*pole) if isinstance(pole, tuple) else pole for pole in found.poles]
     return fields

@@ -87,6 +87,8 @@ class PlantConfig(Section, frozen=True):
     """Input that goes with it."""
     bounds: dict[str, Bounds] = msgspec.field(default_factory=dict)
     """Of X and U, by the name of a state or input, where they are not the plant's own."""
+    input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
+    """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """Parameters of the true plant where they differ from the model's, by name: a model that is wrong. Or a reference
     to what moves in the plant's place: other equations, or an object with `step`."""
@@ -133,6 +135,9 @@ class ControllerConfig(Section, frozen=True):
     """Diagonal state weights, per second: a stage has Q / rate; None: ones."""
     R: list[Positive] | None = None
     """Diagonal input weights, per second; None: ones."""
+    S: list[NonNegative] | None = None
+    """Diagonal weights of how fast the inputs change, on (du/dt)^2, per second: a stage has S rate |u_i - u_{i-1}|^2.
+    None: zeros."""
     terminal: literals.TerminalName = "riccati"
     """P of the terminal cost: of the LQR with the stage weights, of the feedback K ("lyapunov"), or the one of the
     reimplementation of Aswani et al. (`lbmpc.terminal_cost`)."""
