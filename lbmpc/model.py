@@ -80,6 +80,11 @@ class Model:
         return self.A + self.B @ self.K
 
     @cached_property
+    def changes_cost(self) -> bool:
+        """Whether S is not zero."""
+        return bool(self.S.any())
+
+    @cached_property
     def time_scale(self) -> float:
         """Seconds in which the loop under K forgets: the slowest time constant of A + BK, to the nearest power of two.
 

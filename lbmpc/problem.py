@@ -16,6 +16,7 @@ v_{-1} are what acts now. By default S is 0 and the rate infinite: inputs may st
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -52,15 +53,15 @@ class Problem:
     guard: Guard | None = None
     """Bounds v_0 by a certified family of sets; None: nothing is certified."""
 
-    @property
+    @cached_property
     def input_steps(self) -> np.ndarray:
         """By how much an input may change from stage to stage, (m,); infinite where it may step."""
         return self.model.plant.input_rates * self.model.period
 
-    @property
+    @cached_property
     def looks_back(self) -> bool:
         """Whether v_0 depends on the input before."""
-        return bool(self.model.S.any() or np.isfinite(self.input_steps).any())
+        return bool(self.model.changes_cost or np.isfinite(self.input_steps).any())
 
 
 def build_problem(

@@ -21,7 +21,7 @@ from lbmpc.problem import Problem
 from lbmpc.solver.constraint_rows import Box, Rows
 from lbmpc.solver.least_distance import NO_ROWS, Shown
 from lbmpc.solver.nominal_rollout import build_nominal, build_start
-from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent, input_before
+from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent, with_input
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
@@ -86,7 +86,7 @@ class Solver:
         plant = problem.model.plant
         self._per_input = 1.0 / plant.u_scale
         self._u_min, self._u_max = plant.u_min - plant.u_e, plant.u_max - plant.u_e
-        self._behind, self._before = remembered(problem.oracle), input_before(problem.model)
+        self._behind = remembered(problem.oracle)
         self._move = Bound(realise(build_rows(problem.model, problem.horizon, self._behind)))
         self._learned = self._subproblem(problem.oracle)
         nominal = LinearOracle(problem.model.d, problem.model.m, problem.oracle.pairs)
@@ -132,7 +132,7 @@ class Solver:
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
             start = self._start(x, warm_start)
-            s = self._with_input(x, previous)
+            s = with_input(self.problem.model, x, previous)
             self._learned.load(s, oracle_parameters, xr, ur)
             solution = self._solve(self._learned, x, start)
             if solution.usable or self._learned is self._nominal:
@@ -160,7 +160,7 @@ class Solver:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
         self._rows.bound_first(None, previous)
-        rows, s = self._rows, self._with_input(x, previous)
+        rows, s = self._rows, with_input(self.problem.model, x, previous)
         with np.errstate(all="ignore"):
             v, status = self._start(x, warm_start), Status.NUMERICAL
             for subproblem, theta, trusted in (
@@ -213,7 +213,8 @@ class Solver:
         ready, self._prepared = self._prepared, None
         if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
-        rows, change = self._rows, self._with_input(np.asarray(x, dtype=float), previous) - ready.s
+        s = with_input(self.problem.model, np.asarray(x, dtype=float), previous)
+        rows, change = self._rows, s - ready.s
         rows.bound_first(first, previous)
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow.dot(change)
@@ -235,12 +236,6 @@ class Solver:
                 u = u + (ready.slopes_u @ nearest.w).reshape(shape)
                 status = status if feasible else Status.INFEASIBLE
             return self._finish(status, x, v, u, ready.cost, 1)
-
-    def _with_input(self, x: np.ndarray, previous: np.ndarray | None) -> np.ndarray:
-        """x or s, and where changes cost something the input before behind it."""
-        if not self._before:
-            return x
-        return np.concatenate([x, np.zeros(self._before) if previous is None else previous])
 
     # -- to convergence --------------------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ from __future__ import annotations
 from typing import Literal
 
 import casadi as ca
+import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, follow_symbols, remembered
@@ -189,7 +190,13 @@ def _propagation(
 
 def input_before(model: Model) -> int:
     """Entries of the recursion's state for the input before: m where changes of it cost something."""
-    return model.m if model.S.any() else 0
+    return model.m if model.changes_cost else 0
+
+
+def with_input(model: Model, s: np.ndarray, previous: np.ndarray | None) -> np.ndarray:
+    """What `sweep` takes for x: s, and where it counts the input before, (m,), behind it; None: the equilibrium's."""
+    before = input_before(model)
+    return np.concatenate([s, np.zeros(before) if previous is None else previous]) if before else s
 
 
 def _gain(model: Model, constrained: Constrained) -> ca.DM:
