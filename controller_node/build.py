@@ -24,7 +24,6 @@ from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_tr
 from lbmpc.problem import Problem, build_problem
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
-from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from lbmpc.targets import TargetSelector
@@ -179,9 +178,10 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
+    S = None if settings.S is None else np.array(settings.S, dtype=float)
     try:
         plant = build_plant(config) if given is None else given.known
-        model = nominal_model(plant, config.period, Q, R, settings.terminal)
+        model = nominal_model(plant, config.period, Q, R, settings.terminal, S)
         require_horizon(model, settings.horizon)
         if given is None or given.equations is None:
             return model
@@ -207,9 +207,9 @@ class TimedSolver(Solver):
         self.seconds = time.perf_counter() - before
         return solution
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(self, *args: Any, **options: Any) -> Solution:
         before = time.perf_counter()
-        solution = super().feedback(x, first)
+        solution = super().feedback(*args, **options)
         self.seconds = time.perf_counter() - before
         return solution
 

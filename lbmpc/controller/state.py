@@ -30,6 +30,8 @@ class ControllerState:
     target: np.ndarray
     """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
     estimator: EstimatorState
+    commanded: np.ndarray
+    """The last input that was commanded, (m,), or the safe one; (0,) where no plan depends on it."""
     line: LineState = field(default_factory=dict)
     """What was written and has not acted yet, `lbmpc.controller.dead_time`; empty without a dead time."""
 
@@ -43,6 +45,7 @@ class ControllerState:
             "predicted": self.predicted,
             "delay": np.array([self.delay]),
             **({"target": self.target} if self.target.size else {}),
+            **({"commanded": self.commanded} if self.commanded.size else {}),
             **{f"estimator.{name}": array for name, array in self.estimator.items()},
             **{f"line.{name}": array for name, array in self.line.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
@@ -66,5 +69,6 @@ class ControllerState:
             oracle,
             arrays.get("target", np.zeros(0)),
             estimator,
+            arrays.get("commanded", np.zeros(0)),
             line,
         )

@@ -14,7 +14,7 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
 from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
-from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.controller.fallback import Plan, all_reachable, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
@@ -42,6 +42,7 @@ class Solves(Protocol):
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution: ...
 
     def prepare(
@@ -51,9 +52,12 @@ class Solves(Protocol):
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None: ...
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution: ...
 
 
 ABSURD = 1e6
@@ -103,8 +107,11 @@ class Controller:
         s = self._with_past(oracle, nothing)
         target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
         memory = self.estimator.initial_state()
-        line = self.line.initial_state()
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, line)
+        plant, line = self.model.plant, self.line.initial_state()
+        commanded = plant.safe_input - plant.u_e if self.problem.looks_back else np.zeros(0)
+        return ControllerState(
+            plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, commanded, line
+        )
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -116,7 +123,9 @@ class Controller:
             theta = self.oracle.theta(state.oracle)
             self._prepared_target = target = self._find_target(state, theta)
             references = self._references(_aim(target))
-            self._solver.prepare(state.predicted, theta, state.plan.c, *references)
+            self._solver.prepare(
+                state.predicted, theta, state.plan.c, *references, previous=_known(state.commanded)
+            )
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
@@ -127,7 +136,9 @@ class Controller:
         if state.plan.left == 0 or self.line.dead_time:
             return None
         theta, references = self.oracle.theta(state.oracle), self._references(state.target)
-        return planner.policy(state.predicted, theta, state.plan.u, *references)
+        return planner.policy(
+            state.predicted, theta, state.plan.u, *references, previous=_known(state.commanded)
+        )
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
@@ -151,15 +162,17 @@ class Controller:
         theta = None if self._prepares(state) else self.oracle.theta(oracle)
         target = self._target(state, theta)
         s = state.predicted if start is None else self._with_past(there, start)
-        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target)
+        previous = self._previous(state, written)
+        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target, previous)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         x, u = s[: self.model.d], plan.u[0]
         after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
         estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
+        commanded = u if self.problem.looks_back else state.commanded
         memory = ControllerState(
-            shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, line
+            shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, commanded, line
         )
         return memory, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
 
@@ -270,22 +283,23 @@ class Controller:
         s: np.ndarray | None,
         certified: FirstInputs | None,
         target: SteadyState | None,
+        previous: np.ndarray | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
         if s is not None:
-            solution = self._solve(state, theta, s, first, target)
+            solution = self._solve(state, theta, s, first, target, previous)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
-            return _begun_within(plan, first), "shifted_plan", solution
+            return self._kept(_begun_within(plan, first), previous), "shifted_plan", solution
         nothing, d = empty_plan(horizon, self.model.m), self.model.d
         xs, us = (0.0, 0.0) if target is None else (target.xu[:d], target.xu[d:])
         if s is None:
             # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
-            return replace(nothing, u=nothing.u + us), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us))
+            return self._kept(replace(nothing, u=nothing.u + us), previous), "feedback", solution
+        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us, previous))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
@@ -295,17 +309,33 @@ class Controller:
         s: np.ndarray,
         first: Box | None,
         target: SteadyState | None,
+        previous: np.ndarray | None,
     ) -> Solution:
         if theta is not None:
             references = self._references(_aim(target))
-            return self._solver.solve(s, theta, state.plan.c, *references, first=first)
+            return self._solver.solve(s, theta, state.plan.c, *references, first=first, previous=previous)
         self.prepare(state)
         self._prepared_for = None
-        return self._solver.feedback(s, first)
+        return self._solver.feedback(s, first, previous)
+
+    def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
+        """What acts before v_0, (m,): the plant says so, or else it is what was commanded; None: nothing depends on it."""
+        if not self.problem.looks_back:
+            return None
+        acts = acting(written)
+        return state.commanded if acts is None else acts
+
+    def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
+        """The plan within the rate limits from `previous` on."""
+        return plan if previous is None else replace(plan, u=all_reachable(self.model, plan.u, previous))
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
+
+
+def _known(commanded: np.ndarray) -> np.ndarray | None:
+    return commanded if commanded.size else None
 
 
 def _aim(target: SteadyState | None) -> np.ndarray:
