@@ -50,8 +50,8 @@ bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.
 
 test: $(READY)  ## all tests; for some, .venv/bin/pytest PATH
 	$(BIN)/pytest -n auto --dist loadfile -m "not live"
-# Real processes run alone: what they show depends on when they get a core.
-	$(BIN)/pytest -m live
+# Real processes run apart from these: what they show depends on when they get a core. They wait most of the time.
+	$(BIN)/pytest -n 2 --dist loadfile -m live
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s tests/compose/live_compose.py $(ARGS)
