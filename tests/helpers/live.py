@@ -59,7 +59,7 @@ def live_config(*assignments: str) -> Config:
     )
 
 
-HANG_S = 60.0
+HANG_S = 120.0
 """Nobody waits longer than this for something that must come."""
 
 
