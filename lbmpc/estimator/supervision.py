@@ -46,6 +46,8 @@ LATELY = 20
 """Samples that `LEAP` looks back."""
 STAYS = 4.0
 """Deviations of the difference of two readings: an innovation that changes by more is no bias, but a motion."""
+READINGS = 8
+"""How many of them are kept, to find the smallest step of a sensor."""
 OFF = 10
 """Samples for which a leap stays what it is, before a sensor is named off."""
 AGREES = 4.0
@@ -81,7 +83,7 @@ class SupervisedEstimator(Estimator):
         nothing = np.zeros(len(self._noise))
         return {
             **self._inner.initial_state(),
-            "reading": nothing,
+            "readings": np.zeros((READINGS, len(nothing))),
             "step": nothing,
             "lately": np.ones_like(nothing),
             "leap": nothing,
@@ -102,14 +104,16 @@ class SupervisedEstimator(Estimator):
         if not fault.any():
             return {}
         unseen = self._unseen(tuple(np.flatnonzero(self._measured & (fault == 0)).tolist()))
-        return {self._model.plant.states[i]: f"{FAULTS[fault[i] - 1]}; {unseen}" for i in np.flatnonzero(fault)}
+        return {
+            self._model.plant.states[i]: f"{FAULTS[fault[i] - 1]}; {unseen}" for i in np.flatnonzero(fault)
+        }
 
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
         numbers = np.isfinite(seen.y) & self._measured
         counts = state["counts"]
-        same = numbers & (seen.y == state["reading"])
+        same = numbers & (seen.y == state["readings"][0])
         # Of a plant that was held, or started again, nobody knows that it moved.
         same &= seen.applied is not None
         usable = numbers & (counts[FAULT] == 0)
@@ -142,12 +146,12 @@ class SupervisedEstimator(Estimator):
         share = np.minimum(away**2 / variance, LEAP**2 * state["lately"])
         lately = np.maximum(1.0, state["lately"] + np.where(used, share - state["lately"], 0.0) / LATELY)
         new = (fault != counts[FAULT]) & (fault > 0)
-        after = np.stack(
-            [repeated, gone, leaps, np.where(new, 0, agreed), np.where(new, 0, moving), fault]
-        )
+        after = np.stack([repeated, gone, leaps, np.where(new, 0, agreed), np.where(new, 0, moving), fault])
         return {
             **memory,
-            "reading": np.where(numbers, seen.y, state["reading"]),
+            "readings": np.where(
+                numbers & ~same, np.vstack([seen.y, state["readings"][:-1]]), state["readings"]
+            ),
             "step": step,
             "lately": lately,
             "leap": leap,
@@ -158,11 +162,11 @@ class SupervisedEstimator(Estimator):
         self, state: EstimatorState, y: np.ndarray, changed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The smallest step of each sensor so far, (d,), 0 before the first, and whether it is a fine one."""
-        step, before = np.abs(y - state["reading"]), state["step"]
-        if state["sample"][1] < 0:
-            return before, np.zeros(len(y), dtype=bool)
-        step = np.where(changed & (step > 0.0) & ((before == 0.0) | (step < before)), step, before)
-        return step, (step > 0.0) & (step < FINE * self._noise)
+        earlier = state["readings"]
+        steps = np.where((earlier != 0.0) & (earlier != y) & changed, np.abs(earlier - y), np.inf)
+        before = np.where(state["step"] > 0.0, state["step"], np.inf)
+        step = np.minimum(before, steps.min(axis=0))
+        return np.where(np.isfinite(step), step, 0.0), step < FINE * self._noise
 
     def _leaps(
         self,
@@ -188,6 +192,6 @@ class SupervisedEstimator(Estimator):
             return "nothing is measured any more"
         unseen = unobservable(self._model, np.array(believed))
         if not unseen:
-            return "estimated from the others"
+            return "what it measures is estimated from the others"
         names = ", ".join(self._model.plant.states[i] for i in unseen)
         return f"nothing that is measured tells of {names} any more"

@@ -88,7 +88,7 @@ class Shown(NamedTuple):
 
 
 SHOWN: dict[type[m.Message], Shown] = {
-    m.PlantState: Shown("t x applied source command_seq"),
+    m.PlantState: Shown("t x applied source command_seq missing"),
     m.Command: Shown("state_run_id state_seq period mode u plan_entries", _of_command, {"plan_entries": int}),
     m.Tick: Shown(
         "slot t skipped lateness late state_verdict state_seq x weights_version",
@@ -97,7 +97,8 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
+        "sensor_faults",
         _of_result,
         {
             **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
