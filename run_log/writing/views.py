@@ -55,6 +55,7 @@ def _of_result(result: m.TickResult) -> Json:
         "target_status": aimed,
         "target_x": result.target_x or None,
         "target_u": result.target_u or None,
+        "sensor_faults": result.sensor_faults or None,
     }
 
 
@@ -88,7 +89,7 @@ class Shown(NamedTuple):
 
 
 SHOWN: dict[type[m.Message], Shown] = {
-    m.PlantState: Shown("t x applied source command_seq missing"),
+    m.PlantState: Shown("t x applied source command_seq"),
     m.Command: Shown("state_run_id state_seq period mode u plan_entries", _of_command, {"plan_entries": int}),
     m.Tick: Shown(
         "slot t skipped lateness late state_verdict state_seq x weights_version",
@@ -104,6 +105,7 @@ SHOWN: dict[type[m.Message], Shown] = {
             **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
+            "sensor_faults": dict[str, str] | None,
         },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),
