@@ -18,7 +18,6 @@ A sensor that is not believed has an innovation all the same, and is believed ag
 from __future__ import annotations
 
 from functools import cache
-from typing import Literal
 
 import numpy as np
 
@@ -26,9 +25,8 @@ from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
 from lbmpc.estimator.kalman import LEAST, KalmanEstimator, unobservable
 from lbmpc.model import Model
 
-Fault = Literal["stuck", "dead", "off"]
-FAULTS: tuple[Fault, ...] = ("stuck", "dead", "off")
-"""Fault i of the memory is FAULTS[i - 1]."""
+WORDS = ("", "stuck", "dead", "off")
+NONE, STUCK, DEAD, OFF = range(4)
 
 REPEATS = 4
 """Readings after the first that are all the same, before a sensor may be named stuck."""
@@ -48,7 +46,7 @@ STAYS = 4.0
 """Deviations of the difference of two readings: an innovation that changes by more is no bias, but a motion."""
 READINGS = 8
 """How many of them are kept, to find the smallest step of a sensor."""
-OFF = 10
+LASTS = 10
 """Samples for which a leap stays what it is, before a sensor is named off."""
 AGREES = 4.0
 """Deviations of an innovation, at most, of a sensor that may be believed again."""
@@ -91,7 +89,7 @@ class SupervisedEstimator(Estimator):
         }
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
-        return self._inner.missed(state, delay)
+        return {**state, **self._inner.missed(state, delay)}
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return self._inner.commanded(state, u)
@@ -104,68 +102,77 @@ class SupervisedEstimator(Estimator):
         if not fault.any():
             return {}
         unseen = self._unseen(tuple(np.flatnonzero(self._measured & (fault == 0)).tolist()))
-        return {
-            self._model.plant.states[i]: f"{FAULTS[fault[i] - 1]}; {unseen}" for i in np.flatnonzero(fault)
-        }
+        return {self._model.plant.states[i]: f"{WORDS[fault[i]]}; {unseen}" for i in np.flatnonzero(fault)}
 
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
-        numbers = np.isfinite(seen.y) & self._measured
-        counts = state["counts"]
-        same = numbers & (seen.y == state["readings"][0])
+        counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
         # Of a plant that was held, or started again, nobody knows that it moved.
-        same &= seen.applied is not None
+        same = numbers & (seen.y == state["readings"][0]) & (seen.applied is not None)
+        step, fine = self._steps(state["readings"], state["step"], seen.y, numbers & ~same)
+        if (same == numbers).all():
+            # A plant that rests, or a frozen line: a repetition alone proves nothing.
+            fine[:] = False
         usable = numbers & (counts[FAULT] == 0)
         if trusted is not None:
             usable &= trusted
-        step, fine = self._steps(state, seen.y, numbers & ~same)
-        memory, estimate = self._inner.update(state, seen, usable & ~(same & fine))
+
+        tried = usable & ~(same & fine)
+        memory, estimate = self._inner.update(state, seen, tried)
         known = np.isfinite(estimate.innovation) & numbers
         away = np.where(known, np.abs(estimate.innovation), 0.0)
         variance = np.where(known, estimate.innovation_variance, np.inf)
-        vague = variance > (1.0 + KNOWS_LESS) * self._noise**2
         leapt, leap = self._leaps(state, estimate.innovation, away, variance, usable & ~same)
-        used = usable & ~leapt & ~(same & (fine | ~vague))
-        if (used != usable & ~(same & fine)).any():
+        vague = variance > (1.0 + KNOWS_LESS) * self._noise**2
+        used = tried & ~leapt & (~same | vague)
+        if (used != tried).any():
             memory, estimate = self._inner.update(state, seen, used)
 
-        repeated = np.where(same, counts[REPEATED] + 1, 0)
-        gone = np.where(numbers | ~self._measured, 0, counts[GONE] + 1)
-        moved = (away > MOVED * self._noise) & (fine | ((away > MOVED * np.sqrt(variance)) & (away > step)))
+        sure = fine | ((away > MOVED * np.sqrt(variance)) & (away > step))
         agrees = known & (away <= AGREES * np.sqrt(variance))
-        agreed = np.where(agrees & ~same, counts[AGREED] + 1, np.where(agrees & same, counts[AGREED], 0))
-        moving = np.where(numbers & ~same, counts[MOVING] + 1, np.where(same & ~fine, counts[MOVING], 0))
-        leaps = np.where(leapt, counts[LEAPT] + 1, 0)
-        fault = counts[FAULT].copy()
-        back = (agreed >= self._well) | ((fault != 3) & (moving >= ALIVE * self._well))
-        fault[back] = 0
-        fault[(fault == 0) & (leaps >= OFF)] = 3
-        fault[(repeated >= REPEATS) & moved & (fault != 2)] = 1
-        fault[gone >= ABSENT] = 2
+        counted = np.stack(
+            [
+                np.where(same, counts[REPEATED] + 1, 0),
+                np.where(numbers | ~self._measured, 0, counts[GONE] + 1),
+                np.where(leapt, counts[LEAPT] + 1, 0),
+                np.where(agrees, counts[AGREED] + ~same, 0),
+                np.where(numbers & ~(same & fine), counts[MOVING] + ~same, 0),
+                counts[FAULT],
+            ]
+        )
         share = np.minimum(away**2 / variance, LEAP**2 * state["lately"])
-        lately = np.maximum(1.0, state["lately"] + np.where(used, share - state["lately"], 0.0) / LATELY)
-        new = (fault != counts[FAULT]) & (fault > 0)
-        after = np.stack([repeated, gone, leaps, np.where(new, 0, agreed), np.where(new, 0, moving), fault])
+        lately = state["lately"] + np.where(used, share - state["lately"], 0.0) / LATELY
         return {
             **memory,
-            "readings": np.where(
-                numbers & ~same, np.vstack([seen.y, state["readings"][:-1]]), state["readings"]
-            ),
+            "readings": _with_reading(state["readings"], seen.y, numbers & ~same),
             "step": step,
-            "lately": lately,
+            "lately": np.maximum(1.0, lately),
             "leap": leap,
-            "counts": after.astype(np.int64),
+            "counts": self._judged(counted, (away > MOVED * self._noise) & sure),
         }, estimate
 
+    def _judged(self, counts: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """The counts with what is wrong by now; moved: whose states have left their readings, (d,)."""
+        before = counts[FAULT]
+        well = counts[AGREED] >= self._well
+        well |= (before != OFF) & (counts[MOVING] >= ALIVE * self._well)
+        fault = np.where(well, NONE, before)
+        fault[(fault == NONE) & (counts[LEAPT] >= LASTS)] = OFF
+        fault[(fault != DEAD) & (counts[REPEATED] >= REPEATS) & moved] = STUCK
+        fault[counts[GONE] >= ABSENT] = DEAD
+        new = (fault != before) & (fault != NONE)
+        judged = counts.copy()
+        judged[[AGREED, MOVING]] = np.where(new, 0, counts[[AGREED, MOVING]])
+        judged[FAULT] = fault
+        return judged
+
     def _steps(
-        self, state: EstimatorState, y: np.ndarray, changed: np.ndarray
+        self, readings: np.ndarray, smallest: np.ndarray, y: np.ndarray, changed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The smallest step of each sensor so far, (d,), 0 before the first, and whether it is a fine one."""
-        earlier = state["readings"]
-        steps = np.where((earlier != 0.0) & (earlier != y) & changed, np.abs(earlier - y), np.inf)
-        before = np.where(state["step"] > 0.0, state["step"], np.inf)
-        step = np.minimum(before, steps.min(axis=0))
+        steps = np.where((readings != 0.0) & (readings != y) & changed, np.abs(readings - y), np.inf)
+        step = np.minimum(np.where(smallest > 0.0, smallest, np.inf), steps.min(axis=0))
         return np.where(np.isfinite(step), step, 0.0), step < FINE * self._noise
 
     def _leaps(
@@ -195,3 +202,8 @@ class SupervisedEstimator(Estimator):
             return "what it measures is estimated from the others"
         names = ", ".join(self._model.plant.states[i] for i in unseen)
         return f"nothing that is measured tells of {names} any more"
+
+
+def _with_reading(readings: np.ndarray, y: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """The last different readings of each sensor, (READINGS, d), the newest first."""
+    return np.where(new, np.vstack([y, readings[:-1]]), readings)
