@@ -12,7 +12,9 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
+from lbmpc.estimator.base import Estimator
 from lbmpc.estimator.kalman import KalmanEstimator, unobservable
+from lbmpc.estimator.supervision import SupervisedEstimator
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
@@ -265,7 +267,7 @@ def build_controller(
     return controller, solver
 
 
-def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
+def build_estimator(config: Config, model: Model) -> Estimator | None:
     """The estimator of the configuration; None: a sample is the state.
 
     Raises:
@@ -286,7 +288,8 @@ def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
     if settings.process is not None:
         process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
     noise = in_half_widths(settings.noise, plant) * plant.x_scale
-    return KalmanEstimator(model, measured, noise, process, settings.correlation)
+    kalman = KalmanEstimator(model, measured, noise, process, settings.correlation)
+    return SupervisedEstimator(kalman, model, measured, noise)
 
 
 def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:

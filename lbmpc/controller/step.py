@@ -174,12 +174,16 @@ class Controller:
         memory = ControllerState(
             shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, commanded, line
         )
-        return memory, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
+        faults = self.estimator.faults(estimator)
+        return memory, StepResult(
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, target, faults
+        )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
         if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
-            seen = replace(seen, x=None)
+            x = np.where(np.abs(seen.x) <= most_x, seen.x, np.nan)
+            seen = replace(seen, x=x if self.estimator.tells(x) else None)
         inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
         if any(not (np.abs(u) <= most_u).all() for u in inputs):
             seen = replace(seen, applied=None, pieces=())

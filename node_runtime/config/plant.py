@@ -287,6 +287,7 @@ def _check_names_of_states(config: Config, plant: Described) -> None:
         ("plant.sensors.quantisation", sensors.quantisation),
         ("plant.sensors.bias", sensors.bias),
         ("plant.sensors.stuck", sensors.stuck),
+        ("plant.sensors.dead", sensors.dead),
         ("estimator.noise", estimator.noise),
         ("estimator.process", estimator.process),
         ("estimator.measured", estimator.measured),

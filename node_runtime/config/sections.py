@@ -67,6 +67,8 @@ class SensorsConfig(Section, frozen=True):
     """Seconds after the first sample from which on there is a bias."""
     stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
     """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
+    dead: dict[str, Instant] = msgspec.field(default_factory=dict)
+    """Seconds after the first sample from which on no number comes of a state, by name, while those of others do."""
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
 

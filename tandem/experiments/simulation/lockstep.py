@@ -26,6 +26,7 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
 from plant_sim.sensors import Sensors
+from plant_sim.shield import measurement
 from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from protocol import topics
@@ -313,7 +314,7 @@ class LockStep:
     def _measured(self, true: m.PlantState) -> m.PlantState | None:
         """The sample as its controller gets it; None where it is lost."""
         x = self.sensors.measure(np.array(true.x), true.t)
-        return None if x is None else msgspec.structs.replace(true, x=x.tolist())
+        return None if x is None else msgspec.structs.replace(true, **measurement(self.core.plant, x))
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
         self.log.append(self._noted(topic, message, seq))
