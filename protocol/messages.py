@@ -248,6 +248,12 @@ class TickResult(Message, frozen=True):
     """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
     sensor_faults: dict[str, str] = msgspec.field(default_factory=dict)
     """Sensors that are not believed, by the names of their states: what is wrong, and what is known of these states."""
+    reference: dict[str, float] = {}
+    """Where the outputs should be in this tick, by name, plant units; empty where there are none."""
+    reference_verdict: str = "none"
+    """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
+    reference_from: str = ""
+    """run_id of who sent that; empty without one."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

@@ -98,6 +98,9 @@ class Snapshot:
     set_piece: int = -1
     outside: int = 0
     """Ticks outside of them."""
+    reference: dict[str, float] = field(default_factory=dict)
+    """Where outputs should be now, by name; empty where there are none."""
+    target_status: str = "none"
     solve_ms: tuple[float, float] | None = None
     """p50 and p99 of the recent ticks."""
     tick_ms: tuple[float, float] | None = None
@@ -228,6 +231,10 @@ class Monitor:
         seen.soft += soft
         self._take_margin(result, now)
         self._take_faults(result, now)
+        seen.reference, seen.target_status = result.reference, result.target_status
+        if result.reference_verdict != "none":
+            taken = result.reference_verdict == "taken"
+            self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1
@@ -323,7 +330,7 @@ class Monitor:
             self._seen,
             phase=self.phase or ("the plant" if silent else ""),
             elapsed=None if self.first_command is None else now - self.first_command,
-            states=_gauges(plant.states, x, plant.x_min, plant.x_max, plant.x_e, plant.x_scale),
+            states=_gauges(plant.states, x, plant.x_min, plant.x_max, self._goal(), plant.x_scale),
             inputs=_gauges(plant.inputs, u, plant.u_min, plant.u_max, plant.u_e, plant.u_scale),
             measured_rate=_rate(self._tick_times, now),
             solve_ms=_percentiles(self._solve_ms),
@@ -334,6 +341,14 @@ class Monitor:
             bad_messages=self.bad.total + sum(self._bad_elsewhere.values()),
             events=tuple(self._events),
         )
+
+    def _goal(self) -> np.ndarray:
+        """Where the states should come to rest, (d,)."""
+        goal, states = self.plant.x_e.copy(), self.plant.states
+        for name, value in self._seen.reference.items():
+            if name in states:
+                goal[states.index(name)] = value
+        return goal
 
     def _row(self, name: str, now: float) -> ProcessRow:
         health, at = self._health.get(name, (None, now))

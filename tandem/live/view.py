@@ -13,7 +13,7 @@ from rich.text import Text
 from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
-FIGURES = 8
+FIGURES = 9
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
@@ -78,6 +78,8 @@ def line(now: Snapshot) -> str:
     )
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
+    if now.reference:
+        parts.append(f"set-point {_set_point(now)}")
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
     parts += now.sensor_faults.values()
     if now.phase:
@@ -93,6 +95,18 @@ def _sets(now: Snapshot) -> tuple[str, str]:
     if now.set_margin < 0.0:
         return f"OUTSIDE the sets by {-now.set_margin:.2g}", "bold red"
     return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
+
+
+def _set_point(now: Snapshot) -> str:
+    """Where outputs should be, how far off they are, and whether the plant can rest there."""
+    if not now.reference:
+        return "the equilibrium"
+    at = {gauge.name: gauge.value for gauge in now.states}
+    parts = []
+    for name, r in now.reference.items():
+        x = at.get(name)
+        parts.append(f"{name} {r:.4g}" + ("" if x is None else f", off by {abs(x - r):.2g}"))
+    return f"{'; '.join(parts)}, {now.target_status}"
 
 
 def _panel(title: str, body: RenderableType) -> Panel:
@@ -210,6 +224,7 @@ def _loop(now: Snapshot) -> Table:
             ("mode", Text.assemble(mode, "   ", _counted(now.fallback, "fallback"))),
             ("slack", Text.assemble(slack, "   ", _counted(now.soft, "soft ticks"))),
             ("sets", Text.assemble(_sets(now), "   ", _counted(now.outside, "ticks outside", "bold red"))),
+            ("set-point", Text(_set_point(now), "dim" if not now.reference else "default")),
             ("plant", source.get(now.source, now.source or "-")),
         ]
     )
