@@ -14,7 +14,8 @@ import numpy as np
 
 from lbmpc.controller.aims import Aim, Aims
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
-from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
+from lbmpc.controller.fallback import Plan, all_reachable, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
@@ -43,6 +44,7 @@ class Solves(Protocol):
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution: ...
 
     def prepare(
@@ -52,9 +54,12 @@ class Solves(Protocol):
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None: ...
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution: ...
 
 
 ABSURD = 1e6
@@ -89,6 +94,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self._prepared_aim = Aim()
         self.model: Model = problem.model
+        self.line = InputLine(self.model.plant, self.model.period)
         self.aims = Aims(self.model, problem.horizon, targets, reference)
         self._first_delay = self._acceptable(input_delay)
         guard = problem.guard
@@ -105,7 +111,11 @@ class Controller:
         s = self._with_past(oracle, nothing)
         target = self.aims.nothing_yet
         memory = self.estimator.initial_state()
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory)
+        plant, line = self.model.plant, self.line.initial_state()
+        commanded = plant.safe_input - plant.u_e if self.problem.looks_back else np.zeros(0)
+        return ControllerState(
+            plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, commanded, line
+        )
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -115,22 +125,30 @@ class Controller:
         """
         if self._prepares(state) and self._prepared_for is not state:
             theta = self.oracle.theta(state.oracle)
-            self._prepared_aim = aim = self.aims.find(state.reference, theta, state.target, state.delay)
-            self._solver.prepare(state.predicted, theta, state.plan.c, *aim.references)
+            self._prepared_aim = aim = self._aim(state, state.reference, theta, state.delay)
+            self._solver.prepare(
+                state.predicted, theta, state.plan.c, *aim.references, previous=_known(state.commanded)
+            )
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
-        """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
-        if state.plan.left == 0:
+        """What to follow from the next period on if nothing else comes; None when this step followed no solution.
+
+        None with a dead time too: fed back so late, a stiff K may be unstable. The plan is what is followed there.
+        """
+        if state.plan.left == 0 or self.line.dead_time:
             return None
         theta = self.oracle.theta(state.oracle)
-        aim = self.aims.find(state.reference, theta, state.target, state.delay, new=False)
-        return planner.policy(state.predicted, theta, state.plan.u, *aim.references)
+        aim = self._aim(state, state.reference, theta, state.delay, new=False)
+        previous = _known(state.commanded)
+        return planner.policy(state.predicted, theta, state.plan.u, *aim.references, previous=previous)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        estimator, seen, estimate = self._estimate(state, self._without_absurd(seen))
-        label, oracle = self._learn(state, seen, estimate)
+        written = self._without_absurd(seen)
+        line, acted = self.line.advance(state.line, written, state.delay)
+        estimator, seen, estimate = self._estimate(state, acted)
+        label, oracle = self._learn(state, seen, estimate, acted.known)
         rolled_back = ""
         if label is not None:
             oracle, rolled_back = self.oracle.confirm(oracle)
@@ -139,8 +157,8 @@ class Controller:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
         if seen.truth:
             oracle = self.oracle.told(oracle, seen.truth)
-        delay = self._delay(state.delay, seen)
-        start = self._when_it_acts(oracle, seen, delay)
+        delay = self._delay(state.delay, written)
+        start, there = self._when_it_acts(oracle, seen.x, acted, acting(written), delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
         # A prepared step goes on from what was known when it was prepared.
@@ -151,60 +169,72 @@ class Controller:
             self.prepare(state)
             aim = self._prepared_aim
         else:
-            aim = self.aims.find(reference, theta, state.target, delay)
-        s = state.predicted if start is None else self._with_past(oracle, start)
-        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, aim)
+            aim = self._aim(state, reference, theta, delay)
+        s = state.predicted if start is None else self._with_past(there, start)
+        previous = self._previous(state, written)
+        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, aim, previous)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         x, u = s[: self.model.d], plan.u[0]
-        predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        estimator = self.estimator.commanded(estimator, u)
-        after = ControllerState(
+        after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
+        estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
+        memory = ControllerState(
             shift(plan),
             pending_x,
             pending,
-            predicted,
+            after,
             delay,
             oracle,
             aim.xu,
             estimator,
+            u if self.problem.looks_back else state.commanded,
+            line,
             None if reference is None else reference.advanced(1),
         )
-        return after, StepResult(
-            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target
+        faults = self.estimator.faults(estimator)
+        return memory, StepResult(
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, faults
         )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
         if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
-            seen = replace(seen, x=None)
+            x = np.where(np.abs(seen.x) <= most_x, seen.x, np.nan)
+            seen = replace(seen, x=x if self.estimator.tells(x) else None)
         inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
         if any(not (np.abs(u) <= most_u).all() for u in inputs):
             seen = replace(seen, applied=None, pieces=())
         return seen
 
     def _estimate(
-        self, state: ControllerState, seen: Observation
+        self, state: ControllerState, acted: Acted
     ) -> tuple[EstimatorState, Observation, Estimate | None]:
         """The estimator's memory, what was seen with the estimate in the place of x, and what else is known of it."""
+        seen = acted.seen
         if seen.x is None:
-            return self.estimator.missed(state.estimator, state.delay), seen, None
+            memory, delay = state.estimator, state.delay
+            if seen.pieces:
+                # Behind the dead time other inputs acted than those that were commanded last.
+                (seconds, first), (_, then) = seen.pieces[0], seen.pieces[-1]
+                delay = seconds if len(seen.pieces) > 1 else 0.0
+                memory = self.estimator.commanded(self.estimator.commanded(memory, first), then)
+            return self.estimator.missed(memory, delay), seen, None
         measured = Measured(seen.x, seen.source, seen.sequence, seen.applied, seen.pieces)
         memory, estimate = self.estimator.update(state.estimator, measured)
         return memory, seen if estimate.x is seen.x else replace(seen, x=estimate.x), estimate
 
     def _learn(
-        self, state: ControllerState, seen: Observation, estimate: Estimate | None
+        self, state: ControllerState, seen: Observation, estimate: Estimate | None, known: bool
     ) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
         follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
         if seen.x is None or estimate is None:
             return None, state.oracle
-        if seen.applied is None or not follows:
+        if seen.applied is None or not follows or not known:
             # What came before x is not known, at the start and after a gap.
-            acting = _acting(seen)
-            u = np.zeros(self.model.m) if acting is None else acting
+            acts = acting(seen)
+            u = np.zeros(self.model.m) if acts is None else acts
             return None, self.oracle.begin(state.oracle, seen.x, u)
         x, u = state.pending_x, seen.applied
         h = self.model.label(x, u, estimate.reached, seen.pieces)
@@ -222,21 +252,40 @@ class Controller:
     def _acceptable(self, delay: float) -> float:
         return min(delay, LATEST * self.model.period)
 
-    def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
-        """The state, (d,), at which the command that is being computed will begin to act.
+    def _when_it_acts(
+        self,
+        oracle: OracleState,
+        x: np.ndarray | None,
+        acted: Acted,
+        acts: np.ndarray | None,
+        delay: float,
+    ) -> tuple[np.ndarray | None, OracleState]:
+        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there.
 
-        Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance. With certified sets it is no oracle that says
-        where, `lbmpc.sets.motion`: its error would be one of the state that the sets are asked about, and they hold for
-        any oracle.
+        Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
+        which the model knows; without this every millisecond between sample and command would be a disturbance. With
+        certified sets it is no oracle that says where, `lbmpc.sets.motion`: its error would be one of the state that
+        the sets are asked about, and they hold for any oracle.
         """
-        acting = _acting(seen)
-        if seen.x is None or acting is None or delay == 0.0:
-            return seen.x
-        if self._motion is not None and (there := self._motion.after(seen.x, acting, delay)) is not None:
-            return there
-        drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
-        return self.model.ahead(seen.x, acting, delay) + drift
+        inputs = acted.ahead if acts is None or delay == 0.0 else (*acted.ahead, (delay, acts))
+        if x is None or not inputs:
+            return x, oracle
+        if self._motion is not None and acts is not None:
+            there = self._motion.after(x, acts, delay)
+            if there is not None:
+                return there, oracle
+        return predicted(self.model, self.oracle, oracle, x, inputs)
+
+    def _aim(
+        self,
+        state: ControllerState,
+        reference: Reference | None,
+        theta: np.ndarray,
+        delay: float,
+        new: bool = True,
+    ) -> Aim:
+        """Where a plan leads that begins to act after the delay and the plant's dead time."""
+        return self.aims.find(reference, theta, state.target, delay + self.line.dead_time, new)
 
     def _prepares(self, state: ControllerState) -> bool:
         """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
@@ -249,22 +298,23 @@ class Controller:
         s: np.ndarray | None,
         certified: FirstInputs | None,
         aim: Aim,
+        previous: np.ndarray | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
         if s is not None:
-            solution = self._solve(state, theta, s, first, aim)
+            solution = self._solve(state, theta, s, first, aim, previous)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
-            return _begun_within(plan, first), "shifted_plan", solution
+            return self._kept(_begun_within(plan, first), previous), "shifted_plan", solution
         nothing, d = empty_plan(horizon, self.model.m), self.model.d
         xs, us = (aim.xu[:d], aim.xu[d:]) if aim.xu.size else (0.0, 0.0)
         if s is None:
             # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
-            return replace(nothing, u=nothing.u + us), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us))
+            return self._kept(replace(nothing, u=nothing.u + us), previous), "feedback", solution
+        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us, previous))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
@@ -274,21 +324,32 @@ class Controller:
         s: np.ndarray,
         first: Box | None,
         aim: Aim,
+        previous: np.ndarray | None,
     ) -> Solution:
         if theta is not None:
-            return self._solver.solve(s, theta, state.plan.c, *aim.references, first=first)
+            return self._solver.solve(s, theta, state.plan.c, *aim.references, first=first, previous=previous)
         self.prepare(state)
         self._prepared_for = None
-        return self._solver.feedback(s, first)
+        return self._solver.feedback(s, first, previous)
+
+    def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
+        """What acts before v_0, (m,): the plant says so, or else it is what was commanded; None: nothing depends on it."""
+        if not self.problem.looks_back:
+            return None
+        acts = acting(written)
+        return state.commanded if acts is None else acts
+
+    def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
+        """The plan within the rate limits from `previous` on."""
+        return plan if previous is None else replace(plan, u=all_reachable(self.model, plan.u, previous))
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
 
 
-def _acting(seen: Observation) -> np.ndarray | None:
-    """The input that the plant has when it is seen, (m,)."""
-    return seen.pieces[-1][1] if seen.pieces else seen.applied
+def _known(commanded: np.ndarray) -> np.ndarray | None:
+    return commanded if commanded.size else None
 
 
 def _box(first: FirstInputs | None) -> Box | None:
