@@ -142,6 +142,8 @@ class Translation:
             set_piece=result.first.piece if result.first else -1,
             weights_rolled_back=result.rolled_back,
             **self._target(result.target),
+            **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
+            deviation=result.deviation.tolist(),
         )
 
     def _target(self, target: SteadyState | None) -> dict[str, Any]:

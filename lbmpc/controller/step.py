@@ -153,7 +153,10 @@ class Controller:
         after = ControllerState(
             shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target), estimator
         )
-        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
+        known = self.oracle.weights(oracle), self.estimator.deviation(estimator)
+        return after, StepResult(
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, target, *known
+        )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd

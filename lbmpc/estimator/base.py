@@ -54,6 +54,10 @@ class Estimator(ABC):
         """The memory before the first sample."""
         return {}
 
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
+        return np.zeros(0)
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""
         return state

@@ -129,6 +129,11 @@ class Oracle(ABC):
         """
         return state
 
+    def weights(self, state: OracleState) -> np.ndarray:
+        """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; of no part where labels say nothing
+        of it."""
+        return np.zeros((0, self.d))
+
     def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:
         """The state once an experiment has said what the true plant's parameters are from now on, by name.
 
