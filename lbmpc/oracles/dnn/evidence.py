@@ -24,6 +24,8 @@ from lbmpc.oracles.base import OracleState, Variance
 from lbmpc.oracles.dnn.kalman_law import Kalman
 
 TINY = 1e-300
+LONGER = 5.0
+"""Times the filter's memory: what labels say of a weight counts so long. A weight moves less than what it weighs."""
 NETWORK, CONSTANT = 0, 1
 
 
@@ -32,9 +34,11 @@ class Evidence:
     """What is remembered of it is part of an oracle's state."""
 
     filter: Kalman
-    """Of the constant; what is kept of an earlier label counts for the weights too."""
+    """Of the constant."""
     output_scale: np.ndarray
     """Its variances are in units of this one squared, (d,)."""
+    bound: np.ndarray
+    """On the constant, (d,), units of h."""
 
     def nothing(self) -> OracleState:
         """Before the first label."""
@@ -52,10 +56,11 @@ class Evidence:
         sums = np.stack([wanted * predicted, predicted**2], axis=1) / (variance + TINY)
         kept, units = self.filter.kept, self.output_scale**2
         gain = spread / (spread + variance + self.filter.label_variance * units)
+        followed = np.clip(constant + gain * (rest - constant), -self.bound, self.bound)
         faded = (1.0 - kept) * self.filter.prior_variance * units
         return {
-            "evidence": kept * state["evidence"] + sums,
-            "constant": np.stack([constant + gain * (rest - constant), kept * (1.0 - gain) * spread + faded]),
+            "evidence": kept ** (1.0 / LONGER) * state["evidence"] + sums,
+            "constant": np.stack([followed, kept * (1.0 - gain) * spread + faded]),
         }
 
 

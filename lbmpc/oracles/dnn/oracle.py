@@ -61,7 +61,9 @@ class DnnOracle(NetworkExpressions):
         self.law: AdaptationLaw = (
             GradientLaw(gamma, self.bounds) if kalman is None else KalmanLaw(kalman, self.bounds)
         )
-        self.evidence = None if evidence is None else Evidence(evidence, self.output_scale)
+        self.evidence: Evidence | None = None
+        if evidence is not None:
+            self.evidence = Evidence(evidence, self.output_scale, self.bounds * self.output_scale)
         self._adoption = Adoption(self, self.bounds, refit, trial)
         self._last_layer: LastLayer | None = None
 
