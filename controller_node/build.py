@@ -41,9 +41,9 @@ FILTERED = 512
 """Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
 COARSE = 0.05
 """Share of a time scale. K_0 stands for nothing yet; where a period is longer it would move predictions far."""
-MEMORY, REACH, WATCH = 2.0, 4.0, 1.0
-"""Time scales of the plant: what the last layer's filter remembers, how far the samples reach back on which hidden
-weights are tried, and how long these are watched."""
+MEMORY, NOISY_MEMORY, REACH, WATCH = 2.0, 10.0, 4.0, 1.0
+"""Time scales of the plant: what the last layer's filter remembers of exact labels, and of noisy ones; how far the
+samples reach back on which hidden weights are tried, and how long these are watched."""
 FEWEST = 20
 """Samples in a memory or a watch of so many time scales: a slow loop has few in one."""
 SHORTEST_WATCH = 8
@@ -132,12 +132,13 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         raise ConfigError(f"network: {error}") from error
     adaptation, share = config.adaptation, model.period / model.time_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
-    chosen = describe_filter(config, model.time_scale)
-    filtered = adaptation.enabled and adaptation.law == "kalman"
+    chosen, noisy = describe_filter(config, model.time_scale), config.estimator.kind != "none"
+    filtered = adaptation.enabled and (adaptation.law == "kalman" or (adaptation.law is None and noisy))
     if filtered and description.features > FILTERED:
         raise ConfigError(
-            f'adaptation.law = "kalman" keeps a covariance of {description.features} x {description.features} numbers; '
-            f"the last of network.hidden can have {FILTERED - 1} neurons at most with it"
+            f"the filter of the last layer keeps a covariance of {description.features} x {description.features} "
+            f"numbers; the last of network.hidden can have {FILTERED - 1} neurons at most with it, or take "
+            f'adaptation.law = "gradient"'
         )
     return DnnOracle(
         description,
@@ -148,7 +149,7 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         again if adaptation.at_adoption == "refit" else None,
         describe_trial(config, model.time_scale),
         chosen if filtered else None,
-        None if config.estimator.kind == "none" else chosen,
+        chosen if noisy else None,
     )
 
 
@@ -158,8 +159,10 @@ def describe_filter(config: Config, time_scale: float) -> Kalman:
     time_scale: the plant's, in seconds.
     """
     settings = config.adaptation.kalman
-    least = FEWEST * config.period
-    memory = max(MEMORY * time_scale, least) if settings.memory is None else settings.memory
+    scales = MEMORY if config.estimator.kind == "none" else NOISY_MEMORY
+    memory = settings.memory
+    if memory is None:
+        memory = max(scales * time_scale, FEWEST * config.period)
     return Kalman(settings.prior_variance, settings.label_variance, math.exp(-config.period / memory))
 
 

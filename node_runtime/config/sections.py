@@ -223,23 +223,24 @@ class TrialConfig(Section, frozen=True):
 
 
 class KalmanConfig(Section, frozen=True):
-    """Of the last layer's filter, where `adaptation.law` is "kalman", and of the constant that is learned beside the
-    network where there is an estimator. Variances in (output scale)^2."""
+    """Of the last layer's filter, where that is its law, and of the constant that is learned beside the network where
+    there is an estimator. Variances in (output scale)^2."""
 
     prior_variance: Variance = 0.02
     """Of each entry of K, before the first sample."""
     label_variance: Variance = 1e-3
     """Of each entry of a label: measuring noise, and what the features cannot explain."""
     memory: Seconds | None = None
-    """Seconds in which what is known fades towards the prior, by a factor of e; None: two time scales of the plant, but
-    20 samples at least."""
+    """Seconds in which what is known fades towards the prior, by a factor of e; None: two time scales of the plant, ten
+    where there is an estimator, but 20 samples at least."""
 
 
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
-    law: literals.LawName = "gradient"
-    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
+    law: literals.LawName | None = None
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter. None: kalman
+    where there is an estimator, which says how noisy labels are, and gradient where a sample is the state."""
     gamma: Unit = 0.8
     """Learning rate of the gradient law, 0 < gamma < 1."""
     column_bound: Positive = 2.0

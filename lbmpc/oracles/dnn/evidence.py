@@ -24,8 +24,6 @@ from lbmpc.oracles.base import OracleState, Variance
 from lbmpc.oracles.dnn.kalman_law import Kalman
 
 TINY = 1e-300
-LONGER = 5.0
-"""Times the filter's memory: what labels say of a weight counts so long. A weight moves less than what it weighs."""
 NETWORK, CONSTANT = 0, 1
 
 
@@ -34,7 +32,7 @@ class Evidence:
     """What is remembered of it is part of an oracle's state."""
 
     filter: Kalman
-    """Of the constant."""
+    """Of the constant; what it keeps of an earlier label counts for the weights too."""
     output_scale: np.ndarray
     """Its variances are in units of this one squared, (d,)."""
     bound: np.ndarray
@@ -59,7 +57,7 @@ class Evidence:
         followed = np.clip(constant + gain * (rest - constant), -self.bound, self.bound)
         faded = (1.0 - kept) * self.filter.prior_variance * units
         return {
-            "evidence": kept ** (1.0 / LONGER) * state["evidence"] + sums,
+            "evidence": kept * state["evidence"] + sums,
             "constant": np.stack([followed, kept * (1.0 - gain) * spread + faded]),
         }
 

@@ -283,6 +283,7 @@ def test_no_covariance_is_kept_where_there_is_no_filter() -> None:
         (["rate=20"], 1.0, 40),
         (["rate=1000"], 0.25, 500),
         (["rate=0.2"], 16.0, 20),
+        (["rate=20", "estimator.kind=kalman"], 1.0, 200),
         (["rate=10", "adaptation.kalman.memory=0.5"], 16.0, 5),
     ],
 )
