@@ -108,6 +108,8 @@ class ControllerNode:
             self._settings.backup.enabled
             and self._period >= BACKUP_FROM
             and core.controller.estimator.sees_all
+            # Fed back behind a dead time, its stiff K may be unstable.
+            and not core.plant.dead_time
         )
         if self._backs_up:
             core.ready_backup()
@@ -128,6 +130,7 @@ class ControllerNode:
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
+        self._faults: dict[str, str] = {}
         self._hidden = core.memory.hidden_snapshot(-1)
         self._keyframes = Keyframes(bus, core.memory, self._settings.keyframe_every)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
@@ -181,7 +184,7 @@ class ControllerNode:
                 self._missing = 0
                 self._followed = self._first.message.run_id
                 self._grid.reanchor(self._states.undelayed(self._first) + self._phase)
-                self._health.set("running")
+                self._health.set("running", "; ".join(self._faults.values()))
                 return True
             self._health.set("ready", "no plant: its states come too late to act on")
             old_since = now if old_since is None else old_since
@@ -258,9 +261,16 @@ class ControllerNode:
         outputs = self._core.step(tick)
         self._bus.publish(topics.COMMAND, outputs.command)
         sent = clock.now()
-        # The plant obeys no command that answers none of its samples, and no policy that belongs to one.
+        # The plant obeys no command that answers none of its samples, and no policy that belongs to one. And the policy
+        # would feed back a sensor that is not believed.
         obeyed = latched.verdict == "fresh"
-        if self._backs_up and obeyed and (backup := self._core.backup(outputs.command)) is not None:
+        believed = not outputs.result.sensor_faults
+        if (
+            self._backs_up
+            and obeyed
+            and believed
+            and (backup := self._core.backup(outputs.command)) is not None
+        ):
             self._bus.publish(topics.BACKUP, backup)
         timing = m.TickTiming(
             run_id=self._run_id,
@@ -312,6 +322,21 @@ class ControllerNode:
         if rolled_back := result.weights_rolled_back:
             counts["weights rolled back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
+        if result.sensor_faults or self._faults:
+            self._say_faults(tick, result.sensor_faults)
+
+    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
+        """In health and in this process's log, where sensors are believed no longer, or again."""
+        before = self._faults
+        words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}
+        self._faults = {name: before.get(name, text) for name, text in words.items()}
+        if self._faults.keys() == before.keys():
+            return
+        for name in faults.keys() - before.keys():
+            log.warning("tick %d: %s", tick.seq, self._faults[name])
+        for name in before.keys() - faults.keys():
+            log.info("tick %d: sensor %s is believed again", tick.seq, name)
+        self._health.set("running", "; ".join(self._faults.values()))
 
     def _send_samples(self) -> None:
         for batch in self._outbox.batches(self._unsent):

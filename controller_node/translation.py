@@ -64,6 +64,8 @@ class Translation:
             # Not the whole period: what acted in the rest of it is not known, but what acts now is.
             applied = None
         x = np.array(state.x) - self.plant.x_e
+        if state.missing:
+            x[[name in state.missing for name in self.plant.states]] = math.nan
         return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces, tick.truth)
 
     def outputs(
@@ -141,6 +143,7 @@ class Translation:
             set_margin=result.first.margin if result.first else None,
             set_piece=result.first.piece if result.first else -1,
             weights_rolled_back=result.rolled_back,
+            sensor_faults=result.sensor_faults,
             **self._target(result.target),
         )
 

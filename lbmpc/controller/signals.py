@@ -69,6 +69,8 @@ class StepResult:
     """What is certified of v_0; None where there are no certified sets, or no state."""
     target: SteadyState | None
     """Where the plan aims; None without a reference: at the equilibrium."""
+    sensor_faults: dict[str, str] = field(default_factory=dict)
+    """Which sensors are not believed, by the names of their states, and in words what is wrong."""
 
     @property
     def new_network(self) -> bool:

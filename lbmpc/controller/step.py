@@ -13,7 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
-from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
+from lbmpc.controller.fallback import Plan, all_reachable, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
@@ -41,6 +42,7 @@ class Solves(Protocol):
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution: ...
 
     def prepare(
@@ -50,9 +52,12 @@ class Solves(Protocol):
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None: ...
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution: ...
 
 
 ABSURD = 1e6
@@ -86,6 +91,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self._prepared_target: SteadyState | None = None
         self.model: Model = problem.model
+        self.line = InputLine(self.model.plant, self.model.period)
         self._first_delay = self._acceptable(input_delay)
         guard = problem.guard
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
@@ -101,7 +107,11 @@ class Controller:
         s = self._with_past(oracle, nothing)
         target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
         memory = self.estimator.initial_state()
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory)
+        plant, line = self.model.plant, self.line.initial_state()
+        commanded = plant.safe_input - plant.u_e if self.problem.looks_back else np.zeros(0)
+        return ControllerState(
+            plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, commanded, line
+        )
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -113,20 +123,29 @@ class Controller:
             theta = self.oracle.theta(state.oracle)
             self._prepared_target = target = self._find_target(state, theta)
             references = self._references(_aim(target))
-            self._solver.prepare(state.predicted, theta, state.plan.c, *references)
+            self._solver.prepare(
+                state.predicted, theta, state.plan.c, *references, previous=_known(state.commanded)
+            )
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
-        """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
-        if state.plan.left == 0:
+        """What to follow from the next period on if nothing else comes; None when this step followed no solution.
+
+        None with a dead time too: fed back so late, a stiff K may be unstable. The plan is what is followed there.
+        """
+        if state.plan.left == 0 or self.line.dead_time:
             return None
         theta, references = self.oracle.theta(state.oracle), self._references(state.target)
-        return planner.policy(state.predicted, theta, state.plan.u, *references)
+        return planner.policy(
+            state.predicted, theta, state.plan.u, *references, previous=_known(state.commanded)
+        )
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        estimator, seen, estimate = self._estimate(state, self._without_absurd(seen))
-        label, oracle = self._learn(state, seen, estimate)
+        written = self._without_absurd(seen)
+        line, acted = self.line.advance(state.line, written, state.delay)
+        estimator, seen, estimate = self._estimate(state, acted)
+        label, oracle = self._learn(state, seen, estimate, acted.known)
         rolled_back = ""
         if label is not None:
             oracle, rolled_back = self.oracle.confirm(oracle)
@@ -135,56 +154,69 @@ class Controller:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
         if seen.truth:
             oracle = self.oracle.told(oracle, seen.truth)
-        delay = self._delay(state.delay, seen)
-        start = self._when_it_acts(oracle, seen, delay)
+        delay = self._delay(state.delay, written)
+        start, there = self._when_it_acts(oracle, seen.x, acted, acting(written), delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
         # A prepared step goes on from what was known when it was prepared.
         theta = None if self._prepares(state) else self.oracle.theta(oracle)
         target = self._target(state, theta)
-        s = state.predicted if start is None else self._with_past(oracle, start)
-        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target)
+        s = state.predicted if start is None else self._with_past(there, start)
+        previous = self._previous(state, written)
+        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target, previous)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         x, u = s[: self.model.d], plan.u[0]
-        predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        estimator = self.estimator.commanded(estimator, u)
-        after = ControllerState(
-            shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target), estimator
+        after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
+        estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
+        commanded = u if self.problem.looks_back else state.commanded
+        memory = ControllerState(
+            shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, commanded, line
         )
-        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
+        faults = self.estimator.faults(estimator)
+        return memory, StepResult(
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, target, faults
+        )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
         if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
-            seen = replace(seen, x=None)
+            x = np.where(np.abs(seen.x) <= most_x, seen.x, np.nan)
+            seen = replace(seen, x=x if self.estimator.tells(x) else None)
         inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
         if any(not (np.abs(u) <= most_u).all() for u in inputs):
             seen = replace(seen, applied=None, pieces=())
         return seen
 
     def _estimate(
-        self, state: ControllerState, seen: Observation
+        self, state: ControllerState, acted: Acted
     ) -> tuple[EstimatorState, Observation, Estimate | None]:
         """The estimator's memory, what was seen with the estimate in the place of x, and what else is known of it."""
+        seen = acted.seen
         if seen.x is None:
-            return self.estimator.missed(state.estimator, state.delay), seen, None
+            memory, delay = state.estimator, state.delay
+            if seen.pieces:
+                # Behind the dead time other inputs acted than those that were commanded last.
+                (seconds, first), (_, then) = seen.pieces[0], seen.pieces[-1]
+                delay = seconds if len(seen.pieces) > 1 else 0.0
+                memory = self.estimator.commanded(self.estimator.commanded(memory, first), then)
+            return self.estimator.missed(memory, delay), seen, None
         measured = Measured(seen.x, seen.source, seen.sequence, seen.applied, seen.pieces)
         memory, estimate = self.estimator.update(state.estimator, measured)
         return memory, seen if estimate.x is seen.x else replace(seen, x=estimate.x), estimate
 
     def _learn(
-        self, state: ControllerState, seen: Observation, estimate: Estimate | None
+        self, state: ControllerState, seen: Observation, estimate: Estimate | None, known: bool
     ) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
         follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
         if seen.x is None or estimate is None:
             return None, state.oracle
-        if seen.applied is None or not follows:
+        if seen.applied is None or not follows or not known:
             # What came before x is not known, at the start and after a gap.
-            acting = _acting(seen)
-            u = np.zeros(self.model.m) if acting is None else acting
+            acts = acting(seen)
+            u = np.zeros(self.model.m) if acts is None else acts
             return None, self.oracle.begin(state.oracle, seen.x, u)
         x, u = state.pending_x, seen.applied
         h = self.model.label(x, u, estimate.reached, seen.pieces)
@@ -202,21 +234,29 @@ class Controller:
     def _acceptable(self, delay: float) -> float:
         return min(delay, LATEST * self.model.period)
 
-    def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
-        """The state, (d,), at which the command that is being computed will begin to act.
+    def _when_it_acts(
+        self,
+        oracle: OracleState,
+        x: np.ndarray | None,
+        acted: Acted,
+        acts: np.ndarray | None,
+        delay: float,
+    ) -> tuple[np.ndarray | None, OracleState]:
+        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there.
 
-        Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance. With certified sets it is no oracle that says
-        where, `lbmpc.sets.motion`: its error would be one of the state that the sets are asked about, and they hold for
-        any oracle.
+        Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
+        which the model knows; without this every millisecond between sample and command would be a disturbance. With
+        certified sets it is no oracle that says where, `lbmpc.sets.motion`: its error would be one of the state that
+        the sets are asked about, and they hold for any oracle.
         """
-        acting = _acting(seen)
-        if seen.x is None or acting is None or delay == 0.0:
-            return seen.x
-        if self._motion is not None and (there := self._motion.after(seen.x, acting, delay)) is not None:
-            return there
-        drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
-        return self.model.ahead(seen.x, acting, delay) + drift
+        inputs = acted.ahead if acts is None or delay == 0.0 else (*acted.ahead, (delay, acts))
+        if x is None or not inputs:
+            return x, oracle
+        if self._motion is not None and acts is not None:
+            there = self._motion.after(x, acts, delay)
+            if there is not None:
+                return there, oracle
+        return predicted(self.model, self.oracle, oracle, x, inputs)
 
     def _prepares(self, state: ControllerState) -> bool:
         """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
@@ -247,22 +287,23 @@ class Controller:
         s: np.ndarray | None,
         certified: FirstInputs | None,
         target: SteadyState | None,
+        previous: np.ndarray | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
         if s is not None:
-            solution = self._solve(state, theta, s, first, target)
+            solution = self._solve(state, theta, s, first, target, previous)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
-            return _begun_within(plan, first), "shifted_plan", solution
+            return self._kept(_begun_within(plan, first), previous), "shifted_plan", solution
         nothing, d = empty_plan(horizon, self.model.m), self.model.d
         xs, us = (0.0, 0.0) if target is None else (target.xu[:d], target.xu[d:])
         if s is None:
             # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
-            return replace(nothing, u=nothing.u + us), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us))
+            return self._kept(replace(nothing, u=nothing.u + us), previous), "feedback", solution
+        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us, previous))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
@@ -272,22 +313,33 @@ class Controller:
         s: np.ndarray,
         first: Box | None,
         target: SteadyState | None,
+        previous: np.ndarray | None,
     ) -> Solution:
         if theta is not None:
             references = self._references(_aim(target))
-            return self._solver.solve(s, theta, state.plan.c, *references, first=first)
+            return self._solver.solve(s, theta, state.plan.c, *references, first=first, previous=previous)
         self.prepare(state)
         self._prepared_for = None
-        return self._solver.feedback(s, first)
+        return self._solver.feedback(s, first, previous)
+
+    def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
+        """What acts before v_0, (m,): the plant says so, or else it is what was commanded; None: nothing depends on it."""
+        if not self.problem.looks_back:
+            return None
+        acts = acting(written)
+        return state.commanded if acts is None else acts
+
+    def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
+        """The plan within the rate limits from `previous` on."""
+        return plan if previous is None else replace(plan, u=all_reachable(self.model, plan.u, previous))
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
 
 
-def _acting(seen: Observation) -> np.ndarray | None:
-    """The input that the plant has when it is seen, (m,)."""
-    return seen.pieces[-1][1] if seen.pieces else seen.applied
+def _known(commanded: np.ndarray) -> np.ndarray | None:
+    return commanded if commanded.size else None
 
 
 def _aim(target: SteadyState | None) -> np.ndarray:

@@ -61,9 +61,14 @@ class Description:
     """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What states and inputs are called in a person's words, by name."""
+    dead_time: float = 0.0
+    """Seconds from when an input is written until the plant begins to answer: transport, a pipe, a bus behind the
+    gateway. Of all inputs."""
+    u_rate_max: np.ndarray | None = None
+    """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
 
     def __post_init__(self) -> None:
-        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
+        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain", "u_rate_max"):
             object.__setattr__(self, name, as_array(getattr(self, name)))
         for name in TUPLES:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
@@ -73,21 +78,27 @@ class Description:
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
+        input_rate_max: Mapping[str, float] | None = None,
     ) -> Self:
         """With other bounds, or about another point.
 
         Args:
             bounds: lower and upper by the name of a state or input, None where there is none; others stay.
             x_e, u_e: (d,) and (m,), where equations are linearised.
+            dead_time: seconds; None: its own.
+            input_rate_max: how fast an input may change, per second, by its name; others stay.
 
         Raises:
-            KeyError: a bound of what is no state or input.
+            KeyError: a bound of what is no state or input, a rate of what is no input.
         """
         for name in bounds:
             if name not in (*self.states, *self.inputs):
                 raise KeyError(name)
         new: dict[str, Any] = {
-            name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None
+            name: value
+            for name, value in (("x_e", x_e), ("u_e", u_e), ("dead_time", dead_time))
+            if value is not None
         }
         for axis, names in (("x", self.states), ("u", self.inputs)):
             low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))
@@ -98,6 +109,13 @@ class Description:
                         low[names.index(name)] = -np.inf if lower is None else lower
                         high[names.index(name)] = np.inf if upper is None else upper
                 new |= {f"{axis}_min": low, f"{axis}_max": high}
+        if input_rate_max:
+            rates = self.input_rates.copy()
+            for name, rate in input_rate_max.items():
+                if name not in self.inputs:
+                    raise KeyError(name)
+                rates[self.inputs.index(name)] = rate
+            new["u_rate_max"] = rates
         return replace(self, **new) if new else self
 
     def safe_input_at(self, x: np.ndarray) -> np.ndarray:
@@ -116,6 +134,11 @@ class Description:
     @property
     def m(self) -> int:
         return len(self.inputs)
+
+    @cached_property
+    def input_rates(self) -> np.ndarray:
+        """`u_rate_max`, (m,), infinite where there is no limit."""
+        return np.full(self.m, np.inf) if self.u_rate_max is None else self.u_rate_max
 
     @cached_property
     def x_scale(self) -> np.ndarray:

@@ -55,6 +55,7 @@ def _of_result(result: m.TickResult) -> Json:
         "target_status": aimed,
         "target_x": result.target_x or None,
         "target_u": result.target_u or None,
+        "sensor_faults": result.sensor_faults or None,
     }
 
 
@@ -97,12 +98,14 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
+        "sensor_faults",
         _of_result,
         {
             **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
+            "sensor_faults": dict[str, str] | None,
         },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -86,6 +86,8 @@ class Snapshot:
     late: int = 0
     skipped: int = 0
     mode: str = ""
+    sensor_faults: dict[str, str] = field(default_factory=dict)
+    """What is wrong with sensors that are not believed, in words, by the names of their states."""
     fallback: int = 0
     slack: float = 0.0
     slack_row: str = ""
@@ -225,6 +227,7 @@ class Monitor:
         seen.slack_row = result.slack_row
         seen.soft += soft
         self._take_margin(result, now)
+        self._take_faults(result, now)
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1
@@ -238,6 +241,16 @@ class Monitor:
         if result.prediction_error is not None:
             self._errors.append((now, result.prediction_error))
             self._follow_trend(now)
+
+    def _take_faults(self, result: m.TickResult, now: float) -> None:
+        before, began = self._seen.sensor_faults, self.first_command
+        since = 0.0 if began is None else now - began
+        told = {name: m.words_of_fault(name, fault, since) for name, fault in result.sensor_faults.items()}
+        for name in told.keys() - before.keys():
+            self.say(f"tick {result.seq}: {told[name]}", now, "bad")
+        for name in before.keys() - told.keys():
+            self.say(f"tick {result.seq}: sensor {name} is believed again", now, "good")
+        self._seen.sensor_faults = {name: before.get(name, text) for name, text in told.items()}
 
     def _take_margin(self, result: m.TickResult, now: float) -> None:
         margin = result.set_margin

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -79,6 +79,7 @@ def line(now: Snapshot) -> str:
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
+    parts += now.sensor_faults.values()
     if now.phase:
         parts.append(f"waiting for {now.phase}")
     troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
@@ -132,9 +133,15 @@ def _gauges(now: Snapshot, width: int) -> Table:
             f"{gauge.low:.4g}",
             _bar(gauge, cells) if cells >= 8 else "",
             f"{gauge.high:.4g}",
-            f"off by {gauge.value - gauge.target:+.4f}" if roomy and gauge.value is not None else "",
+            _beside(gauge, now.sensor_faults) if roomy else "",
         )
     return table
+
+
+def _beside(gauge: Gauge, faults: Mapping[str, str]) -> Text:
+    if gauge.name in faults:
+        return Text("not believed", "bold red")
+    return Text("" if gauge.value is None else f"off by {gauge.value - gauge.target:+.4f}")
 
 
 def _number(gauge: Gauge) -> str:

@@ -21,11 +21,12 @@ from controller_node.build import GivenPlant
 from controller_node.core import ControllerCore, Outputs
 from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth, true_motion
 from node_runtime.config.architecture import register_architecture
-from node_runtime.config.plant import files_of, initial_state, true_plant_of
+from node_runtime.config.plant import files_of, initial_state, true_dead_time, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
 from plant_sim.sensors import Sensors
+from plant_sim.shield import measurement
 from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from protocol import topics
@@ -139,6 +140,7 @@ class LockStep:
         truth = None if given is None else given.truth
         self.true = true_plant_of(config, get_plant, get_truth) if truth is None else truth
         self.motion = self._motion(self.true)
+        self.dead_time = true_dead_time(config, self.core.plant, self.true)
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         self.plant = self._started_plant(initial_state(config, self.core.plant))
         self.changes = self._changes()
@@ -164,7 +166,7 @@ class LockStep:
     def _started_plant(self, x0: np.ndarray) -> PlantSim:
         run_id = PLANT if self.episode == 1 else f"{PLANT}-{self.episode}"
         plant, patience = self.core.plant, self.config.plant.plan_patience
-        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id)
+        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id, self.dead_time)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -312,7 +314,7 @@ class LockStep:
     def _measured(self, true: m.PlantState) -> m.PlantState | None:
         """The sample as its controller gets it; None where it is lost."""
         x = self.sensors.measure(np.array(true.x), true.t)
-        return None if x is None else msgspec.structs.replace(true, x=x.tolist())
+        return None if x is None else msgspec.structs.replace(true, **measurement(self.core.plant, x))
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
         self.log.append(self._noted(topic, message, seq))

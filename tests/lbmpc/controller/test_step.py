@@ -120,6 +120,7 @@ class Failing:
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         self.good -= 1
         if self.good >= 0:
