@@ -285,8 +285,10 @@ def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
     process = plant.W * config.period if given is None else given
     if settings.process is not None:
         process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
-    noise = in_half_widths(settings.noise, plant) * plant.x_scale
-    return KalmanEstimator(model, measured, noise, process, settings.correlation)
+    told = settings.noise
+    noise = None if told == "innovations" else in_half_widths(told, plant) * plant.x_scale
+    correlation = model.time_scale if settings.correlation is None else settings.correlation
+    return KalmanEstimator(model, measured, noise, process, correlation)
 
 
 def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:

@@ -64,6 +64,10 @@ class Estimator(ABC):
         """The memory before the first sample."""
         return {}
 
+    def noise(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of what is measured, (d,), in units of the states; of others it says nothing."""
+        return np.zeros(0)
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""
         return state
