@@ -142,6 +142,7 @@ class Translation:
             set_piece=result.first.piece if result.first else -1,
             weights_rolled_back=result.rolled_back,
             **self._target(result.target),
+            noise=result.noise.tolist(),
         )
 
     def _target(self, target: SteadyState | None) -> dict[str, Any]:

@@ -244,6 +244,9 @@ class TickResult(Message, frozen=True):
     target_u: list[float] = []
     target_distance: float | None = None
     """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
+    noise: list[float] = []
+    """Standard deviation of what is measured of each state as the estimator found it, its own units, 0 of those that
+    are not measured; empty where it was told."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

@@ -69,6 +69,8 @@ class StepResult:
     """What is certified of v_0; None where there are no certified sets, or no state."""
     target: SteadyState | None
     """Where the plan aims; None without a reference: at the equilibrium."""
+    noise: np.ndarray
+    """Standard deviation of what is measured as the estimator found it, (d,); (0,) where it had not to."""
 
     @property
     def new_network(self) -> bool:

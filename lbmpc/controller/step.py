@@ -161,7 +161,10 @@ class Controller:
         memory = ControllerState(
             shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, line
         )
-        return memory, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
+        noise = self.estimator.found_noise(estimator)
+        return memory, StepResult(
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, target, noise
+        )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd

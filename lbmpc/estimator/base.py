@@ -64,8 +64,9 @@ class Estimator(ABC):
         """The memory before the first sample."""
         return {}
 
-    def noise(self, state: EstimatorState) -> np.ndarray:
-        """Standard deviation of what is measured, (d,), in units of the states; of others it says nothing."""
+    def found_noise(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of what is measured, (d,), in units of the states, 0 of others; (0,) where nobody had to
+        find it."""
         return np.zeros(0)
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:

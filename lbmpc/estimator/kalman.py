@@ -67,7 +67,9 @@ class KalmanEstimator(Estimator):
         self.sees_all = len(measured) == d
         units = self._units = balanced(model.plant)[:d]
         least = self._least = LEAST * model.plant.x_scale
-        self._told = np.maximum(GUESS * model.plant.x_scale if noise is None else noise, least)
+        told = GUESS * model.plant.x_scale if noise is None else noise
+        self._told = np.zeros(d)
+        self._told[measured] = np.maximum(told, least)[measured]
         sigma = np.maximum(process, least * model.period) / units
         rho = self._kept = float(np.exp(-model.period / correlation))
         self._F = np.block(
@@ -100,7 +102,11 @@ class KalmanEstimator(Estimator):
         }
 
     def noise(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of what is measured, told or found, (d,), in units of the states; 0 of others."""
         return state.get("noise", self._told)
+
+    def found_noise(self, state: EstimatorState) -> np.ndarray:
+        return state.get("noise", super().found_noise(state))
 
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
@@ -117,18 +123,20 @@ class KalmanEstimator(Estimator):
             after, estimate = self._followed(state, seen, measured, u, periods)
         after = {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}
         if self._finder is not None:
-            follows = np.isfinite(estimate.variance).all() and periods == 1
-            after = self._with_noise(after, seen, follows and len(measured) == len(self._measured))
+            follows = periods == 1 and np.isfinite(estimate.variance).all()
+            usable = u if follows and len(measured) == len(self._measured) else None
+            after = self._with_noise(self._finder, after, seen, usable)
         return after, estimate
 
-    def _with_noise(self, after: EstimatorState, seen: Measured, follows: bool) -> EstimatorState:
-        """What a sample says of the noise; `follows`: it is the next one, and all that is measured of it counts."""
-        assert self._finder is not None
+    def _with_noise(
+        self, finder: NoiseFinder, after: EstimatorState, seen: Measured, u: np.ndarray | None
+    ) -> EstimatorState:
+        """What a sample says of the noise; u: None: it is not the next one, or not all that is measured counts."""
         d, measured, units = self._model.d, self._measured, self._units
-        if not follows or seen.applied is None:
-            return self._finder.begun(after, np.concatenate([after["x"] / units, after["disturbance"] / units]))
-        moved = np.concatenate([self._nominal(np.zeros(d), seen.applied, seen.pieces) / units, np.zeros(d)])
-        after, R = self._finder.followed(after, moved, (seen.y / units)[measured])
+        if u is None:
+            return finder.begun(after, self._scaled(after))
+        moved = np.concatenate([self._nominal(np.zeros(d), u, seen.pieces) / units, np.zeros(d)])
+        after, R = finder.followed(after, moved, (seen.y / units)[measured])
         if R is None:
             return after
         noise = after["noise"].copy()
@@ -144,6 +152,8 @@ class KalmanEstimator(Estimator):
         after = self._predicted(state, self._nominal(state["x"], then, pieces))
         if self._is_lost(after):
             return {**self._afresh(state), "sample": self.initial_state()["sample"]}
+        if self._finder is not None:
+            after = self._finder.begun(after, self._scaled(after))
         return {**after, "sample": np.array([source, sequence + 1], dtype=np.int64)}
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
@@ -207,6 +217,10 @@ class KalmanEstimator(Estimator):
         spread = np.diag(predicted["covariance"])[:d] + self._R(predicted)
         variance[measured] = (spread * self._units**2)[measured]
         return innovation, variance
+
+    def _scaled(self, state: EstimatorState) -> np.ndarray:
+        """State and disturbance, (2d,), in the filter's units."""
+        return np.concatenate([state["x"] / self._units, state["disturbance"] / self._units])
 
     def _R(self, state: EstimatorState) -> np.ndarray:
         """Variance of what is measured, (d,), in the filter's units."""
