@@ -69,6 +69,14 @@ class Estimator(ABC):
         find it."""
         return np.zeros(0)
 
+    def tells(self, y: np.ndarray) -> bool:
+        """Whether a sample, (d,), NaN where there is no number, says anything."""
+        return bool(np.isfinite(y).all())
+
+    def faults(self, state: EstimatorState) -> dict[str, str]:
+        """Which sensors are not believed, by the names of their states, and in words what is wrong."""
+        return {}
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""
         return state

@@ -77,9 +77,7 @@ def test_of_a_plant_that_runs_away_fast_as_well() -> None:
 
 def test_one_loud_sensor_among_quiet_ones_is_told_apart() -> None:
     noise = np.array([0.02, 0.001, 0.001, 0.005]) * COMPRESSOR.plant.x_scale
-    memory, _, _ = follow(
-        COMPRESSOR, finding(COMPRESSOR, np.arange(4)), noise, slow(COMPRESSOR, 110, 1.0), 1
-    )
+    memory, _, _ = follow(COMPRESSOR, finding(COMPRESSOR, np.arange(4)), noise, slow(COMPRESSOR, 110, 1.0), 1)
     share = memory["noise"] / noise
     assert ((share > 1 / 1.5) & (share < 1.5)).all()
 
