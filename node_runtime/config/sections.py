@@ -168,12 +168,13 @@ class EstimatorConfig(Section, frozen=True):
     """"none": a sample is the state; "kalman": a filter of the nominal model and a disturbance of each state."""
     measured: list[str] | None = None
     """States that a sample measures; of the others its numbers count nothing. None: all."""
-    noise: Shares = 0.01
-    """Standard deviation of what is measured, in half-widths."""
+    noise: Shares | Literal["innovations"] = 0.01
+    """Standard deviation of what is measured, in half-widths; "innovations": found in the first 100 samples."""
     process: Shares | None = None
     """Standard deviation of h, in half-widths per second of period; None: `controller.W`, or else the plant's own."""
-    correlation: Seconds = 1.0
-    """Seconds in which h becomes another along the motion, by a factor of e."""
+    correlation: Seconds | None = None
+    """Seconds in which h becomes another along the motion, by a factor of e; None: the plant's time scale, that of its
+    slowest mode under K."""
 
 
 class ReferenceConfig(Section, frozen=True):
