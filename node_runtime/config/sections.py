@@ -26,6 +26,10 @@ LONGEST_PERIOD = 1e6
 Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
 """Two of them differ by so little that rounding leaves a covariance positive."""
 LONGEST_HORIZON = 1000
+DEAD_TIME = "dead_time"
+"""In `plant.truth`, beside the parameters of the equations."""
+MOST_DEAD_PERIODS = 50
+"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
