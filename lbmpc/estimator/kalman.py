@@ -100,6 +100,9 @@ class KalmanEstimator(Estimator):
             after, estimate = self._followed(state, seen, measured, u, periods)
         return {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}, estimate
 
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        return self._units * np.sqrt(np.diag(state["covariance"])[: self._model.d])
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         source, sequence = state["sample"].tolist()
         if sequence < 0:
