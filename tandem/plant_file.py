@@ -20,6 +20,7 @@ COMMENTS = {
     "offset": "x+ - x at (x_e, u_e): Tandem takes the nearest point of rest for (x_e, u_e)",
     "W": "half-widths of what A and B leave out, per second",
     "period": "s: A and B hold at this rate only",
+    "dead_time": "s, from when an input is written until the plant begins to answer: A and B are what follows then",
 }
 """What a reader is told of a field, on the line before it."""
 
@@ -67,11 +68,24 @@ def source(fields: Mapping[str, Any], about: Sequence[str]) -> str:
 def shared_fields(known: Known) -> dict[str, Any]:
     """What a model with other matrices has in common with this one, as `from_matrices` takes it; names come first."""
     names = (
-        *("name", "states", "inputs", "units", "x_e", "u_e", "x_min", "x_max", "u_min", "u_max", "u_rate_max"),
+        *(
+            "name",
+            "states",
+            "inputs",
+            "units",
+            "x_e",
+            "u_e",
+            "x_min",
+            "x_max",
+            "u_min",
+            "u_max",
+            "u_rate_max",
+        ),
         *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
     )
     fields = {key: getattr(known, key) for key in names}
-    return fields | {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+    fields |= {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+    return fields | {"dead_time": known.dead_time or None}
 
 
 def _text(value: Any, indent: int) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from lbmpc.controller.dead_time import LineState
 from lbmpc.controller.fallback import Plan
 from lbmpc.estimator.base import EstimatorState
 from lbmpc.oracles.base import OracleState
@@ -31,6 +32,8 @@ class ControllerState:
     estimator: EstimatorState
     commanded: np.ndarray
     """The last input that was commanded, (m,), or the safe one; (0,) where no plan depends on it."""
+    line: LineState = field(default_factory=dict)
+    """What was written and has not acted yet, `lbmpc.controller.dead_time`; empty without a dead time."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -44,6 +47,7 @@ class ControllerState:
             **({"target": self.target} if self.target.size else {}),
             **({"commanded": self.commanded} if self.commanded.size else {}),
             **{f"estimator.{name}": array for name, array in self.estimator.items()},
+            **{f"line.{name}": array for name, array in self.line.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -51,9 +55,9 @@ class ControllerState:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
         """Raises KeyError when an array is missing."""
         source, sequence = (int(value) for value in arrays["pending"])
-        oracle, estimator = (
+        oracle, estimator, line = (
             {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-            for prefix in ("oracle.", "estimator.")
+            for prefix in ("oracle.", "estimator.", "line.")
         )
         plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
@@ -66,4 +70,5 @@ class ControllerState:
             arrays.get("target", np.zeros(0)),
             estimator,
             arrays.get("commanded", np.zeros(0)),
+            line,
         )

@@ -85,6 +85,8 @@ def number_faults(plant: Description) -> Iterator[str]:
             f"u_rate_max is {shown(rates)}: give how fast each of {', '.join(plant.inputs)} may change, per second, "
             "a positive number or inf"
         )
+    if not (isinstance(plant.dead_time, int | float) and 0.0 <= plant.dead_time < np.inf):
+        yield f"dead_time is {plant.dead_time!r}: give seconds, 0 where the plant answers at once"
 
 
 def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:

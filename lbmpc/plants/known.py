@@ -69,10 +69,11 @@ class Known(Description):
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
     ) -> Known:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
-        there = super().changed(bounds, x_e, u_e, input_rate_max)
+        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max)
         if x_e is None and u_e is None:
             return there
         refuse(self.name, all_faults(there))
@@ -124,6 +125,7 @@ class Known(Description):
         poles: Sequence[complex] | None = None,
         scale: Mapping[str, float] | None = None,
         names: Mapping[str, str] | None = None,
+        dead_time: float = 0.0,
     ) -> Known:
         """A plant of which a pair of matrices is known.
 
@@ -141,7 +143,7 @@ class Known(Description):
             safe_input: u_e by default.
             performance: all states by default.
             kernel: all states and inputs by default.
-            safe_gain, poles, scale, names, u_rate_max: as the fields of these names.
+            safe_gain, poles, scale, names, dead_time, u_rate_max: as the fields of these names.
 
         Raises:
             PlantDefinitionError: it cannot be used; the text names every fault.
@@ -173,6 +175,7 @@ class Known(Description):
             scale=scale or {},
             names=names or {},
             u_rate_max=u_rate_max,
+            dead_time=dead_time,
             A=A,
             B=B,
             period=period,

@@ -42,6 +42,8 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     poles: list[float | tuple[float, float]] | None
     u_rate_max: list[Number] | None = None
     """Missing in files that are older than it."""
+    dead_time: float = 0.0
+    """Left out where there is none, as in what was written before there was such a field."""
 
 
 FIELDS = Written.__struct_fields__
@@ -53,7 +55,10 @@ def written(fields: dict[str, Any]) -> dict[str, Any]:
     Raises:
         PlantDefinitionError: a field has what JSON, or `read`, would not take.
     """
-    return msgspec.to_builtins(_typed({name: _plain(fields[name]) for name in FIELDS}))
+    given = {name: _plain(fields[name]) for name in FIELDS}
+    if given["dead_time"] == 0.0:
+        del given["dead_time"]
+    return msgspec.to_builtins(_typed(given))
 
 
 def read(data: object) -> dict[str, Any]:

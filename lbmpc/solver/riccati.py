@@ -53,7 +53,11 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
         ca.DM(weight / model.cost_scale) for weight in (model.Q, model.R, model.P, model.S[:before, :before])
     )
     a, b = ca.DM(model.A), ca.DM(model.B)
-    x, v, theta = ca.MX.sym("x", d + behind + before), ca.MX.sym("v", m, n), ca.MX.sym("theta", oracle.parameters)
+    x, v, theta = (
+        ca.MX.sym("x", d + behind + before),
+        ca.MX.sym("v", m, n),
+        ca.MX.sym("theta", oracle.parameters),
+    )
     xr, ur = ca.MX.sym("xr", d, n + 1), ca.MX.sym("ur", m, n)
     inputs = ca.horzsplit(v)
     parts = oracle.split(theta)

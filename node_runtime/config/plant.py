@@ -43,6 +43,8 @@ class Described(Protocol):
     def W(self) -> np.ndarray: ...
     @property
     def x0(self) -> np.ndarray: ...
+    @property
+    def dead_time(self) -> float: ...
 
 
 class Plant(Described, Protocol):
@@ -53,6 +55,7 @@ class Plant(Described, Protocol):
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
     ) -> Self: ...
     def varied(self, **changes: float) -> Self: ...
@@ -64,6 +67,10 @@ class Motion(Protocol):
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray: ...
 
 
+DEAD_TIME = "dead_time"
+"""In `plant.truth`, beside the parameters of the equations."""
+MOST_DEAD_PERIODS = 50
+"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 P = TypeVar("P", bound=Plant)
 Find = Callable[[Any, Callable[[P], P]], P]
 """`lbmpc.plants.get_plant`: of a name or a plant, and what is changed before it is looked at, the plant. It raises
@@ -133,6 +140,26 @@ def true_plant_of(
     return true
 
 
+def true_dead_time(config: Config, known: Described, true: object) -> float:
+    """Seconds: what `plant.truth` says, or what it names has; where neither does it is as known.
+
+    Args:
+        known, true: of `plant_of` and `true_plant_of`.
+
+    Raises:
+        ConfigError: `plant.truth.dead_time` is none, or longer than what a simulation remembers.
+    """
+    truth = config.plant.truth
+    if not isinstance(truth, dict) or DEAD_TIME not in truth:
+        return getattr(true, DEAD_TIME, 0.0) or known.dead_time
+    seconds, most = truth[DEAD_TIME], MOST_DEAD_PERIODS * config.period
+    if not 0.0 <= seconds <= most * (1.0 + 1e-9):
+        raise ConfigError(
+            f"plant.truth.dead_time = {seconds:g}: seconds, from 0 to {most:g}, {MOST_DEAD_PERIODS} periods"
+        )
+    return seconds
+
+
 def load_plant(reference: str) -> Any:
     """The plant that "tanks.py:TANKS" names, as it is there. Raises `ConfigError`."""
     return load(reference, _is_plant, "plant")
@@ -171,6 +198,7 @@ def spelt_out(config: Config, plant: Described) -> Config:
             u_e=plant.u_e.tolist(),
             bounds=bounds,
             input_rate_max=rates,
+            dead_time=plant.dead_time,
         ),
         controller=msgspec.structs.replace(
             settings,
@@ -223,7 +251,9 @@ def _as_configured(config: Config, plant: P) -> P:
         if name not in plant.inputs:
             hint = did_you_mean(name, plant.inputs, f"it has {', '.join(plant.inputs)}")
             raise ConfigError(f"plant.input_rate_max: {plant.name} has no input {name!r}; {hint}")
-    return plant.changed(config.plant.bounds, config.plant.x_e, config.plant.u_e, rates)
+    return plant.changed(
+        config.plant.bounds, config.plant.x_e, config.plant.u_e, config.plant.dead_time, rates
+    )
 
 
 def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
@@ -279,7 +309,10 @@ def in_half_widths(shares: Shares, plant: Described) -> np.ndarray:
 
 def _with_parameters(config: Config, plant: P) -> P:
     truth = config.plant.truth
+    others = (
+        {name: value for name, value in truth.items() if name != DEAD_TIME} if isinstance(truth, dict) else {}
+    )
     try:
-        return plant.varied(**truth) if isinstance(truth, dict) and truth else plant
+        return plant.varied(**others) if others else plant
     except (LookupError, ArithmeticError) as error:
         raise ConfigError(f"plant.truth: {error.args[0]}") from error

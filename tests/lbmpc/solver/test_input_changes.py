@@ -26,9 +26,7 @@ EXACT = 1e-9
 
 def with_rates(model: Model, rates: np.ndarray, S: np.ndarray) -> Model:
     """The same model with other rate limits, (m,), and weights of a stage's change, (m,)."""
-    return dataclasses.replace(
-        model, plant=dataclasses.replace(model.plant, u_rate_max=rates), S=np.diag(S)
-    )
+    return dataclasses.replace(model, plant=dataclasses.replace(model.plant, u_rate_max=rates), S=np.diag(S))
 
 
 def changes(v: np.ndarray, previous: np.ndarray) -> np.ndarray:
