@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
+from rich.console import Console
 
 from benchmarks.solver.recording import SEED, Recording, configure, record, shifted
 from controller_node.build import Realise, build_model, build_oracle
@@ -99,9 +100,12 @@ def measure(chosen: Arguments, realise: Realise) -> dict[str, Timed]:
 
 
 def main(chosen: Arguments) -> int:
+    console = Console(width=160, highlight=False)
     with punctual(0), one_blas_thread():
         variants = measure(chosen, Compiler(None))
-    print(f"{chosen.oracle}, N = {chosen.horizon}: median / p99 in ms (ratio to neither), mean iterations")
+    console.print(
+        f"{chosen.oracle}, N = {chosen.horizon}: median / p99 in ms (ratio to neither), mean iterations"
+    )
     plain = variants["neither"]
     for name, one in variants.items():
         cells = []
@@ -109,7 +113,7 @@ def main(chosen: Arguments) -> int:
             own, other = (np.percentile(each.seconds[mode], [50, 99]) * 1e3 for each in (one, plain))
             ratios = own / other
             cells.append(f"{mode} {own[0]:.3f} / {own[1]:.3f} ({ratios[0]:.2f} / {ratios[1]:.2f})")
-        print(f"{name:12s} | {' | '.join(cells)} | {np.mean(one.iterations):.2f}")
+        console.print(f"{name:12s} | {' | '.join(cells)} | {np.mean(one.iterations):.2f}")
     return 0
 
 
