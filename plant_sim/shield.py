@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from operator import mul
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -195,7 +195,9 @@ class Shield:
     # -- what a sample says ------------------------------------------------------------------------------
 
     def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
-        """x(t), (d,), and what acted since the sample before; t must rise by about whole periods, after `advance`.
+        """x(t), (d,), NaN where no number came, and what acted since the sample before.
+
+        t must rise by about whole periods, after `advance`.
 
         `applied` is the time average of the input over the last period, that input itself when only one
         acted, and None when a part of it is not known or the last sample is not one period ago.
@@ -223,11 +225,11 @@ class Shield:
             run_id=self._run_id,
             seq=self._seq,
             t=t,
-            x=x.tolist(),
             applied=applied,
             pieces=pieces if applied is None or len(pieces) > 1 else [],
             source=acted[-1][1].source if acted else self._tape[0].source,
             command_seq=-1 if orders is None else orders.seq,
+            **measurement(self.plant, x),
         )
 
     def _begin_epoch(self, t: float) -> None:
@@ -262,6 +264,15 @@ class Shield:
             return inputs[0]
         shares = [seconds / total for seconds, _one in acted]
         return [sum(map(mul, shares, entries)) for entries in zip(*inputs, strict=True)]
+
+
+def measurement(plant: Description, x: np.ndarray) -> dict[str, Any]:
+    """The fields of a `PlantState` that tell of x, (d,): NaN, where no number came, does not travel."""
+    missing = np.isnan(x)
+    if not missing.any():
+        return {"x": x.tolist()}
+    names = [plant.states[i] for i in np.flatnonzero(missing)]
+    return {"x": np.where(missing, plant.x_e, x).tolist(), "missing": names}
 
 
 def _pieces(acted: list[tuple[float, _Acting]]) -> list[Piece]:

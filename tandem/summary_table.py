@@ -25,6 +25,7 @@ MEANING = {
     "soft_ticks": "a soft state constraint gave way",
     "fallback_ticks": "input not from the solver",
     "unreached_ticks": "no rest has the outputs where they should be, or none was found",
+    "sensor_faults": "sensors that were not believed",
     "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
     "J": "sum of the stage costs, Q and R per second",
@@ -46,8 +47,8 @@ ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
 """What null means, where it is more than that there is no such figure."""
 OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s", "offset": "share"}
 """Which figure of each performance state these are."""
-WITH_A_REFERENCE = ("unreached_ticks", "target_distance", "offset")
-"""Rows that the table of another run has not."""
+WHERE_THERE_IS_ONE = ("unreached_ticks", "target_distance", "offset", "sensor_faults")
+"""Rows that the table of another run has not: one without a reference, or without such a fault."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -61,6 +62,7 @@ SHOULD_BE_ZERO = (
     "constraint_violations",
     "excess_between_samples",
     "outside_ticks",
+    "sensor_faults",
 )
 
 
@@ -78,7 +80,7 @@ def table(summary: Summary) -> Table:
     if len(episodes) > 1:
         figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
     for name, value in figures.items():
-        if name in WITH_A_REFERENCE and value in (None, {}):
+        if name in WHERE_THERE_IS_ONE and value in (None, {}, []):
             continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
@@ -90,6 +92,8 @@ def _text(name: str, value: Any) -> str:
         return ABSENT.get(name, "-")
     if name in OF_EACH_STATE:
         return ", ".join(f"{state} {_text(OF_EACH_STATE[name], one)}" for state, one in value.items())
+    if isinstance(value, list):
+        return "\n".join(value)
     if isinstance(value, dict):
         return " / ".join(_text("", part) for part in value.values())
     if name == "share":

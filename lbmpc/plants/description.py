@@ -61,11 +61,11 @@ class Description:
     """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What states and inputs are called in a person's words, by name."""
-    u_rate_max: np.ndarray | None = None
-    """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
     dead_time: float = 0.0
     """Seconds from when an input is written until the plant begins to answer: transport, a pipe, a bus behind the
     gateway. Of all inputs."""
+    u_rate_max: np.ndarray | None = None
+    """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain", "u_rate_max"):

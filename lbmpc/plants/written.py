@@ -40,10 +40,9 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     performance: list[int]
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
-    u_rate_max: list[Number] | None = None
-    """Missing in files that are older than it."""
     dead_time: float = 0.0
-    """Left out where there is none, as in what was written before there was such a field."""
+    """Left out where there is none, as in what was written before there was such a field; so is the next."""
+    u_rate_max: list[Number] | None = None
 
 
 FIELDS = Written.__struct_fields__
@@ -57,6 +56,7 @@ def written(fields: dict[str, Any]) -> dict[str, Any]:
     """
     given = {name: _plain(fields[name]) for name in FIELDS}
     if given["dead_time"] == 0.0:
+        # Only the default itself is left out, not what equals it.
         del given["dead_time"]
     return msgspec.to_builtins(_typed(given))
 

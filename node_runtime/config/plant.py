@@ -197,8 +197,8 @@ def spelt_out(config: Config, plant: Described) -> Config:
             x_e=plant.x_e.tolist(),
             u_e=plant.u_e.tolist(),
             bounds=bounds,
-            input_rate_max=rates,
             dead_time=plant.dead_time,
+            input_rate_max=rates,
         ),
         controller=msgspec.structs.replace(
             settings,
@@ -251,9 +251,8 @@ def _as_configured(config: Config, plant: P) -> P:
         if name not in plant.inputs:
             hint = did_you_mean(name, plant.inputs, f"it has {', '.join(plant.inputs)}")
             raise ConfigError(f"plant.input_rate_max: {plant.name} has no input {name!r}; {hint}")
-    return plant.changed(
-        config.plant.bounds, config.plant.x_e, config.plant.u_e, config.plant.dead_time, rates
-    )
+    there = config.plant
+    return plant.changed(there.bounds, there.x_e, there.u_e, there.dead_time, rates)
 
 
 def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
@@ -288,6 +287,7 @@ def _check_names_of_states(config: Config, plant: Described) -> None:
         ("plant.sensors.quantisation", sensors.quantisation),
         ("plant.sensors.bias", sensors.bias),
         ("plant.sensors.stuck", sensors.stuck),
+        ("plant.sensors.dead", sensors.dead),
         ("estimator.noise", estimator.noise),
         ("estimator.process", estimator.process),
         ("estimator.measured", estimator.measured),

@@ -67,6 +67,8 @@ class SensorsConfig(Section, frozen=True):
     """Seconds after the first sample from which on there is a bias."""
     stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
     """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
+    dead: dict[str, Instant] = msgspec.field(default_factory=dict)
+    """Seconds after the first sample from which on no number comes of a state, by name, while those of others do."""
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
 
@@ -87,11 +89,11 @@ class PlantConfig(Section, frozen=True):
     """Input that goes with it."""
     bounds: dict[str, Bounds] = msgspec.field(default_factory=dict)
     """Of X and U, by the name of a state or input, where they are not the plant's own."""
-    input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
-    """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
     dead_time: Annotated[float, msgspec.Meta(ge=0, le=1e6)] | None = None
     """Seconds from when the gateway writes an input until the plant begins to answer; None: the plant's own. It is
     part of the model, and another thing than `controller.input_delay_ms`, which ends at the gateway."""
+    input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
+    """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """Parameters of the true plant where they differ from the model's, by name, `dead_time` among them: a model that is
     wrong. Or a reference to what moves in the plant's place: other equations, or an object with `step`."""

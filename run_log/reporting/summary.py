@@ -56,6 +56,8 @@ class Summary(Performance, frozen=True, kw_only=True):
     """Ticks whose input did not come from the solver."""
     unreached_ticks: int | None
     """Ticks whose target's outputs are not where they should be, or that found no rest; null without a reference."""
+    sensor_faults: list[str]
+    """Which sensors were not believed, and when, in words."""
     target_distance: float | None
     """How far the outputs of the last tick's target are from there, the largest share of an output's half-width."""
     solve_ms: Spread | None
@@ -92,6 +94,7 @@ def summarise(run: Run) -> Summary:
         soft_ticks=sum(r.slack > SOFT for r in results),
         fallback_ticks=sum(r.mode != "solver" for r in results),
         unreached_ticks=sum(r.target_status != "reached" for r in aimed) if aimed else None,
+        sensor_faults=_sensor_faults(run.config.period, ticks, results),
         target_distance=aimed[-1].target_distance if aimed else None,
         solve_ms=_spread([timing.solve_ms for timing in timings]),
         tick_ms=_spread([timing.tick_ms for timing in timings]),
@@ -100,6 +103,19 @@ def summarise(run: Run) -> Summary:
         smallest_set_margin=min(margins, default=None),
         log=str(run.path) if run.path.name else None,
     )
+
+
+def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResult]) -> list[str]:
+    when = {(tick.run_id, tick.seq): tick.t for tick in ticks}
+    told: list[str] = []
+    now: dict[str, str] = {}
+    for result in results:
+        t = when.get((result.run_id, result.seq), result.seq * period)
+        for name in now.keys() - result.sensor_faults.keys():
+            told.append(f"{now.pop(name)}; believed again from {t:.1f} s")
+        for name, fault in result.sensor_faults.items():
+            now.setdefault(name, m.words_of_fault(name, fault, t))
+    return [*told, *now.values()]
 
 
 def _spread(values: list[float]) -> Spread | None:

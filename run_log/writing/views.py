@@ -55,6 +55,9 @@ def _of_result(result: m.TickResult) -> Json:
         "target_status": aimed,
         "target_x": result.target_x or None,
         "target_u": result.target_u or None,
+        "sensor_faults": result.sensor_faults or None,
+        "reference": result.reference or None,
+        "reference_verdict": None if result.reference_verdict == "none" else result.reference_verdict,
     }
 
 
@@ -97,12 +100,16 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
+        "sensor_faults reference reference_verdict",
         _of_result,
         {
             **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
+            "sensor_faults": dict[str, str] | None,
+            "reference": dict[str, float] | None,
+            "reference_verdict": str | None,
         },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),
