@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from controller_node.core import ControllerCore
-from lbmpc.plants import Truth
+from lbmpc.plants import PlantError, Truth
 from lbmpc.plants.moore_greitzer import MOORE_GREITZER
 from node_runtime.config.loading import load, override
 from node_runtime.config.sections import Config
@@ -66,8 +66,12 @@ def follow(config: Config, seed: int, ticks: int) -> Found:
     first = float(core.plant.safe_input[0])
     for k in range(ticks):
         t = k * period
-        shield.advance(t, motion)
-        state = shield.sample(t, motion.read(t))
+        try:
+            shield.advance(t, motion)
+            state = shield.sample(t, motion.read(t))
+        except PlantError:
+            # Nobody commanded it for too long; what was written until then counts.
+            break
         shield.renew(t, np.array(state.x), motion)
         sources[state.source] = sources.get(state.source, 0) + 1
         if state.applied is not None:
