@@ -161,6 +161,9 @@ class Translation:
             sensor_faults=result.sensor_faults,
             **self._target(result.target),
             **self._judged(tick),
+            **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
+            deviation=result.deviation.tolist(),
+            noise=result.noise.tolist(),
         )
 
     def _judged(self, tick: m.Tick) -> dict[str, Any]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
+
+import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
 from controller_node.core import ControllerCore
 from lbmpc.plants import get_plant
@@ -14,6 +18,7 @@ from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow, simulate
+from tandem.summary_table import table
 
 PLANT = get_plant("moore_greitzer")
 SETTINGS = [
@@ -65,6 +70,30 @@ def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
     assert "oracle.evidence" not in exact.keyframes[0].arrays
 
 
+def test_a_result_says_what_of_the_network_counts_and_how_well_the_state_is_known(lossy: Run) -> None:
+    after = [result for result in lossy.results if result.seq >= 5]
+    deviations = np.array([result.deviation for result in after])
+    # Better than one sample, worse where there was none.
+    known = np.array([lossy.ticks[result.seq].state is not None for result in after])
+    assert (deviations[known] < 0.01 * PLANT.x_scale).all()
+    assert deviations[~known].mean() > deviations[known].mean()
+    for result in after:
+        for weight in (result.weight, result.constant_weight):
+            assert len(weight) == 4
+            assert all(0.0 <= share <= 1.0 for share in weight)
+    assert any(max(result.weight + result.constant_weight) > 0.0 for result in after)
+    summary = summarise(lossy)
+    last = np.mean([result.weight for result in lossy.results[-20:]], axis=0)
+    assert summary.weight == pytest.approx(dict(zip(PLANT.states, last, strict=True)))
+    console = Console(width=200, file=io.StringIO())
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.01})))
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.4})))
+    assert console.file.getvalue().count("noise exceeds h") == 1
+    exact = simulate(config("estimator.kind=none"), 3)
+    assert all(not (r.weight or r.constant_weight or r.deviation) for r in exact.results)
+    assert summarise(exact).weight is None
+
+
 def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) -> None:
     core = ControllerCore(config("adaptation.law=kalman"), "controller-a")
     core.memory.restore(lossy.keyframes[2])
@@ -77,6 +106,30 @@ def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) ->
         core.step(tick)
         again.step(tick)
     np.testing.assert_array_equal(again.memory.state.estimator["x"], core.memory.state.estimator["x"])
+
+
+def test_noise_that_is_found_is_in_every_tick_in_keyframes_and_in_checkpoints() -> None:
+    settings = config("estimator.noise=innovations", "controller.oracle=linear", "plant.sensors.noise=0.002")
+    run = follow(settings, 120).run
+    first, last = np.array(run.results[5].noise), np.array(run.results[-1].noise)
+    np.testing.assert_allclose(first, 0.01 * PLANT.x_scale)
+    np.testing.assert_allclose(last / PLANT.x_scale, 0.002, rtol=0.5)
+    assert replay(run).equal
+    # In the middle of finding.
+    assert replay(run, from_tick=45).equal
+    core = ControllerCore(settings, "controller-a")
+    core.memory.restore(run.keyframes[3])
+    again = ControllerCore(settings, "controller-b")
+    again.memory.go_on(core.memory.lasting(), "controller-a")
+    for memory in (core.memory, again.memory):
+        assert memory.state.estimator["finder.counts"][1] > 40
+    for tick in run.ticks[61:70]:
+        core.step(tick)
+        again.step(tick)
+    for name, array in core.memory.state.estimator.items():
+        np.testing.assert_array_equal(again.memory.state.estimator[name], array)
+    told = simulate(config("controller.oracle=linear"), 5)
+    assert told.results[-1].noise == []
 
 
 def test_half_of_the_states_measured_and_a_wrong_start_is_survived() -> None:
