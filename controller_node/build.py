@@ -43,8 +43,13 @@ FILTERED = 512
 """Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
 COARSE = 0.05
 """Share of a time scale. K_0 stands for nothing yet; where a period is longer it would move predictions far."""
+MEMORY, NOISY_MEMORY, REACH, WATCH = 2.0, 10.0, 4.0, 1.0
+"""Time scales of the plant: what the last layer's filter remembers of exact labels, and of noisy ones; how far the
+samples reach back on which hidden weights are tried, and how long these are watched."""
+FEWEST = 20
+"""Samples in a memory or a watch of so many time scales: a slow loop has few in one."""
 SHORTEST_WATCH = 8
-"""Samples, also where the loop is slow."""
+"""Samples, whatever was asked for."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +134,14 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         raise ConfigError(f"network: {error}") from error
     adaptation, share = config.adaptation, model.period / model.time_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
+    chosen, noisy = describe_filter(config, model.time_scale), config.estimator.kind != "none"
+    filtered = adaptation.enabled and (adaptation.law == "kalman" or (adaptation.law is None and noisy))
+    if filtered and description.features > FILTERED:
+        raise ConfigError(
+            f"the filter of the last layer keeps a covariance of {description.features} x {description.features} "
+            f"numbers; the last of network.hidden can have {FILTERED - 1} neurons at most with it, or take "
+            f'adaptation.law = "gradient"'
+        )
     return DnnOracle(
         description,
         adaptation.gamma if adaptation.enabled else 0.0,
@@ -136,40 +149,40 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         adaptation.initial_scale * (min(share, COARSE) * model.plant.x_scale),
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
-        describe_trial(config),
-        describe_filter(config, description.features),
-        None if config.estimator.kind == "none" else math.exp(-config.period / adaptation.kalman.memory),
+        describe_trial(config, model.time_scale),
+        chosen if filtered else None,
+        chosen if noisy else None,
     )
 
 
-def describe_filter(config: Config, features: int) -> Kalman | None:
-    """The filter of the last layer with so many features, at the configured rate; None where there is none.
+def describe_filter(config: Config, time_scale: float) -> Kalman:
+    """The filter of the last layer, and of the constant beside it, at the configured rate.
 
-    Raises:
-        ConfigError: its covariance would be too large.
+    time_scale: the plant's, in seconds.
     """
-    adaptation = config.adaptation
-    if adaptation.law != "kalman" or not adaptation.enabled:
-        return None
-    if features > FILTERED:
-        raise ConfigError(
-            f'adaptation.law = "kalman" keeps a covariance of {features} x {features} numbers; the last of '
-            f"network.hidden can have {FILTERED - 1} neurons at most with it"
-        )
-    settings = adaptation.kalman
-    kept = math.exp(-config.period / settings.memory)
-    return Kalman(settings.prior_variance, settings.label_variance, kept)
+    settings = config.adaptation.kalman
+    scales = MEMORY if config.estimator.kind == "none" else NOISY_MEMORY
+    memory = settings.memory
+    if memory is None:
+        memory = max(scales * time_scale, FEWEST * config.period)
+    return Kalman(settings.prior_variance, settings.label_variance, math.exp(-config.period / memory))
 
 
-def describe_trial(config: Config) -> Trial | None:
-    """The trial of hidden weights at the configured rate; None where it is switched off."""
+def describe_trial(config: Config, time_scale: float) -> Trial | None:
+    """The trial of hidden weights at the configured rate, for a plant with this time scale in seconds.
+
+    None where it is switched off.
+    """
     settings = config.adaptation.trial
     if not settings.enabled:
         return None
+    least = FEWEST * config.period
+    reach = REACH * time_scale if settings.seconds is None else settings.seconds
+    confirm = max(WATCH * time_scale, least) if settings.confirm is None else settings.confirm
     return Trial(
         capacity=settings.samples,
-        stride=max(1, round(settings.seconds * config.rate / settings.samples)),
-        window=max(SHORTEST_WATCH, math.ceil(settings.confirm * config.rate - 1e-9)),
+        stride=max(1, round(reach * config.rate / settings.samples)),
+        window=max(SHORTEST_WATCH, math.ceil(confirm * config.rate - 1e-9)),
         margin=settings.margin,
         floor=settings.floor,
         floor_after=settings.floor_after,

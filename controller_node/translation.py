@@ -161,6 +161,8 @@ class Translation:
             sensor_faults=result.sensor_faults,
             **self._target(result.target),
             **self._judged(tick),
+            **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
+            deviation=result.deviation.tolist(),
             noise=result.noise.tolist(),
         )
 

@@ -254,6 +254,12 @@ class TickResult(Message, frozen=True):
     """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
     reference_from: str = ""
     """run_id of who sent that; empty without one."""
+    weight: list[float] = []
+    """What of the network counts in the prediction of each state, 0 to 1; empty where nothing weighs it."""
+    constant_weight: list[float] = []
+    """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
+    deviation: list[float] = []
+    """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
     noise: list[float] = []
     """Standard deviation of what is measured of each state as the estimator found it, its own units, 0 of those that
     are not measured; empty where it was told."""

@@ -8,7 +8,7 @@ import msgspec
 from rich.table import Column, Table
 from rich.text import Text
 
-from run_log.reporting.summary import Summary
+from run_log.reporting.summary import ADDS, Summary
 
 FOR_A_PERSON = ("skipped_slots",)
 """Shown in the table alone; programs may count on everything else, in `run` and `simulate` alike."""
@@ -39,16 +39,31 @@ MEANING = {
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
     "prediction_error": "first / last second, or period if longer",
+    "weight": "what of the network counted in the last second",
+    "constant_weight": "what of a constant beside it",
     "outside_ticks": "outside of the certified sets",
     "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",
 }
 ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
 """What null means, where it is more than that there is no such figure."""
-OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s", "offset": "share"}
+OF_EACH_STATE = {
+    "overshoot": "share",
+    "settled_by_state_s": "settled_s",
+    "offset": "share",
+    "weight": "share",
+    "constant_weight": "share",
+}
 """Which figure of each performance state these are."""
-WHERE_THERE_IS_ONE = ("unreached_ticks", "target_distance", "offset", "sensor_faults")
-"""Rows that the table of another run has not: one without a reference, or without such a fault."""
+WHERE_THERE_IS_ONE = (
+    "unreached_ticks",
+    "target_distance",
+    "offset",
+    "sensor_faults",
+    "weight",
+    "constant_weight",
+)
+"""Rows that the table of another run has not: one without a reference, an estimator, or such a fault."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -84,6 +99,14 @@ def table(summary: Summary) -> Table:
             continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
+    counted = [
+        share
+        for weights in (summary.weight, summary.constant_weight)
+        if weights
+        for share in weights.values()
+    ]
+    if counted and max(counted) < ADDS:
+        shown.add_row("learning", Text("adds nothing", "bold yellow"), "noise exceeds h")
     return shown
 
 

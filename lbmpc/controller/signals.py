@@ -74,6 +74,10 @@ class StepResult:
     """What is certified of v_0; None where there are no certified sets, or no state."""
     target: SteadyState | None
     """Where the plan aims; None without a reference: at the equilibrium."""
+    weights: np.ndarray
+    """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; (0, d) where nothing weighs it."""
+    deviation: np.ndarray
+    """Standard deviation of the state that is known, (d,); (0,) where a sample is the state."""
     sensor_faults: dict[str, str] = field(default_factory=dict)
     """Which sensors are not believed, by the names of their states, and in words what is wrong."""
     noise: np.ndarray = field(default_factory=lambda: np.zeros(0))

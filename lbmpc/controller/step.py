@@ -192,9 +192,14 @@ class Controller:
             line,
             None if reference is None else reference.advanced(1),
         )
-        faults, noise = self.estimator.faults(estimator), self.estimator.found_noise(estimator)
+        known = (
+            self.oracle.weights(oracle),
+            self.estimator.deviation(estimator),
+            self.estimator.faults(estimator),
+            self.estimator.found_noise(estimator),
+        )
         return memory, StepResult(
-            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, faults, noise
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known
         )
 
     def _without_absurd(self, seen: Observation) -> Observation:

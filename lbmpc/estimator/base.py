@@ -77,6 +77,10 @@ class Estimator(ABC):
         """Which sensors are not believed, by the names of their states, and in words what is wrong."""
         return {}
 
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
+        return np.zeros(0)
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""
         return state

@@ -143,6 +143,9 @@ class KalmanEstimator(Estimator):
         noise[measured] = np.maximum(np.sqrt(R) * units[measured], self._least[measured])
         return {**after, "noise": noise}
 
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        return self._units * np.sqrt(np.diag(state["covariance"])[: self._model.d])
+
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         source, sequence = state["sample"].tolist()
         if sequence < 0:

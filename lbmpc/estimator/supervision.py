@@ -98,6 +98,9 @@ class SupervisedEstimator(Estimator):
     def found_noise(self, state: EstimatorState) -> np.ndarray:
         return self._inner.found_noise(state)
 
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        return self._inner.deviation(state)
+
     def faults(self, state: EstimatorState) -> dict[str, str]:
         fault = state["counts"][FAULT]
         if not fault.any():

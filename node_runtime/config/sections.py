@@ -26,6 +26,10 @@ LONGEST_PERIOD = 1e6
 Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
 """Two of them differ by so little that rounding leaves a covariance positive."""
 LONGEST_HORIZON = 1000
+DEAD_TIME = "dead_time"
+"""In `plant.truth`, beside the parameters of the equations."""
+MOST_DEAD_PERIODS = 50
+"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
@@ -217,12 +221,14 @@ class TrialConfig(Section, frozen=True):
     """Of new hidden weights, before they are adopted and for a while after."""
 
     enabled: bool = True
-    seconds: Seconds = 4.0
-    """How far the controller's own samples reach back, on which a set on offer is tried."""
+    seconds: Seconds | None = None
+    """How far the controller's own samples reach back, on which a set on offer is tried; None: four time scales of the
+    plant, those of `network.output_scale`."""
     samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
     """How many there are of them; a fast loop takes one every few ticks, a slow one reaches further back."""
-    confirm: Seconds = 1.0
-    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back."""
+    confirm: Seconds | None = None
+    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back; None: one time
+    scale, but 20 samples at least."""
     margin: NonNegative = 0.2
     """Share by which the mean squared error of a new set may be larger than the old one's."""
     floor: NonNegative = 0.003
@@ -232,21 +238,24 @@ class TrialConfig(Section, frozen=True):
 
 
 class KalmanConfig(Section, frozen=True):
-    """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
+    """Of the last layer's filter, where that is its law, and of the constant that is learned beside the network where
+    there is an estimator. Variances in (output scale)^2."""
 
     prior_variance: Variance = 0.02
     """Of each entry of K, before the first sample."""
     label_variance: Variance = 1e-3
     """Of each entry of a label: measuring noise, and what the features cannot explain."""
-    memory: Seconds = 2.0
-    """Seconds in which what is known fades towards the prior, by a factor of e."""
+    memory: Seconds | None = None
+    """Seconds in which what is known fades towards the prior, by a factor of e; None: two time scales of the plant, ten
+    where there is an estimator, but 20 samples at least."""
 
 
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
-    law: literals.LawName = "gradient"
-    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
+    law: literals.LawName | None = None
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter. None: kalman
+    where there is an estimator, which says how noisy labels are, and gradient where a sample is the state."""
     gamma: Unit = 0.8
     """Learning rate of the gradient law, 0 < gamma < 1."""
     column_bound: Positive = 2.0

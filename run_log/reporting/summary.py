@@ -13,6 +13,9 @@ from run_log.reporting.performance import Performance, of_episodes, performance
 from run_log.run import Run, plant_of, true_plant_of
 
 SOFT = 1e-9
+ADDS = 0.1
+"""What of h_hat counts, at least in one state, or else learning adds nothing."""
+ADDS_NOTHING = "learning adds nothing: noise exceeds h"
 
 
 class Spread(msgspec.Struct, frozen=True):
@@ -63,6 +66,11 @@ class Summary(Performance, frozen=True, kw_only=True):
     solve_ms: Spread | None
     tick_ms: Spread | None
     prediction_error: PredictionError
+    weight: dict[str, float] | None
+    """What of the network counted in the prediction of each state, 0 to 1: the mean of the last second, or period if
+    longer; null where nothing weighs it."""
+    constant_weight: dict[str, float] | None
+    """What counted of the constant beside it, likewise."""
     outside_ticks: int | None
     """Ticks in a state outside the certified sets, where nothing is guaranteed; null where none are in force."""
     smallest_set_margin: float | None
@@ -99,6 +107,8 @@ def summarise(run: Run) -> Summary:
         solve_ms=_spread([timing.solve_ms for timing in timings]),
         tick_ms=_spread([timing.tick_ms for timing in timings]),
         prediction_error=_prediction_error(run.config.period, ticks, results),
+        weight=_weight(run, plant.states, [r.weight for r in results]),
+        constant_weight=_weight(run, plant.states, [r.constant_weight for r in results]),
         outside_ticks=sum(margin < 0.0 for margin in margins) if margins else None,
         smallest_set_margin=min(margins, default=None),
         log=str(run.path) if run.path.name else None,
@@ -116,6 +126,11 @@ def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResul
         for name, fault in result.sensor_faults.items():
             now.setdefault(name, m.words_of_fault(name, fault, t))
     return [*told, *now.values()]
+
+
+def _weight(run: Run, states: tuple[str, ...], found: list[list[float]]) -> dict[str, float] | None:
+    last = [one for one in found[-max(1, round(run.config.rate)) :] if len(one) == len(states)]
+    return dict(zip(states, np.mean(last, axis=0).tolist(), strict=True)) if last else None
 
 
 def _spread(values: list[float]) -> Spread | None:

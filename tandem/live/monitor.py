@@ -16,13 +16,15 @@ from node_runtime.config.sections import Config
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
-from run_log.reporting.summary import SOFT
+from run_log.reporting.summary import ADDS, ADDS_NOTHING, SOFT
 from tandem.live.presence import SILENT_S, Presence
 
 RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
 TREND_SECONDS = 40
 EVENTS = 10
+# Until it is said that learning adds nothing.
+PATIENCE_S, PATIENCE_TICKS = 3.0, 10
 
 # Of no use here, and large: not even decoded.
 UNSEEN = (topics.KEYFRAME, topics.SETS, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
@@ -106,6 +108,11 @@ class Snapshot:
     tick_ms: tuple[float, float] | None = None
     prediction_error: float | None = None
     """Mean of the last second."""
+    counts: float | None = None
+    """What of the network, or of the constant beside it, counts in the prediction of some state: the most; None where
+    nothing weighs it."""
+    adds_nothing: bool = False
+    """Whether it has been nearly nothing for seconds."""
     trend: tuple[float, ...] = ()
     """Mean prediction error of each second so far, the newest last."""
     weights_version: int = -1
@@ -146,6 +153,9 @@ class Monitor:
         self._errors: deque[tuple[float, float]] = deque(maxlen=RECENT_TICKS)
         self._trend: deque[float] = deque(maxlen=TREND_SECONDS)
         self._trend_second = self._first_slot = self._outside_now = 0
+        self._counted: float | None = None
+        """When h_hat last counted, or was first weighed."""
+        self._patience = max(PATIENCE_S, PATIENCE_TICKS * config.period)
         self._events: deque[Event] = deque(maxlen=EVENTS)
         self._new_events: deque[Event] = deque(maxlen=200)
         self._bad_elsewhere: dict[tuple[str, str], int] = {}
@@ -235,6 +245,8 @@ class Monitor:
         if result.reference_verdict != "none":
             taken = result.reference_verdict == "taken"
             self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
+        if result.weight:
+            self._take_weight(max(result.weight + result.constant_weight), tick, now)
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1
@@ -258,6 +270,16 @@ class Monitor:
         for name in before.keys() - told.keys():
             self.say(f"tick {result.seq}: sensor {name} is believed again", now, "good")
         self._seen.sensor_faults = {name: before.get(name, text) for name, text in told.items()}
+
+    def _take_weight(self, weight: float, tick: str, now: float) -> None:
+        seen = self._seen
+        seen.counts = weight
+        if weight >= ADDS or self._counted is None:
+            self._counted = now
+        nothing = now - self._counted > self._patience
+        if nothing != seen.adds_nothing:
+            seen.adds_nothing = nothing
+            self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning counts again'}", now)
 
     def _take_margin(self, result: m.TickResult, now: float) -> None:
         margin = result.set_margin

@@ -10,6 +10,7 @@ from rich.panel import Panel
 from rich.table import Column, Table
 from rich.text import Text
 
+from run_log.reporting.summary import ADDS_NOTHING
 from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
@@ -73,6 +74,8 @@ def line(now: Snapshot) -> str:
         parts.append(f"solve p50 {now.solve_ms[0]:.1f} p99 {now.solve_ms[1]:.1f} ms")
     if now.prediction_error is not None:
         parts.append(f"error {now.prediction_error:.1e}")
+    if now.adds_nothing:
+        parts.append(ADDS_NOTHING)
     parts.append(
         f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused, {now.rolled_back} rolled back)"
     )
@@ -243,7 +246,7 @@ def _learning(now: Snapshot, width: int) -> Table:
     loss = "-" if now.loss is None else f"{now.loss[0]:.2e} → {now.loss[1]:.2e}"
     return _pairs(
         [
-            ("pred. error", Text(error)),
+            ("pred. error", Text.assemble(error, "   ", _weight(now))),
             ("each second", spark(now.trend, max(4, width - 18))),
             ("weights", Text(f"version {_version(now)}   {now.adopted} adopted")),
             ("refused", _counted(now.refused, "sets")),
@@ -253,6 +256,13 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("bad messages", _counted(now.bad_messages, "not obeyed")),
         ]
     )
+
+
+def _weight(now: Snapshot) -> tuple[str, str]:
+    """What of h_hat counts, in words, and their style."""
+    if now.counts is None:
+        return "", "default"
+    return ("adds nothing", "bold yellow") if now.adds_nothing else (f"counts {now.counts:.0%}", "default")
 
 
 def spark(values: Sequence[float], cells: int) -> Text:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
+
+import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
 from controller_node.core import ControllerCore
 from lbmpc.plants import get_plant
@@ -14,6 +18,7 @@ from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow, simulate
+from tandem.summary_table import table
 
 PLANT = get_plant("moore_greitzer")
 SETTINGS = [
@@ -63,6 +68,30 @@ def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
     assert all(sample.variance == [] for sample in exact.samples)
     assert not any(name.startswith("estimator") for name in exact.keyframes[0].arrays)
     assert "oracle.evidence" not in exact.keyframes[0].arrays
+
+
+def test_a_result_says_what_of_the_network_counts_and_how_well_the_state_is_known(lossy: Run) -> None:
+    after = [result for result in lossy.results if result.seq >= 5]
+    deviations = np.array([result.deviation for result in after])
+    # Better than one sample, worse where there was none.
+    known = np.array([lossy.ticks[result.seq].state is not None for result in after])
+    assert (deviations[known] < 0.01 * PLANT.x_scale).all()
+    assert deviations[~known].mean() > deviations[known].mean()
+    for result in after:
+        for weight in (result.weight, result.constant_weight):
+            assert len(weight) == 4
+            assert all(0.0 <= share <= 1.0 for share in weight)
+    assert any(max(result.weight + result.constant_weight) > 0.0 for result in after)
+    summary = summarise(lossy)
+    last = np.mean([result.weight for result in lossy.results[-20:]], axis=0)
+    assert summary.weight == pytest.approx(dict(zip(PLANT.states, last, strict=True)))
+    console = Console(width=200, file=io.StringIO())
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.01})))
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.4})))
+    assert console.file.getvalue().count("noise exceeds h") == 1
+    exact = simulate(config("estimator.kind=none"), 3)
+    assert all(not (r.weight or r.constant_weight or r.deviation) for r in exact.results)
+    assert summarise(exact).weight is None
 
 
 def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) -> None:
