@@ -12,8 +12,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from lbmpc.plants import Description
+from plant_sim.hand import Hand, HandVerdict
 from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
-from protocol.messages import Backup, Command, InputSource, Piece, PlantState
+from plant_sim.way_back import WayBack
+from protocol.messages import Backup, Command, InputSource, Override, Piece, PlantState
 
 Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 JITTER = 0.1
@@ -49,16 +51,26 @@ class _Acting:
 class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
-    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
+    In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
     begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
-    def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
+    def __init__(
+        self,
+        plant: Description,
+        period: float,
+        patience: float,
+        run_id: str,
+        held: bool,
+        way_back: WayBack | None = None,
+    ):
         """patience: periods without a command before the plan goes on.
 
         held: the plant stands still until the first command that answers one of its samples; else the safe input acts.
+        way_back: whether an input by hand may act; None: none does.
         """
         self.plant = plant
+        self.hand = Hand(plant, way_back)
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
         self._first: float | None = None
@@ -122,6 +134,13 @@ class Shield:
                 return "ok"
         return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
 
+    def override(self, override: Override, t: float) -> HandVerdict:
+        """Let a person's input act from the next sample on, before all others, or no more; it arrived at time t.
+
+        It must have the plant's dimensions. See `plant_sim.hand` for when it ends.
+        """
+        return self.hand.take(override, t)
+
     def jump(self) -> None:
         """From the next sample on the state is another one than the last inputs led to: a new origin, a fresh start.
 
@@ -150,9 +169,11 @@ class Shield:
         And what was not written for a period is written again: a machine's own watchdog may wait for it, and where the
         last write failed the next one may not.
         """
+        self.hand.look(x)
         written, self._written = self._written, False
         acting = self._tape[-1]
-        if (self._held and self._orders is None) or (written and acting.source == "command"):
+        stands = self._held and self._orders is None and acting.source == "hold"
+        if (stands or (written and acting.source == "command")) and self.hand.input(t) is None:
             return
         drive = self._drive(t, lambda: x)
         same = acting.u is not None and np.array_equal(drive.u, acting.u)
@@ -166,6 +187,8 @@ class Shield:
         return None if self._held else within(self.plant, self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
+        if (u := self.hand.input(t)) is not None:
+            return Drive(u, "manual", self.hand.until)
         orders = self._orders
         if orders is None:
             return safe_drive(self.plant, measure, math.inf)
@@ -224,6 +247,7 @@ class Shield:
         """Of what was before t only the input that acts is still true."""
         self._jumped, self._epoch, self._measured = False, self._seq, -math.inf
         self._pending, self._standby = [], {}
+        self.hand.end("the state is another one")
         if self._orders is not None:
             self._orders = self._before_jump = self._orders.without_plan()
         self._tape = [replace(self._tape[-1], since=t)]

@@ -8,8 +8,10 @@ import math
 import numpy as np
 
 from lbmpc.plants import Description, PlantError, TrueMotion
+from plant_sim.hand import Hand, HandVerdict
 from plant_sim.shield import Shield, Verdict
-from protocol.messages import Backup, Command, PlantState
+from plant_sim.way_back import WayBack
+from protocol.messages import Backup, Command, Override, PlantState
 
 
 class Motion:
@@ -92,9 +94,13 @@ class PlantSim:
         x0: np.ndarray,
         plan_patience: float,
         run_id: str,
+        way_back: WayBack | None = None,
     ):
-        """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on."""
-        self._shield = Shield(plant, period, plan_patience, run_id, held=True)
+        """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on.
+
+        way_back: whether an input by hand may act; None: none does.
+        """
+        self._shield = Shield(plant, period, plan_patience, run_id, True, way_back)
         self._motion = Motion(truth, x0, period)
 
     def change(self, truth: TrueMotion) -> None:
@@ -108,6 +114,15 @@ class PlantSim:
     def backup(self, backup: Backup) -> Verdict:
         """See `Shield.backup`."""
         return self._shield.backup(backup)
+
+    def override(self, override: Override, t: float) -> HandVerdict:
+        """See `Shield.override`."""
+        return self._shield.override(override, t)
+
+    @property
+    def hand(self) -> Hand:
+        """Who drives it by hand, and why nobody does any more."""
+        return self._shield.hand
 
     def look(self, t: float) -> PlantState:
         """What `sample` would say at t; nothing changes. Raises as `sample` does."""

@@ -1,0 +1,93 @@
+"""A hand on the switch: an input that a person commands, while they say so and the plant stays in X. No clock, no I/O.
+
+The messages of one sender are one intention. Its message number 0 begins it and takes over from whoever's was there,
+those behind it renew it or give another input. It ends when it says so itself, when another begins, when the lease of
+its last message is over, when the state is another one (a new origin), and where the plant would leave X. What ended
+does not come back: a renewal that arrives too late is refused, also by a gateway that was started again meanwhile.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from lbmpc.plants import Description
+from plant_sim.orders import within
+from plant_sim.way_back import WayBack
+from protocol.messages import Override
+
+HandVerdict = Literal["ok", "out of order", "ended", "no model"]
+
+LEASE_OVER = "the lease is over"
+
+
+class Hand:
+    """Whose input acts, and until when. Times in seconds."""
+
+    def __init__(self, plant: Description, way_back: WayBack | None):
+        """way_back: what is asked at every sample; None: nobody may take over by hand."""
+        self._plant, self._way_back = plant, way_back
+        self._said: Override | None = None
+        self._wanted = np.zeros(plant.m)
+        self._u: np.ndarray | None = None
+        self.until = np.inf
+        """When the lease is over; infinite where nobody has the hand on it."""
+        self.ended = ""
+        """Why their input acts no more, for a person; empty while it does, and where they gave it back."""
+
+    @property
+    def run_id(self) -> str:
+        """Of the last who said anything; empty before that."""
+        return "" if self._said is None else self._said.run_id
+
+    @property
+    def acts(self) -> bool:
+        """Whether somebody has taken over, from the next sample on at the latest."""
+        return self.until < np.inf
+
+    def take(self, override: Override, t: float) -> HandVerdict:
+        """What arrived at time t, with the plant's dimensions (`check_dimensions`)."""
+        last = self._said
+        own = last is not None and override.run_id == last.run_id
+        if self._way_back is None:
+            return "no model"
+        if last is not None and own and override.seq < last.seq:
+            return "out of order"
+        if not own and override.seq != 0:
+            return "ended"
+        if override.mode == "auto":
+            self._said = override
+            self.end("" if own else f"{override.run_id} gave it back")
+            return "ok"
+        if own and not self.acts:
+            return "ended"
+        if not own:
+            self._way_back.begin()
+        self._said, self.ended = override, ""
+        self._wanted, self.until = within(self._plant, override.u), t + override.lease
+        return "ok"
+
+    def end(self, why: str) -> None:
+        """From now on it is for others to say what acts."""
+        if self.acts:
+            self._u, self.until, self.ended = None, np.inf, why
+
+    def input(self, t: float) -> np.ndarray | None:
+        """The input, (m,), that acts by hand at time t; None: none does."""
+        if t >= self.until:
+            self.end(LEASE_OVER)
+        return self._u
+
+    def look(self, x: np.ndarray | None) -> None:
+        """At a sample: what was said since the last acts from now on, unless there is no way back inside X behind it.
+
+        x: the state, (d,), plant units; None: it was not measured.
+        """
+        if not self.acts or self._way_back is None:
+            return
+        why = self._way_back.lost(x, self._wanted)
+        if why:
+            self.end(why)
+        else:
+            self._u = self._wanted
