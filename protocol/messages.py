@@ -25,12 +25,16 @@ Sequence = Annotated[int, msgspec.Meta(ge=-1, le=LARGEST)]
 RunId = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Digest = Annotated[str, msgspec.Meta(max_length=64)]
 
-InputSource = Literal["hold", "command", "plan", "safe"]
-"""What drove the plant: held at x0, a fresh command, the backup policy or else the last plan, the local safe input."""
+InputSource = Literal["hold", "command", "plan", "safe", "manual"]
+"""What drove the plant: held at x0, a fresh command, the backup policy or else the last plan, the local safe input, a
+person."""
 CommandMode = Literal["solver", "shifted_plan", "feedback"]
 StateVerdict = Literal["fresh", "stale", "missing"]
 WeightsOutcome = Literal["none", "adopted", "refused"]
 TargetStatus = Literal["none", "reached", "nearest", "no rest"]
+ReferenceKind = Literal["set", "hold", "configured"]
+"""set: outputs go to values; hold: the plant stays where it is, as far as it can rest there; configured: what the
+configuration says."""
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
 
 
@@ -142,6 +146,39 @@ class HiddenWeights(Message, frozen=True):
     """Hidden layer i as (1 + n_{i-1}, n_i); the first row is the bias."""
 
 
+MOST_POINTS = 1000
+Lease = Annotated[float, msgspec.Meta(gt=0, le=60)]
+"""Seconds for which a person's word counts that is not said again."""
+
+
+class Reference(Message, frozen=True):
+    """Where the plant shall go, from the tick on that latches it.
+
+    From where the reference is then it leads in a straight line to the first point, and from point to point. It stays
+    at the last. Two points of one time are a jump. To say it again in time is a lease; it is not followed from its
+    beginning again then.
+    """
+
+    kind: ReferenceKind = "set"
+    outputs: list[str] = []
+    """Names of the states that are outputs; with `set` only."""
+    times: Annotated[list[float], msgspec.Meta(max_length=MOST_POINTS)] = []
+    """Of the points, seconds from that tick on, none of them less than the one before."""
+    values: Annotated[list[list[float]], msgspec.Meta(max_length=MOST_POINTS)] = []
+    """(points, outputs), plant units."""
+    lease: Lease | None = None
+    """After so long without a repetition the configured reference is back; None: it stays."""
+
+
+class Override(Message, frozen=True):
+    """A hand on the plant's input. It counts until `auto`, or until its lease is over."""
+
+    mode: Literal["manual", "auto"]
+    u: list[float] = []
+    """(m,), plant units; with `manual` only."""
+    lease: Lease = 1.0
+
+
 class Tick(Message, frozen=True):
     """All that one control step depends on: the latched inputs and every verdict that depended on time."""
 
@@ -160,6 +197,8 @@ class Tick(Message, frozen=True):
     """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
     truth: dict[str, float] = msgspec.field(default_factory=dict)
     """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
+    reference: Reference | msgspec.UnsetType = msgspec.UNSET
+    """That arrived since the tick before, the last of several; unset, and no byte, where there was none."""
 
 
 class TickResult(Message, frozen=True):

@@ -9,17 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protocol import topics
-from protocol.topics import Topic
+from protocol.topics import COMMANDER, Topic
 
 OPERATOR = "operator"
 """Whoever looks: `tandem health`, a live view. It publishes nothing."""
-ROLES = (*topics.PROCESSES, OPERATOR)
-READS_ALL = ("recorder", OPERATOR)
+ROLES = (*topics.PROCESSES, OPERATOR, COMMANDER)
+READS_ALL = ("recorder", OPERATOR, COMMANDER)
 QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
 
 _READS: dict[str, tuple[Topic, ...]] = {
-    "controller": (topics.PLANT_STATE, topics.HIDDEN_WEIGHTS),
-    "plant": (topics.COMMAND, topics.BACKUP),
+    "controller": (topics.PLANT_STATE, topics.HIDDEN_WEIGHTS, topics.REFERENCE),
+    "plant": (topics.COMMAND, topics.BACKUP, topics.OVERRIDE),
     "trainer": (topics.SAMPLES, topics.OUTPUT_WEIGHTS),
 }
 _ASKS: dict[str, tuple[str, ...]] = {"trainer": QUERIES}
@@ -69,7 +69,7 @@ def rights_of(role: str) -> Rights:
 
 def role_of(process: str) -> str:
     """The role in which a process of this name speaks: its own, or the operator's."""
-    return process if process in topics.PROCESSES else OPERATOR
+    return process if process in (*topics.PROCESSES, COMMANDER) else OPERATOR
 
 
 def common_name(role: str, plant: str) -> str:

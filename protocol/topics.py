@@ -17,6 +17,8 @@ Lane = Literal["control", "bulk"]
 PREFIX = "tandem"
 DIRECT = "@direct"
 PROCESSES = ("router", "plant", "controller", "trainer", "recorder")
+COMMANDER = "commander"
+"""Whoever says where the plant shall go, and takes it by hand."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ OUTPUT_WEIGHTS = Topic(
 KEYFRAME = Topic("controller/keyframe", m.Keyframe, "bulk", "controller", 4 * WEIGHTS_LIMIT)
 SETS = Topic("controller/sets", m.CertifiedSets, "bulk", "controller", WEIGHTS_LIMIT)
 HIDDEN_WEIGHTS = Topic("trainer/hidden_weights", m.HiddenWeights, "bulk", "trainer", WEIGHTS_LIMIT)
+REFERENCE = Topic("operator/reference", m.Reference, "control", COMMANDER, 256 * 1024)
+OVERRIDE = Topic("operator/override", m.Override, "control", COMMANDER)
 BATCH = {
     name: Topic(f"{name}/batch", m.Batch, "bulk", name, 4 * WEIGHTS_LIMIT) for name in ("plant", "controller")
 }
@@ -100,6 +104,8 @@ ALL: tuple[Topic, ...] = (
     KEYFRAME,
     SETS,
     HIDDEN_WEIGHTS,
+    REFERENCE,
+    OVERRIDE,
     *BATCH.values(),
     *RUN_INFO.values(),
     *HEALTH.values(),

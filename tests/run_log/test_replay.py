@@ -272,6 +272,16 @@ def test_bytes_count_even_where_fields_agree(run: Run) -> None:
     assert (first.tick, first.field) == (5, "command (byte 1)")
 
 
+def test_a_result_of_a_version_before_a_field_replays_where_the_field_is_at_its_default(run: Run) -> None:
+    entries = list(run.entries(topics.RESULT))
+    for i, entry in enumerate(entries):
+        tree = msgspec.msgpack.decode(entry.payload)
+        del tree["target_distance"]
+        entries[i] = Entry(entry.log_time, msgspec.msgpack.encode(tree), entry.message)
+    run.streams[topics.RESULT.name] = entries
+    assert replay(run).first_difference is None
+
+
 def test_difference_sees_signs_of_zero_and_types() -> None:
     assert first_difference([0.0], [0.0], "x") is None
     assert first_difference([0.0], [-0.0], "x") == ("x[0]", 0.0, -0.0)

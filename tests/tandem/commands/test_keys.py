@@ -203,6 +203,7 @@ def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
         f"tandem/jet1/trainer/{name}" for name in ("hidden_weights", "run_info", "health")
     }
     assert publishes["operator"] == set()
+    assert publishes["commander"] == {f"tandem/jet1/operator/{name}" for name in ("reference", "override")}
     assert publishes["recorder"] == {"tandem/jet1/recorder/run_info", "tandem/jet1/recorder/health"}
     asked = [role for role in rights.ROLES if rights.rights_of(role).asks]
     answered = [role for role in rights.ROLES if rights.rights_of(role).answers]
