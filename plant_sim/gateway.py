@@ -37,6 +37,7 @@ from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual
+from plant_sim.hand import NO_LONGER
 from plant_sim.machine import Guarded, Read, Write
 from plant_sim.shield import Shield
 from plant_sim.way_back import way_back_of
@@ -201,7 +202,7 @@ class _Loop:
         if self._source == "manual":
             note += f" ({hand.run_id})"
         elif hand.ended:
-            note = "; ".join(filter(None, (note, f"no longer driven by hand: {hand.ended}")))
+            note = "; ".join(filter(None, (note, f"{NO_LONGER}{hand.ended}")))
         status: ProcessStatus = "failed" if trouble else "running" if moving else "ready"
         self._health.set(status, "; ".join(filter(None, (trouble, note))))
 

@@ -14,12 +14,14 @@ import numpy as np
 
 from lbmpc.plants import Description
 from plant_sim.orders import within
-from plant_sim.way_back import WayBack
+from plant_sim.way_back import Ahead, WayBack
 from protocol.messages import Override
 
 HandVerdict = Literal["ok", "out of order", "ended", "no model"]
 
 LEASE_OVER = "the lease is over"
+NO_LONGER = "no longer driven by hand: "
+"""So a gateway's health begins to say why, in `Hand.ended`."""
 
 
 class Hand:
@@ -31,6 +33,7 @@ class Hand:
         self._said: Override | None = None
         self._wanted = np.zeros(plant.m)
         self._u: np.ndarray | None = None
+        self._ahead: Ahead | None = None
         self.until = np.inf
         """When the lease is over; infinite where nobody has the hand on it."""
         self.ended = ""
@@ -57,13 +60,11 @@ class Hand:
         if not own and override.seq != 0:
             return "ended"
         if override.mode == "auto":
-            self._said = override
+            self._said, self.ended = override, ""
             self.end("" if own else f"{override.run_id} gave it back")
             return "ok"
         if own and not self.acts:
             return "ended"
-        if not own:
-            self._way_back.begin()
         self._said, self.ended = override, ""
         self._wanted, self.until = within(self._plant, override.u), t + override.lease
         return "ok"
@@ -71,7 +72,7 @@ class Hand:
     def end(self, why: str) -> None:
         """From now on it is for others to say what acts."""
         if self.acts:
-            self._u, self.until, self.ended = None, np.inf, why
+            self._u, self._ahead, self.until, self.ended = None, None, np.inf, why
 
     def input(self, t: float) -> np.ndarray | None:
         """The input, (m,), that acts by hand at time t; None: none does."""
@@ -82,12 +83,15 @@ class Hand:
     def look(self, x: np.ndarray | None) -> None:
         """At a sample: what was said since the last acts from now on, unless there is no way back inside X behind it.
 
-        x: the state, (d,), plant units; None: it was not measured.
+        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it.
         """
-        if not self.acts or self._way_back is None:
+        way_back = self._way_back
+        if not self.acts or way_back is None:
             return
-        why = self._way_back.lost(x, self._wanted)
+        now = self._ahead if x is None else way_back.of(x)
+        ahead = None if now is None else way_back.after(now, self._wanted)
+        why = "the state is not measured" if ahead is None else way_back.lost(ahead)
         if why:
             self.end(why)
         else:
-            self._u = self._wanted
+            self._u, self._ahead = self._wanted, ahead

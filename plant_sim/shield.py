@@ -51,8 +51,8 @@ class _Acting:
 class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
-    In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
-    begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a
+    period, `renew` begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
     """
 
     def __init__(

@@ -100,6 +100,7 @@ class PlantSim:
 
         way_back: whether an input by hand may act; None: none does.
         """
+        self._way_back = way_back
         self._shield = Shield(plant, period, plan_patience, run_id, True, way_back)
         self._motion = Motion(truth, x0, period)
 
@@ -126,8 +127,8 @@ class PlantSim:
 
     def look(self, t: float) -> PlantState:
         """What `sample` would say at t; nothing changes. Raises as `sample` does."""
-        # Shared are the two that keep nothing.
-        shared = {id(one): one for one in (self._shield.plant, self._motion.truth)}
+        # Shared is what keeps nothing.
+        shared = {id(one): one for one in (self._shield.plant, self._motion.truth, self._way_back)}
         return copy.deepcopy(self, shared).sample(t)
 
     def sample(self, t: float) -> PlantState:

@@ -13,6 +13,8 @@ the way back itself is in the margin alone, and asked anew at the next sample.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lbmpc.model import Model, ModelError, build_model
@@ -24,8 +26,15 @@ RAMP = 4
 """Steps over which the margin grows, as that of `lbmpc.controller.backup_policy` does."""
 
 
+class Ahead(NamedTuple):
+    """Where the model expects the plant, in deviations, and by how much each state may be elsewhere: (d,) both."""
+
+    z: np.ndarray
+    spread: np.ndarray
+
+
 class WayBack:
-    """For one plant; all numbers in plant units.
+    """For one plant; it keeps nothing.
 
     Args:
         model: of the plant, at its period.
@@ -46,38 +55,29 @@ class WayBack:
         for _ in range(steps - 1):
             powers.append(model.closed_loop @ powers[-1])
         self._spread = np.abs(np.array(powers))
-        self._after: tuple[np.ndarray, np.ndarray] | None = None
 
-    def begin(self) -> None:
-        """Forget what was predicted: what acts is somebody else's."""
-        self._after = None
+    def of(self, x: np.ndarray) -> Ahead:
+        """Where a measured state, (d,), is."""
+        return Ahead(x - self._model.plant.x_e, np.zeros(self._model.d))
 
-    def lost(self, x: np.ndarray | None, u: np.ndarray) -> str:
-        """What keeps the input u, (m,), from acting for one more period, for a person; empty where nothing does.
+    def after(self, now: Ahead, u: np.ndarray) -> Ahead:
+        """A period later, under the input u, (m,)."""
+        model = self._model
+        return Ahead(model.step(now.z, u - model.plant.u_e), self._absolute @ now.spread + self._w)
 
-        x: the state now, (d,); None: not measured, and what the last call predicted stands for it, with what the model
-        may have missed since.
-        """
-        plant, model = self._model.plant, self._model
-        if x is not None:
-            z, spread = x - plant.x_e, np.zeros(model.d)
-        elif self._after is not None:
-            z, spread = self._after
-        else:
-            return "the state is not measured"
+    def lost(self, there: Ahead) -> str:
+        """What leaves X on the way back from there, for a person; empty where nothing does."""
+        model, z = self._model, there.z
         with np.errstate(over="ignore", invalid="ignore"):
-            z, spread = model.step(z, u - plant.u_e), self._absolute @ spread + self._w
-            self._after = z, spread
-            beside = self._spread @ spread
+            beside = self._spread @ there.spread
             low, high = self._low + beside, self._high - beside
             for i in range(len(low)):
-                # Also where it is no number.
+                # A number that is none is not inside.
                 inside = (z >= low[i]) & (z <= high[i])
                 if not inside.all():
-                    state = plant.states[int(np.argmin(inside))]
+                    state = model.plant.states[int(np.argmin(inside))]
                     return f"{state} would leave X within {(i + 1) * model.period:.3g} s"
-                v = np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high)
-                z = model.step(z, v)
+                z = model.step(z, np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high))
         return ""
 
 

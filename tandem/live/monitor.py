@@ -172,7 +172,7 @@ class Monitor:
                 self.say(f"{error}; not obeyed", now, "bad")
             return
         follower = self._followers.setdefault(topic.name, Follower(self.config.bus.follow_silence))
-        verdict = follower.accept(message.run_id, message.seq, now)
+        verdict = "ok" if topic.shared else follower.accept(message.run_id, message.seq, now)
         if verdict == "ok":
             self._take(message, now)
         else:
