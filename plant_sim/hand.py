@@ -35,7 +35,8 @@ class Hand:
         self._u: np.ndarray | None = None
         self._ahead: Ahead | None = None
         self.until = np.inf
-        """When the lease is over; infinite where nobody has the hand on it."""
+        """When it is over if nothing else is said; infinite where nobody has the hand on it."""
+        self._given_back: str | None = None
         self.ended = ""
         """Why their input acts no more, for a person; empty while it does, and where they gave it back."""
 
@@ -47,7 +48,7 @@ class Hand:
     @property
     def acts(self) -> bool:
         """Whether somebody has taken over, from the next sample on at the latest."""
-        return self.until < np.inf
+        return self.until < np.inf and self._given_back is None
 
     def take(self, override: Override, t: float) -> HandVerdict:
         """What arrived at time t, with the plant's dimensions (`check_dimensions`)."""
@@ -60,24 +61,25 @@ class Hand:
         if not own and override.seq != 0:
             return "ended"
         if override.mode == "auto":
+            if self.acts:
+                self.until, self._given_back = t, "" if own else f"{override.run_id} gave it back"
             self._said, self.ended = override, ""
-            self.end("" if own else f"{override.run_id} gave it back")
             return "ok"
         if own and not self.acts:
             return "ended"
-        self._said, self.ended = override, ""
+        self._said, self.ended, self._given_back = override, "", None
         self._wanted, self.until = within(self._plant, override.u), t + override.lease
         return "ok"
 
     def end(self, why: str) -> None:
         """From now on it is for others to say what acts."""
-        if self.acts:
-            self._u, self._ahead, self.until, self.ended = None, None, np.inf, why
+        if self.until < np.inf:
+            self._u, self._ahead, self._given_back, self.until, self.ended = None, None, None, np.inf, why
 
     def input(self, t: float) -> np.ndarray | None:
         """The input, (m,), that acts by hand at time t; None: none does."""
         if t >= self.until:
-            self.end(LEASE_OVER)
+            self.end(LEASE_OVER if self._given_back is None else self._given_back)
         return self._u
 
     def look(self, x: np.ndarray | None) -> None:

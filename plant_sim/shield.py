@@ -52,7 +52,8 @@ class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
     In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a
-    period, `renew` begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    period, `renew` begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for
+    a real one.
     """
 
     def __init__(
@@ -94,7 +95,8 @@ class Shield:
     @property
     def due(self) -> float:
         """When `advance` has something to do next, if nothing else arrives; infinite where never."""
-        return min(self._until, self._pending[0].arrived) if self._pending else self._until
+        until = min(self._until, self.hand.until)
+        return min(until, self._pending[0].arrived) if self._pending else until
 
     # -- what is obeyed ----------------------------------------------------------------------------------
 
@@ -188,7 +190,7 @@ class Shield:
 
     def _drive(self, t: float, measure: Measure) -> Drive:
         if (u := self.hand.input(t)) is not None:
-            return Drive(u, "manual", self.hand.until)
+            return Drive(u, "manual", math.inf)
         orders = self._orders
         if orders is None:
             return safe_drive(self.plant, measure, math.inf)
