@@ -26,7 +26,7 @@ from lbmpc.model import Model
 from lbmpc.plants import PLANTS, Plant
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
-from lbmpc.sets.motion import over_any_delay
+from lbmpc.sets.motion import over_any_delay, require_no_dead_time
 from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
@@ -278,8 +278,12 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     """The file that `controller.sets` names, or what the cache or this installation has for this very model.
 
     Raises:
-        ConfigError: there is none, it was edited, or it is about another model.
+        ConfigError: there is none, it was edited, it is about another model, or the plant has a dead time.
     """
+    try:
+        require_no_dead_time(model)
+    except CertificateError as error:
+        raise ConfigError(f"controller.tightening = 'invariant': {error}") from error
     named = config.controller.sets
     if named is not None:
         try:

@@ -21,6 +21,11 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
     Raises:
         ConfigError: `invariant`, and there are no sets for it.
     """
+    if model.plant.dead_time and config.controller.tightening in ("first_step", "tube"):
+        return (
+            f"guaranteed: nothing; {config.controller.tightening} tightens by what W does in a period, and not in the "
+            f"dead time of {model.plant.dead_time:g} s as well, over which the state is predicted"
+        )
     match config.controller.tightening:
         case "none":
             return "guaranteed: nothing; the constraints of the nominal prediction are not tightened"

@@ -101,6 +101,8 @@ class Memory:
             "rate": f"{self._config.rate:g} Hz",
             "oracle": self._config.controller.oracle,
         }
+        if plant.dead_time:
+            words["dead time"] = f"{plant.dead_time!r} s"
         truth = self._config.plant.truth
         if isinstance(truth, str):
             words["truth"] = truth

@@ -108,6 +108,8 @@ class ControllerNode:
             self._settings.backup.enabled
             and self._period >= BACKUP_FROM
             and core.controller.estimator.sees_all
+            # Fed back behind a dead time, its stiff K may be unstable.
+            and not core.plant.dead_time
         )
         if self._backs_up:
             core.ready_backup()

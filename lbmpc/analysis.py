@@ -119,15 +119,20 @@ class Kept:
 
 
 def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float) -> Kept:
-    """The true motion from `start`, (d,), plant units, under the safe input and gain, renewed every period."""
+    """The true motion from `start`, (d,), plant units, under the safe input and gain, renewed every period.
+
+    What is fed back acts a dead time later, in whole periods, and before it the safe input without its gain.
+    """
     plant, x = model.plant, np.array(start, dtype=float)
+    coming = [plant.safe_input] * math.ceil(plant.dead_time / model.period - 1e-9)
     steps = max(1, round(seconds / model.period))
     for k in range(steps + 1):
         outside = np.flatnonzero((x < plant.x_min) | (x > plant.x_max))
         if outside.size:
             return Kept(k * model.period, plant.states[int(outside[0])])
         try:
-            x = step(x, plant.safe_input_at(x), model.period)
+            coming.append(plant.safe_input_at(x))
+            x = step(x, coming.pop(0), model.period)
         except PlantError as error:
             return Kept(k * model.period, str(error))
     return Kept(steps * model.period, "")

@@ -24,6 +24,8 @@ SAME_PERIOD = 1e-9
 """How far apart, as a share, two periods are that are the same: one over a rate is rounded."""
 LARGEST_GROWTH = 1e8
 """Of a prediction over the horizon: of 16 digits half are left."""
+MOST_DEAD_PERIODS = 50
+"""Periods of dead time: over more a prediction says little, and each is remembered and predicted in every tick."""
 STABLE = 1e-9
 """How far above 0 rounding may leave a growth a step."""
 
@@ -144,6 +146,11 @@ def build_model(
     except PlantDefinitionError as error:
         raise ModelError(str(error)) from error
     known = plant if isinstance(plant, Known) else plant.known()
+    if known.dead_time > (MOST_DEAD_PERIODS + SAME_PERIOD) * period:
+        raise ModelError(
+            f"{plant.name}: its dead time of {known.dead_time:g} s is {known.dead_time / period:.4g} periods, and "
+            f"{MOST_DEAD_PERIODS} is the most: take a rate of {MOST_DEAD_PERIODS / known.dead_time:.3g} Hz or less"
+        )
     units = balanced(known)
     A, B = _of_a_period(known, period, units)
     q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)

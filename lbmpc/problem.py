@@ -27,7 +27,7 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.terminal import terminal_set
 from lbmpc.sets.invariance.tube import tighten, tube_margins
-from lbmpc.sets.motion import require_prediction
+from lbmpc.sets.motion import require_no_dead_time, require_prediction
 
 Tightening = Literal["none", "first_step", "tube", "invariant"]
 
@@ -73,11 +73,12 @@ def build_problem(
     Raises:
         ModelError: the plant runs away within the horizon.
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
-        CertificateError: `invariant` without a certificate, or with that of another model.
+        CertificateError: `invariant` without a certificate, with that of another model, or with a dead time.
     """
     require_horizon(model, horizon)
     guard = None
     if tightening == "invariant":
+        require_no_dead_time(model)
         if certificate is None:
             raise CertificateError(
                 "the tightening `invariant` needs certified sets: tandem sets compute makes them"

@@ -8,6 +8,7 @@ does not come back: a renewal that arrives too late is refused, also by a gatewa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -82,18 +83,24 @@ class Hand:
             self.end(LEASE_OVER if self._given_back is None else self._given_back)
         return self._u
 
-    def look(self, x: np.ndarray | None) -> None:
+    def look(self, x: np.ndarray | None, written: Sequence[np.ndarray] = ()) -> None:
         """At a sample: what was said since the last acts from now on, unless there is no way back inside X behind it.
 
-        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it.
+        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it. written: the
+        inputs, (m,), that are on their way through the plant's dead time, one a period, the oldest first.
         """
         way_back = self._way_back
         if not self.acts or way_back is None:
             return
         now = self._ahead if x is None else way_back.of(x)
-        ahead = None if now is None else way_back.after(now, self._wanted)
-        why = "the state is not measured" if ahead is None else way_back.lost(ahead)
-        if why:
+        if now is None:
+            self.end("the state is not measured")
+            return
+        first, *others = (*written, self._wanted)
+        self._ahead = there = way_back.after(now, first)
+        for u in others:
+            there = way_back.after(there, u)
+        if why := way_back.lost(there):
             self.end(why)
         else:
-            self._u, self._ahead = self._wanted, ahead
+            self._u = self._wanted

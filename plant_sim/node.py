@@ -8,7 +8,7 @@ import threading
 import numpy as np
 
 from lbmpc.plants import PlantError, get_plant, get_truth, true_motion
-from node_runtime.config.plant import initial_state, plant_of, true_plant_of
+from node_runtime.config.plant import initial_state, plant_of, true_dead_time, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import run_process
 from plant_sim.gateway import Gateway
@@ -22,7 +22,8 @@ log = logging.getLogger(__name__)
 def motion_of(config: Config) -> Motion:
     """How the plant that the configuration names really moves. Raises `ConfigError`."""
     plant, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
-    return Motion(true_motion(truth), initial_state(config, plant), config.period)
+    x0, dead_time = initial_state(config, plant), true_dead_time(config, plant, truth)
+    return Motion(true_motion(truth), x0, config.period, dead_time, plant.safe_input)
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -22,6 +23,9 @@ JITTER = 0.1
 """Share of a period by which the time between two measurements may differ from it: the error of a label is that share
 of what the plant moves in a period."""
 
+
+HAIR = 1e-9
+"""Of a period: two moments that are so near are one."""
 
 MOST_ACTED = 1000
 """Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
@@ -72,6 +76,9 @@ class Shield:
         """
         self.plant = plant
         self.hand = Hand(plant, way_back)
+        # What is on its way through the dead time, one a period.
+        dead = math.ceil(plant.dead_time / period - HAIR)
+        self._on_the_way = deque([plant.safe_input] * dead, maxlen=dead)
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
         self._first: float | None = None
@@ -171,7 +178,7 @@ class Shield:
         And what was not written for a period is written again: a machine's own watchdog may wait for it, and where the
         last write failed the next one may not.
         """
-        self.hand.look(x)
+        self.hand.look(x, self._on_the_way)
         written, self._written = self._written, False
         acting = self._tape[-1]
         stands = self._held and self._orders is None and acting.source == "hold"
@@ -234,6 +241,11 @@ class Shield:
             # Of older commands nothing is followed any more, but for the one before the last: see `_drive`.
             self._standby = {seq: one for seq, one in self._standby.items() if seq >= orders.seq - 1}
         self._t, self._measured = t, measured
+        if self._on_the_way.maxlen:
+            last = self._tape[-1].u
+            self._on_the_way.append(
+                np.array(applied) if applied else self.plant.safe_input if last is None else last
+            )
         return PlantState(
             run_id=self._run_id,
             seq=self._seq,

@@ -17,12 +17,22 @@ from protocol.messages import Backup, Command, Override, PlantState
 class Motion:
     """A `Machine` that moves as its truth says under what is written, at the times for which the calls are due.
 
-    It stands still at x0 until the first `write`. Times must not fall.
+    It stands still at x0 until the first `write`. What is written then acts, or what was there before until the dead
+    time is over. Times must not fall.
     """
 
-    def __init__(self, truth: TrueMotion, x0: np.ndarray, period: float):
-        """x0: (d,), plant units."""
+    def __init__(
+        self,
+        truth: TrueMotion,
+        x0: np.ndarray,
+        period: float,
+        dead_time: float = 0.0,
+        before: np.ndarray | None = None,
+    ):
+        """x0: (d,), plant units. before: (m,), what acts until the first input does; needed with a dead time."""
         self.truth = truth
+        self._dead_time, self._before = dead_time, before
+        self._coming: list[tuple[float, np.ndarray]] = []
         self._x = np.array(x0, dtype=float)
         self._period = period
         self._t = -math.inf
@@ -43,7 +53,10 @@ class Motion:
     def write(self, u: np.ndarray, due: float) -> float:
         """From that time on u, (m,), acts. Raises as `read` does."""
         self._go(due)
-        self._u, self._ahead = u, None
+        if self._u is None and self._dead_time:
+            self._u = self._before
+        self._coming.append((due + self._dead_time, u))
+        self._let_act(due)
         return due
 
     def look_ahead(self) -> None:
@@ -53,9 +66,28 @@ class Motion:
         # A hair of rounding must not make it the sample that was.
         samples = math.floor((self._t - self._first) / self._period + 1e-6) + 1
         t = self._first + samples * self._period
+        if self._coming and self._coming[0][0] < t:
+            # Another input takes over before.
+            return
         self._ahead = t, self._after(t)
 
     def _go(self, t: float) -> None:
+        while self._let_act(t):
+            pass
+        self._move(t)
+
+    def _let_act(self, t: float) -> bool:
+        """The next input takes over if it has to by time t; whether one did."""
+        # A switch that rounding puts a hair beside a sample is at the sample.
+        hair = 1e-9 * self._period
+        if not self._coming or self._coming[0][0] > t + hair:
+            return False
+        at, u = self._coming.pop(0)
+        self._move(t if at > t - hair else at)
+        self._u, self._ahead = u, None
+        return True
+
+    def _move(self, t: float) -> None:
         if t > self._t:
             if self._u is not None:
                 self._x = self._after(t)
@@ -94,15 +126,18 @@ class PlantSim:
         x0: np.ndarray,
         plan_patience: float,
         run_id: str,
+        dead_time: float = 0.0,
         way_back: WayBack | None = None,
     ):
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on.
 
+        dead_time: seconds, of the truth, from a command's arrival until it acts. Until the first does, the safe input
+            acts, without its gain.
         way_back: whether an input by hand may act; None: none does.
         """
         self._way_back = way_back
         self._shield = Shield(plant, period, plan_patience, run_id, True, way_back)
-        self._motion = Motion(truth, x0, period)
+        self._motion = Motion(truth, x0, period, dead_time, plant.safe_input)
 
     def change(self, truth: TrueMotion) -> None:
         """From the last sample on the true motion is another."""

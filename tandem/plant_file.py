@@ -20,6 +20,7 @@ COMMENTS = {
     "offset": "x+ - x at (x_e, u_e): Tandem takes the nearest point of rest for (x_e, u_e)",
     "W": "half-widths of what A and B leave out, per second",
     "period": "s: A and B hold at this rate only",
+    "dead_time": "s, from when an input is written until the plant begins to answer: A and B are what follows then",
 }
 """What a reader is told of a field, on the line before it."""
 
@@ -71,7 +72,8 @@ def shared_fields(known: Known) -> dict[str, Any]:
         *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
     )
     fields = {key: getattr(known, key) for key in names}
-    return fields | {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+    fields |= {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+    return fields | {"dead_time": known.dead_time or None}
 
 
 def _text(value: Any, indent: int) -> str:

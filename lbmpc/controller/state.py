@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from lbmpc.controller.dead_time import LineState
 from lbmpc.controller.fallback import Plan
 from lbmpc.estimator.base import EstimatorState
 from lbmpc.oracles.base import OracleState
@@ -29,6 +30,8 @@ class ControllerState:
     target: np.ndarray
     """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
     estimator: EstimatorState
+    line: LineState = field(default_factory=dict)
+    """What was written and has not acted yet, `lbmpc.controller.dead_time`; empty without a dead time."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -41,6 +44,7 @@ class ControllerState:
             "delay": np.array([self.delay]),
             **({"target": self.target} if self.target.size else {}),
             **{f"estimator.{name}": array for name, array in self.estimator.items()},
+            **{f"line.{name}": array for name, array in self.line.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
@@ -48,9 +52,9 @@ class ControllerState:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
         """Raises KeyError when an array is missing."""
         source, sequence = (int(value) for value in arrays["pending"])
-        oracle, estimator = (
+        oracle, estimator, line = (
             {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-            for prefix in ("oracle.", "estimator.")
+            for prefix in ("oracle.", "estimator.", "line.")
         )
         plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
@@ -62,4 +66,5 @@ class ControllerState:
             oracle,
             arrays.get("target", np.zeros(0)),
             estimator,
+            line,
         )

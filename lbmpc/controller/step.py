@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
+from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
 from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
@@ -86,6 +87,7 @@ class Controller:
         self._prepared_for: ControllerState | None = None
         self._prepared_target: SteadyState | None = None
         self.model: Model = problem.model
+        self.line = InputLine(self.model.plant, self.model.period)
         self._first_delay = self._acceptable(input_delay)
         guard = problem.guard
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
@@ -101,7 +103,8 @@ class Controller:
         s = self._with_past(oracle, nothing)
         target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
         memory = self.estimator.initial_state()
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory)
+        line = self.line.initial_state()
+        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, line)
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -117,16 +120,21 @@ class Controller:
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
-        """What to follow from the next period on if nothing else comes; None when this step followed no solution."""
-        if state.plan.left == 0:
+        """What to follow from the next period on if nothing else comes; None when this step followed no solution.
+
+        None with a dead time too: fed back so late, a stiff K may be unstable. The plan is what is followed there.
+        """
+        if state.plan.left == 0 or self.line.dead_time:
             return None
         theta, references = self.oracle.theta(state.oracle), self._references(state.target)
         return planner.policy(state.predicted, theta, state.plan.u, *references)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
-        estimator, seen, estimate = self._estimate(state, self._without_absurd(seen))
-        label, oracle = self._learn(state, seen, estimate)
+        written = self._without_absurd(seen)
+        line, acted = self.line.advance(state.line, written, state.delay)
+        estimator, seen, estimate = self._estimate(state, acted)
+        label, oracle = self._learn(state, seen, estimate, acted.known)
         rolled_back = ""
         if label is not None:
             oracle, rolled_back = self.oracle.confirm(oracle)
@@ -135,25 +143,25 @@ class Controller:
             oracle, verdict = self.oracle.adopt(oracle, seen.hidden)
         if seen.truth:
             oracle = self.oracle.told(oracle, seen.truth)
-        delay = self._delay(state.delay, seen)
-        start = self._when_it_acts(oracle, seen, delay)
+        delay = self._delay(state.delay, written)
+        start, there = self._when_it_acts(oracle, seen.x, acted, acting(written), delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
         # A prepared step goes on from what was known when it was prepared.
         theta = None if self._prepares(state) else self.oracle.theta(oracle)
         target = self._target(state, theta)
-        s = state.predicted if start is None else self._with_past(oracle, start)
+        s = state.predicted if start is None else self._with_past(there, start)
         plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
         x, u = s[: self.model.d], plan.u[0]
-        predicted = follow(s, u, self.model.step(x, u) + self.oracle.estimate(oracle, x, u))
-        estimator = self.estimator.commanded(estimator, u)
-        after = ControllerState(
-            shift(plan), pending_x, pending, predicted, delay, oracle, _aim(target), estimator
+        after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
+        estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
+        memory = ControllerState(
+            shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, line
         )
-        return after, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
+        return memory, StepResult(plan.u, mode, solution, label, verdict, rolled_back, delay, first, target)
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
@@ -165,26 +173,33 @@ class Controller:
         return seen
 
     def _estimate(
-        self, state: ControllerState, seen: Observation
+        self, state: ControllerState, acted: Acted
     ) -> tuple[EstimatorState, Observation, Estimate | None]:
         """The estimator's memory, what was seen with the estimate in the place of x, and what else is known of it."""
+        seen = acted.seen
         if seen.x is None:
-            return self.estimator.missed(state.estimator, state.delay), seen, None
+            memory, delay = state.estimator, state.delay
+            if seen.pieces:
+                # Behind the dead time other inputs acted than those that were commanded last.
+                (seconds, first), (_, then) = seen.pieces[0], seen.pieces[-1]
+                delay = seconds if len(seen.pieces) > 1 else 0.0
+                memory = self.estimator.commanded(self.estimator.commanded(memory, first), then)
+            return self.estimator.missed(memory, delay), seen, None
         measured = Measured(seen.x, seen.source, seen.sequence, seen.applied, seen.pieces)
         memory, estimate = self.estimator.update(state.estimator, measured)
         return memory, seen if estimate.x is seen.x else replace(seen, x=estimate.x), estimate
 
     def _learn(
-        self, state: ControllerState, seen: Observation, estimate: Estimate | None
+        self, state: ControllerState, seen: Observation, estimate: Estimate | None, known: bool
     ) -> tuple[Label | None, OracleState]:
         source, sequence = state.pending
         follows = sequence >= 0 and seen.source == source and seen.sequence == sequence + 1
         if seen.x is None or estimate is None:
             return None, state.oracle
-        if seen.applied is None or not follows:
+        if seen.applied is None or not follows or not known:
             # What came before x is not known, at the start and after a gap.
-            acting = _acting(seen)
-            u = np.zeros(self.model.m) if acting is None else acting
+            acts = acting(seen)
+            u = np.zeros(self.model.m) if acts is None else acts
             return None, self.oracle.begin(state.oracle, seen.x, u)
         x, u = state.pending_x, seen.applied
         h = self.model.label(x, u, estimate.reached, seen.pieces)
@@ -202,21 +217,29 @@ class Controller:
     def _acceptable(self, delay: float) -> float:
         return min(delay, LATEST * self.model.period)
 
-    def _when_it_acts(self, oracle: OracleState, seen: Observation, delay: float) -> np.ndarray | None:
-        """The state, (d,), at which the command that is being computed will begin to act.
+    def _when_it_acts(
+        self,
+        oracle: OracleState,
+        x: np.ndarray | None,
+        acted: Acted,
+        acts: np.ndarray | None,
+        delay: float,
+    ) -> tuple[np.ndarray | None, OracleState]:
+        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there.
 
-        Until then the plant goes on under the input it has, which the model knows; without this every millisecond
-        between sample and command would be a disturbance. With certified sets it is no oracle that says
-        where, `lbmpc.sets.motion`: its error would be one of the state that the sets are asked about, and they hold for
-        any oracle.
+        Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
+        which the model knows; without this every millisecond between sample and command would be a disturbance. With
+        certified sets it is no oracle that says where, `lbmpc.sets.motion`: its error would be one of the state that
+        the sets are asked about, and they hold for any oracle.
         """
-        acting = _acting(seen)
-        if seen.x is None or acting is None or delay == 0.0:
-            return seen.x
-        if self._motion is not None and (there := self._motion.after(seen.x, acting, delay)) is not None:
-            return there
-        drift = self.oracle.estimate(oracle, seen.x, acting) * (delay / self.model.period)
-        return self.model.ahead(seen.x, acting, delay) + drift
+        inputs = acted.ahead if acts is None or delay == 0.0 else (*acted.ahead, (delay, acts))
+        if x is None or not inputs:
+            return x, oracle
+        if self._motion is not None and acts is not None:
+            there = self._motion.after(x, acts, delay)
+            if there is not None:
+                return there, oracle
+        return predicted(self.model, self.oracle, oracle, x, inputs)
 
     def _prepares(self, state: ControllerState) -> bool:
         """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
@@ -283,11 +306,6 @@ class Controller:
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
-
-
-def _acting(seen: Observation) -> np.ndarray | None:
-    """The input that the plant has when it is seen, (m,)."""
-    return seen.pieces[-1][1] if seen.pieces else seen.applied
 
 
 def _aim(target: SteadyState | None) -> np.ndarray:

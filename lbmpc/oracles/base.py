@@ -129,6 +129,10 @@ class Oracle(ABC):
         """
         return state
 
+    def passed(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
+        """The state with (x, u) as the last pair of its past, of which nothing is learned."""
+        return state
+
     def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:
         """The state once an experiment has said what the true plant's parameters are from now on, by name.
 

@@ -61,6 +61,9 @@ class Description:
     """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What states and inputs are called in a person's words, by name."""
+    dead_time: float = 0.0
+    """Seconds from when an input is written until the plant begins to answer: transport, a pipe, a bus behind the
+    gateway. Of all inputs."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
@@ -73,12 +76,14 @@ class Description:
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
     ) -> Self:
         """With other bounds, or about another point.
 
         Args:
             bounds: lower and upper by the name of a state or input, None where there is none; others stay.
             x_e, u_e: (d,) and (m,), where equations are linearised.
+            dead_time: seconds; None: its own.
 
         Raises:
             KeyError: a bound of what is no state or input.
@@ -87,7 +92,9 @@ class Description:
             if name not in (*self.states, *self.inputs):
                 raise KeyError(name)
         new: dict[str, Any] = {
-            name: value for name, value in (("x_e", x_e), ("u_e", u_e)) if value is not None
+            name: value
+            for name, value in (("x_e", x_e), ("u_e", u_e), ("dead_time", dead_time))
+            if value is not None
         }
         for axis, names in (("x", self.states), ("u", self.inputs)):
             low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))

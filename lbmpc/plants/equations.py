@@ -61,9 +61,10 @@ class Plant(Description):
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
     ) -> Plant:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
-        there = super().changed(bounds, x_e, u_e)
+        there = super().changed(bounds, x_e, u_e, dead_time)
         if x_e is None or u_e is not None:
             return there
         rest = there.resting_near()

@@ -79,6 +79,8 @@ def number_faults(plant: Description) -> Iterator[str]:
     gain, shape = plant.safe_gain, (plant.m, plant.d)
     if gain is not None and not (numeric(gain) and gain.shape == shape and np.isfinite(gain).all()):
         yield f"safe_gain is {shown(gain)}: it needs finite numbers, a row for each input and a column for each state"
+    if not (isinstance(plant.dead_time, int | float) and 0.0 <= plant.dead_time < np.inf):
+        yield f"dead_time is {plant.dead_time!r}: give seconds, 0 where the plant answers at once"
 
 
 def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:

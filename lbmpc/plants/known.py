@@ -69,9 +69,10 @@ class Known(Description):
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
     ) -> Known:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
-        there = super().changed(bounds, x_e, u_e)
+        there = super().changed(bounds, x_e, u_e, dead_time)
         if x_e is None and u_e is None:
             return there
         refuse(self.name, all_faults(there))
@@ -122,6 +123,7 @@ class Known(Description):
         poles: Sequence[complex] | None = None,
         scale: Mapping[str, float] | None = None,
         names: Mapping[str, str] | None = None,
+        dead_time: float = 0.0,
     ) -> Known:
         """A plant of which a pair of matrices is known.
 
@@ -139,7 +141,7 @@ class Known(Description):
             safe_input: u_e by default.
             performance: all states by default.
             kernel: all states and inputs by default.
-            safe_gain, poles, scale, names: as the fields of these names.
+            safe_gain, poles, scale, names, dead_time: as the fields of these names.
 
         Raises:
             PlantDefinitionError: it cannot be used; the text names every fault.
@@ -170,6 +172,7 @@ class Known(Description):
             poles=None if poles is None else as_tuple(poles),
             scale=scale or {},
             names=names or {},
+            dead_time=dead_time,
             A=A,
             B=B,
             period=period,

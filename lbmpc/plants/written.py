@@ -15,7 +15,7 @@ Number = float | Literal["inf", "-inf"]
 """JSON has no infinity."""
 
 
-class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """Field by field as in `Known`; complex numbers are pairs of their real and imaginary parts."""
 
     name: str
@@ -40,6 +40,8 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     performance: list[int]
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
+    dead_time: float = 0.0
+    """Left out where there is none, as in what was written before there was such a field."""
 
 
 FIELDS = Written.__struct_fields__
@@ -51,7 +53,10 @@ def written(fields: dict[str, Any]) -> dict[str, Any]:
     Raises:
         PlantDefinitionError: a field has what JSON, or `read`, would not take.
     """
-    return msgspec.to_builtins(_typed({name: _plain(fields[name]) for name in FIELDS}))
+    given = {name: _plain(fields[name]) for name in FIELDS}
+    if given["dead_time"] == 0.0:
+        del given["dead_time"]
+    return msgspec.to_builtins(_typed(given))
 
 
 def read(data: object) -> dict[str, Any]:

@@ -85,6 +85,15 @@ def require_prediction(model: Model) -> Continuous:
     return within
 
 
+def require_no_dead_time(model: Model) -> None:
+    """Raises `CertificateError`: there is one, and nothing here bounds what h adds up to until a command acts."""
+    if model.plant.dead_time:
+        raise CertificateError(
+            f"{model.plant.name}: certified sets are about the state in which a command acts, and over a dead time of "
+            f"{model.plant.dead_time:g} s that is not known well enough: take another controller.tightening"
+        )
+
+
 class OfNumbers:
     """The linear motion."""
 

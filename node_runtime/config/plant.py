@@ -41,6 +41,8 @@ class Described(Protocol):
     def W(self) -> np.ndarray: ...
     @property
     def x0(self) -> np.ndarray: ...
+    @property
+    def dead_time(self) -> float: ...
 
 
 class Plant(Described, Protocol):
@@ -51,6 +53,7 @@ class Plant(Described, Protocol):
         bounds: Mapping[str, Sequence[float | None]],
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
+        dead_time: float | None = None,
     ) -> Self: ...
     def varied(self, **changes: float) -> Self: ...
 
@@ -61,6 +64,10 @@ class Motion(Protocol):
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray: ...
 
 
+DEAD_TIME = "dead_time"
+"""In `plant.truth`, beside the parameters of the equations."""
+MOST_DEAD_PERIODS = 50
+"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 P = TypeVar("P", bound=Plant)
 Find = Callable[[Any, Callable[[P], P]], P]
 """`lbmpc.plants.get_plant`: of a name or a plant, and what is changed before it is looked at, the plant. It raises
@@ -130,6 +137,26 @@ def true_plant_of(
     return true
 
 
+def true_dead_time(config: Config, known: Described, true: object) -> float:
+    """Seconds: what `plant.truth` says, or what it names has; where neither does it is as known.
+
+    Args:
+        known, true: of `plant_of` and `true_plant_of`.
+
+    Raises:
+        ConfigError: `plant.truth.dead_time` is none, or longer than what a simulation remembers.
+    """
+    truth = config.plant.truth
+    if not isinstance(truth, dict) or DEAD_TIME not in truth:
+        return getattr(true, DEAD_TIME, 0.0) or known.dead_time
+    seconds, most = truth[DEAD_TIME], MOST_DEAD_PERIODS * config.period
+    if not 0.0 <= seconds <= most * (1.0 + 1e-9):
+        raise ConfigError(
+            f"plant.truth.dead_time = {seconds:g}: seconds, from 0 to {most:g}, {MOST_DEAD_PERIODS} periods"
+        )
+    return seconds
+
+
 def load_plant(reference: str) -> Any:
     """The plant that "tanks.py:TANKS" names, as it is there. Raises `ConfigError`."""
     return load(reference, _is_plant, "plant")
@@ -165,6 +192,7 @@ def spelt_out(config: Config, plant: Described) -> Config:
             x_e=plant.x_e.tolist(),
             u_e=plant.u_e.tolist(),
             bounds=bounds,
+            dead_time=plant.dead_time,
         ),
         controller=msgspec.structs.replace(
             settings,
@@ -211,7 +239,9 @@ def _as_configured(config: Config, plant: P) -> P:
         if name not in known:
             hint = did_you_mean(name, known, f"it has {', '.join(known)}")
             raise ConfigError(f"plant.bounds: {plant.name} has no state or input {name!r}; {hint}")
-    return plant.changed(config.plant.bounds, config.plant.x_e, config.plant.u_e)
+    return plant.changed(
+        config.plant.bounds, config.plant.x_e, config.plant.u_e, dead_time=config.plant.dead_time
+    )
 
 
 def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
@@ -267,7 +297,10 @@ def in_half_widths(shares: Shares, plant: Described) -> np.ndarray:
 
 def _with_parameters(config: Config, plant: P) -> P:
     truth = config.plant.truth
+    others = (
+        {name: value for name, value in truth.items() if name != DEAD_TIME} if isinstance(truth, dict) else {}
+    )
     try:
-        return plant.varied(**truth) if isinstance(truth, dict) and truth else plant
+        return plant.varied(**others) if others else plant
     except (LookupError, ArithmeticError) as error:
         raise ConfigError(f"plant.truth: {error.args[0]}") from error

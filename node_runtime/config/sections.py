@@ -87,9 +87,12 @@ class PlantConfig(Section, frozen=True):
     """Input that goes with it."""
     bounds: dict[str, Bounds] = msgspec.field(default_factory=dict)
     """Of X and U, by the name of a state or input, where they are not the plant's own."""
+    dead_time: Annotated[float, msgspec.Meta(ge=0, le=1e6)] | None = None
+    """Seconds from when the gateway writes an input until the plant begins to answer; None: the plant's own. It is
+    part of the model, and another thing than `controller.input_delay_ms`, which ends at the gateway."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
-    """Parameters of the true plant where they differ from the model's, by name: a model that is wrong. Or a reference
-    to what moves in the plant's place: other equations, or an object with `step`."""
+    """Parameters of the true plant where they differ from the model's, by name, `dead_time` among them: a model that is
+    wrong. Or a reference to what moves in the plant's place: other equations, or an object with `step`."""
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.25
     """Periods without a fresh command after which the plant follows the last plan's next entry."""
     sensors: SensorsConfig = SensorsConfig()

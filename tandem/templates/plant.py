@@ -49,6 +49,9 @@ PLANT = Plant(
     # What the machine does by itself when nobody commands it. For a plant that this would not hold, also
     # safe_gain=[[..]]: then safe_input + safe_gain (x - x_e).
     safe_input=[0.0],
+    # Seconds from when an input is written until the plant begins to answer. Time in a network or a computer before
+    # the input is written is measured, and not a part of this.
+    dead_time=0.0,
     # States that reports are about, by index; and what the kernel of the oracle l2nw sees.
     performance=[0],
     kernel=["speed", "force"],

@@ -322,3 +322,46 @@ def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
     sim.command(command(0, float(PLANT.u_max[0]), [float(PLANT.u_max[0])] * 60), 0.0)
     with pytest.raises(PlantError, match="pressure y"):
         sim.sample(PERIOD * 10)
+
+
+def test_what_is_written_acts_a_dead_time_later_within_a_period_too() -> None:
+    late, truth = 1.3 * PERIOD, Truth(PLANT)
+    motion = Motion(truth, PLANT.x0, PERIOD, late, PLANT.safe_input)
+    first, second = np.array([1.1]), np.array([1.3])
+    assert motion.read(0.0).tolist() == PLANT.x0.tolist()
+    motion.write(first, 0.2 * PERIOD)
+    motion.look_ahead()
+    motion.read(PERIOD)
+    motion.write(second, 1.2 * PERIOD)
+    motion.look_ahead()
+    found = motion.read(3 * PERIOD)
+    # It stands still until the first input is written, and moves by what was there before until that acts.
+    x = PLANT.x0
+    for u, seconds in ((PLANT.safe_input, 1.3), (first, 1.0), (second, 0.5)):
+        x = truth.step(x, u, seconds * PERIOD)
+    np.testing.assert_allclose(found, x, rtol=1e-9, atol=1e-9)
+
+
+def test_looking_ahead_changes_nothing_behind_a_dead_time_of_whole_periods() -> None:
+    truth, steps = Truth(PLANT), []
+
+    class Counted:
+        def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+            steps.append(dt)
+            return truth.step(x, u, dt)
+
+    def states(ahead: bool) -> list[list[float]]:
+        motion, found = Motion(Counted(), PLANT.x0, PERIOD, 2 * PERIOD, PLANT.safe_input), []
+        for k in range(12):
+            due = 1e5 + k * PERIOD
+            found.append(motion.read(due).tolist())
+            motion.write(np.array([U + 0.01 * (k % 5)]), due + (0.6 * PERIOD if k % 4 < 2 else 0.0))
+            if ahead:
+                motion.look_ahead()
+        return found
+
+    found, worked_out = states(ahead=True), steps.copy()
+    steps.clear()
+    assert states(ahead=False) == found
+    # Nothing is worked out that another input overtakes; the last sample is never read.
+    assert len(worked_out) <= len(steps) + 1

@@ -99,6 +99,11 @@ class DnnOracle(NetworkExpressions):
             return state
         return {**state, "past": np.tile(np.concatenate([x, u]), (self.pairs - 1, 1))}
 
+    def passed(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
+        if self.pairs == 1:
+            return state
+        return {**state, "past": np.vstack([state["past"][1:], np.concatenate([x, u])])}
+
     def past(self, state: OracleState) -> np.ndarray:
         return state["past"] if self.pairs > 1 else np.zeros((0, self.d + self.m))
 
@@ -122,8 +127,7 @@ class DnnOracle(NetworkExpressions):
         if self.fading is not None:
             h_hat = self._every_tick().estimate(self.hidden(state), state["K"], x, before, u)
             learned |= evidence.with_label(state, h, h_hat, variance, self.fading)
-        if self.pairs > 1:
-            learned["past"] = np.vstack([state["past"][1:], np.concatenate([x, u])])
+        learned = self.passed(learned, x, u)
         if self.refit is not None or self.trial is not None:
             parts = (before, x, u, h / self.output_scale)
             if self.refit is not None:

@@ -29,6 +29,8 @@ FOLLOWED = 10.0
 """Seconds for which the safe input is followed, or two horizons if that is longer."""
 CHEAP = 1e-3
 """Of what the dearest input costs at its half-width: a performance state that costs less there is not cared for."""
+DOUBLED = 2.0
+"""What an error of a prediction over the dead time may grow by."""
 WEAK = 0.1
 """Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
 
@@ -54,6 +56,8 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
     yield _stability(model)
     yield _inputs(model, horizon)
     yield _horizon(model, horizon)
+    if model.plant.dead_time:
+        yield _dead_time(model)
     yield Finding(
         "ok", "feedback K", f"poles of A + BK, 1/s: {poles_text(poles(model.closed_loop, model.period))}"
     )
@@ -153,6 +157,15 @@ def _horizon(model: Model, horizon: int) -> Finding:
         f"{SETTLED:g} half-widths"
     )
     return Finding("note" if 3 * horizon < advised else "ok", "horizon", text)
+
+
+def _dead_time(model: Model) -> Finding:
+    seconds, periods = model.plant.dead_time, model.plant.dead_time / model.period
+    grown = growth(model, math.ceil(periods))
+    text = f"{seconds:.3g} s, {periods:.3g} periods: the state is predicted to when an input acts"
+    if grown > DOUBLED:
+        text += f", and what is not known of it grows by a factor of {_power(grown)} until then"
+    return Finding("note" if grown > DOUBLED else "ok", "dead time", text)
 
 
 def _power(factor: float) -> str:

@@ -47,8 +47,10 @@ class SetsCompute(Configured):
 
         from controller_node.build import build_model, given_disturbance
         from controller_node.certified_sets import CertifiedSets, default_cache, start_of, write_sets
+        from lbmpc.sets.certificate import CertificateError
         from lbmpc.sets.enclosures.disturbance import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
+        from lbmpc.sets.motion import require_no_dead_time
         from node_runtime.whole_file import require_regular
 
         if not 0.0 < self.slack < 1.0:
@@ -58,6 +60,10 @@ class SetsCompute(Configured):
         except OSError as error:
             raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
         model = build_model(config)
+        try:
+            require_no_dead_time(model)
+        except CertificateError as error:
+            raise Refused(str(error)) from error
         W = given_disturbance(config)
         start = start_of(config, model)
         kinds: Sequence[Kind] = ("box", "hull", "regions") if self.kind == "all" else (self.kind,)

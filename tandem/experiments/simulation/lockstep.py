@@ -21,7 +21,7 @@ from controller_node.build import GivenPlant
 from controller_node.core import ControllerCore, Outputs
 from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth, true_motion
 from node_runtime.config.architecture import register_architecture
-from node_runtime.config.plant import files_of, initial_state, true_plant_of
+from node_runtime.config.plant import files_of, initial_state, true_dead_time, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -142,6 +142,7 @@ class LockStep:
         truth = None if given is None else given.truth
         self.true = true_plant_of(config, get_plant, get_truth) if truth is None else truth
         self.motion = self._motion(self.true)
+        self.dead_time = true_dead_time(config, self.core.plant, self.true)
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         settings = config.controller
         self.way_back = WayBack(self.core.controller.model, settings.backup.margin, settings.horizon)
@@ -173,7 +174,8 @@ class LockStep:
     def _started_plant(self, x0: np.ndarray) -> PlantSim:
         run_id = PLANT if self.episode == 1 else f"{PLANT}-{self.episode}"
         plant, patience = self.core.plant, self.config.plant.plan_patience
-        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id, self.way_back)
+        dead_time, way_back = self.dead_time, self.way_back
+        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id, dead_time, way_back)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:

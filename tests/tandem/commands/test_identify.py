@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from run_log.run import Run
 from run_log.writing.save import save
 from tandem.cli import main
 from tandem.experiments.simulation.lockstep import follow
-from tandem.plant_file import source, write_new
+from tandem.plant_file import shared_fields, source, write_new
 from tests.helpers.paths import ROOT
 
 Capture = pytest.CaptureFixture[str]
@@ -205,6 +206,8 @@ def test_names_of_a_strangers_come_back_from_the_file(tmp_path: Path) -> None:
     text = source(fields, ['"""\nimport nothing # \\', "a log of \udcff\u202e.mcap", ""])
     write_new(tmp_path / "found.py", text)
     known = load_plant(f"{tmp_path / 'found.py'}:PLANT")
+    assert shared_fields(known)["dead_time"] is None
+    assert shared_fields(replace(known, dead_time=0.25))["dead_time"] == 0.25
     assert known.states == states
     assert known.scale[states[0]] == 2.0
     assert "\u202e" not in text

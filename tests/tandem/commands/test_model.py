@@ -199,6 +199,12 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "weights",
         r"per second: angle 0.0001; torque 9\. .* squares of the plant's own units",
     ),
+    "a dead time in which an unstable plant runs away": (
+        replace(PENDULUM, dead_time=0.6),
+        TEN,
+        "dead time",
+        r"0\.6 s, 6 periods: .* grows by a factor of 3\.3",
+    ),
     "states from which nothing can be followed": (
         replace(TANKS, x_min=np.array([-9.0, 1.0])),
         ("--rate", "0.2"),
