@@ -80,7 +80,7 @@ class Snapshot:
     states: tuple[Gauge, ...] = ()
     inputs: tuple[Gauge, ...] = ()
     source: str = ""
-    """What drives the plant: hold, command, plan, safe."""
+    """What drives the plant: hold, command, plan, safe, manual."""
     ticks: int = 0
     measured_rate: float | None = None
     late: int = 0
@@ -184,12 +184,14 @@ class Monitor:
             case m.PlantState():
                 if text := self._plant.came(message.run_id, now):
                     self.say(text, now, "good")
+                self._take_source(message, now)
                 self._x, seen.source = message.x, message.source
             case m.Command():
                 if self.first_command is None:
                     self.first_command = now
                     self.say("the first command: the run begins", now)
-                self._u = message.u
+                if seen.source != "manual":
+                    self._u = message.u
             case m.Tick():
                 if not seen.ticks:
                     self._first_slot = message.slot
@@ -207,6 +209,16 @@ class Monitor:
                 seen.loss, seen.samples = (message.loss_before, message.loss_after), message.samples
             case m.Health():
                 self._take_health(message, now)
+
+    def _take_source(self, state: m.PlantState, now: float) -> None:
+        """Say where a person took over, and where they gave back or it was taken from them."""
+        before = self._seen.source
+        if before and (state.source == "manual") != (before == "manual"):
+            by_hand = state.source == "manual"
+            what = "driven by hand" if by_hand else f"no longer driven by hand: {state.source}"
+            self.say(f"the plant is {what}", now, "note" if by_hand else "good")
+        if state.source == "manual":
+            self._u = state.pieces[-1].u if state.pieces else state.applied
 
     def miss_plant(self, now: float) -> None:
         """Say it, once, when a plant that was there is silent."""

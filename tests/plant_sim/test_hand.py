@@ -246,3 +246,21 @@ def _braking(x: np.ndarray) -> list[float]:
     """What a controller does: to rest at the middle, within its range."""
     wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))
     return [wanted, wanted]
+
+
+def test_what_is_on_its_way_through_a_dead_time_counts() -> None:
+    """At full speed towards the edge the way back is shorter by the way of two periods and a half."""
+    ends = []
+    for dead_time in (0.0, 2.5 * PERIOD):
+        shield = Shield(replace(CART, dead_time=dead_time), PERIOD, 1.25, "plant-a", True, WAY_BACK)
+        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD, dead_time, np.zeros(2))
+        for k in range(200):
+            shield.advance(k * PERIOD, motion)
+            x = motion.read(k * PERIOD)
+            shield.sample(k * PERIOD, x)
+            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.2, 0.0])
+            if shield.override(word, k * PERIOD) == "ended":
+                break
+            shield.renew(k * PERIOD, x, motion)
+        ends.append(float(x[0] + dead_time * x[1]))
+    assert ends[0] == pytest.approx(ends[1], abs=0.05)
