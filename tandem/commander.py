@@ -1,92 +1,126 @@
-"""A commander's place on the bus: it says something, says it again in time, and hears what becomes of it."""
+"""Who says where the plant shall go, or takes it by hand: a place on the bus in the role `commander`.
+
+With certificates that takes the commander's own. What is said travels on the control lane, where a message may be lost,
+so it is said again until an answer shows that it counts, and for as long as it shall.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+import msgspec
 
 from node_runtime.bus.zenoh_bus import Bus, OpenInterrupted
 from node_runtime.config.sections import Config
-from node_runtime.lifecycle import new_run_id, stopped_by_signals
+from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
-from protocol.messages import Message, Override, Reference
+from protocol import messages as m
+from protocol.topics import Topic
 from tandem.terminal import Refused
 
-REACHED_S = 5.0
-"""Seconds within which there must be a router."""
-LEASE_S, LEASE_PERIODS, LONGEST_LEASE_S = 1.0, 3.0, 60.0
-RENEWALS = 3
-"""Of a lease: two may be lost."""
-LAST_WORDS, LAST_WORDS_S = 3, 0.1
-"""How often and how far apart what ends something is said: the control lane drops what finds no room."""
-
-HEARD = (topics.PLANT_STATE, topics.OVERRIDE, topics.REFERENCE, topics.HEALTH["plant"])
-SAID_AT = {Override: topics.OVERRIDE, Reference: topics.REFERENCE}
-
-
-def lease_of(period: float) -> float:
-    """Seconds for which a word counts in a loop of this period, in seconds."""
-    return min(max(LEASE_S, LEASE_PERIODS * period), LONGEST_LEASE_S)
+ROUTER_S = 5.0
+"""Seconds in which a router answers."""
 
 
 class Commander:
-    """One intention of a person: all that it says has one run id, and numbers that count up."""
+    """Says things, each with the next number of one run, and hears what others say.
 
-    def __init__(self, config: Config, bus: Bus, stopping: threading.Event):
-        self.config, self.run_id, self.stopping = config, bus.run_id, stopping
-        self._bus = bus
-        self._mailbox = bus.everything()
-        self._heard = {topic.key(config.name): topic for topic in HEARD}
+    Args:
+        bus: open.
+        heard: the topics that it listens to.
+    """
 
-    def say(self, message: Message) -> None:
-        """Send one override or reference."""
-        self._bus.publish(SAID_AT[type(message)], message)
+    def __init__(self, bus: Bus, heard: tuple[Topic, ...]):
+        self._bus, self._seq = bus, 0
+        self._heard = {topic.name: topic for topic in heard}
+        self._mailbox = bus.everything() if heard else None
 
-    def say_last(self, message: Message) -> None:
-        """Send what ends something: more than once, and until it has left."""
-        for _ in range(LAST_WORDS):
-            self.say(message)
-            clock.sleep_until(clock.now() + LAST_WORDS_S)
+    @property
+    def run_id(self) -> str:
+        """By which others know who said it."""
+        return self._bus.run_id
 
-    def hear(self, until: float) -> Iterator[Message]:
-        """What others say, up to that time on the monotonic clock, or until it is to stop."""
-        while not self.stopping.is_set():
-            left = until - clock.now()
-            delivery = self._mailbox.get(min(max(left, 0.0), 0.1))
-            if delivery is None:
-                if left <= 0.0:
-                    return
-                continue
-            topic = self._heard.get(delivery.key)
-            if topic is None:
+    def say(self, topic: Topic, message: m.Message) -> None:
+        """Once; its run_id and seq are put in here."""
+        self._bus.publish(topic, msgspec.structs.replace(message, run_id=self.run_id, seq=self._seq))
+        self._seq += 1
+
+    def say_again(self, topic: Topic, message: m.Message) -> None:
+        """Once more, by the number of what was said last: for who must not take it for another word."""
+        self._seq = max(0, self._seq - 1)
+        self.say(topic, message)
+
+    def hear(self, seconds: float) -> m.Message | None:
+        """The next of what it listens to; None: there was none for so long. What cannot be read is not heard."""
+        assert self._mailbox is not None
+        until = clock.now() + seconds
+        while (left := until - clock.now()) > 0.0:
+            delivery = self._mailbox.get(left)
+            topic = None if delivery is None else topics.topic_of(delivery.key)
+            if delivery is None or topic is None or topic.name not in self._heard:
                 continue
             try:
-                message = codec.decode(topic, delivery.payload)
+                return codec.decode(topic, delivery.payload)
             except codec.BadMessage:
                 continue
-            if message.run_id != self.run_id:
-                yield message
+        return None
+
+    def keep_saying(
+        self,
+        topic: Topic,
+        message: m.Message,
+        every: float,
+        seconds: float,
+        done: Callable[[m.Message], bool],
+    ) -> bool:
+        """Say it every so often, in seconds, until it is done.
+
+        Args:
+            topic: of the message.
+            message: what is said.
+            every: seconds from one time to the next.
+            seconds: for how long; infinite: until it is interrupted.
+            done: asked of everything that is heard meanwhile.
+
+        Returns:
+            Whether it was done; False after so many seconds.
+        """
+        until = clock.now() + seconds
+        while (now := clock.now()) < until:
+            self.say(topic, message)
+            due = min(now + every, until)
+            while (left := due - clock.now()) > 0.0:
+                heard = self.hear(left)
+                if heard is not None and done(heard):
+                    return True
+        return False
 
 
 @contextmanager
-def commanding(config: Config) -> Iterator[Commander]:
-    """On the bus, until the end of the block; Ctrl-C sets `stopping` meanwhile.
+def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
+    """A commander on the bus of the configuration, who listens to these topics.
 
     Raises:
-        ConfigError: no certificate that can be used.
-        Refused: there is no router, or it lets nobody in.
+        Refused: no router answers.
+        ConfigError: the endpoint is none, the commander's certificate cannot be used, or the router refuses it.
     """
-    with stopped_by_signals() as stopping:
-        timer = threading.Timer(REACHED_S, stopping.set)
-        timer.daemon = True
-        timer.start()
-        try:
-            with Bus(config, topics.COMMANDER, new_run_id(topics.COMMANDER), stopping) as bus:
-                timer.cancel()
-                yield Commander(config, bus, stopping)
-        except OpenInterrupted as interrupted:
-            raise Refused(f"no router at {config.bus.endpoint} within {REACHED_S:g} s") from interrupted
-        finally:
-            timer.cancel()
+    stop = threading.Event()
+    timer = threading.Timer(ROUTER_S, stop.set)
+    timer.daemon = True
+    timer.start()
+    bus = Bus(config, topics.COMMANDER, new_run_id(topics.COMMANDER), stop)
+    try:
+        bus.open()
+    except OpenInterrupted as error:
+        raise Refused(
+            f"no router at {config.bus.endpoint} within {ROUTER_S:g} s: nothing was said"
+        ) from error
+    finally:
+        timer.cancel()
+    try:
+        yield Commander(bus, heard)
+    finally:
+        bus.close()
