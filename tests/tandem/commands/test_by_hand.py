@@ -31,13 +31,14 @@ U = float(PLANT.u_e[0])
 
 
 class Machine:
-    """Rests at the equilibrium, whatever it is given."""
+    """Stands still, whatever it is given."""
 
     def __init__(self) -> None:
         self.written: list[float] = []
+        self.x = PLANT.x_e
 
     def read(self) -> np.ndarray:
-        return PLANT.x_e
+        return self.x
 
     def write(self, u: np.ndarray) -> None:
         self.written.append(float(u[0]))
@@ -70,13 +71,15 @@ def test_a_hand_on_the_switch_of_a_machine(
         assert "given back" in said
         assert "manual" in said
         assert U + 0.02 in machine.written
-        # At once beyond what there is a way back from: the plant says which state and when.
-        assert main(["manual", "u=99", *at]) == 1
+        # Where there is no way back from such an input, it never acts: the plant says which state and when.
+        machine.x = PLANT.x0
+        assert main(["manual", "u=99", "--seconds", "9", *at]) == 1
         assert "would leave X within" in capsys.readouterr().out
         assert PLANT.u_max[0] not in machine.written
+        machine.x = PLANT.x_e
         # From elsewhere.
         result: list[int] = []
-        session = threading.Thread(target=lambda: result.append(main(["manual", f"u={U + 0.03}", *at])))
+        session = threading.Thread(target=lambda: result.append(main(["manual", f"u={U + 0.03}", "--seconds", "30", *at])))
         session.start()
         wait_for(lambda: machine.written[-1] == U + 0.03)
         assert main(["auto", *at]) == 0
