@@ -12,7 +12,9 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
+from lbmpc.estimator.base import Estimator
 from lbmpc.estimator.kalman import KalmanEstimator, unobservable
+from lbmpc.estimator.supervision import SupervisedEstimator
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
@@ -20,11 +22,11 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
+from lbmpc.references import Reference
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
-from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from lbmpc.targets import TargetSelector
@@ -41,8 +43,13 @@ FILTERED = 512
 """Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
 COARSE = 0.05
 """Share of a time scale. K_0 stands for nothing yet; where a period is longer it would move predictions far."""
+MEMORY, NOISY_MEMORY, REACH, WATCH = 2.0, 10.0, 4.0, 1.0
+"""Time scales of the plant: what the last layer's filter remembers of exact labels, and of noisy ones; how far the
+samples reach back on which hidden weights are tried, and how long these are watched."""
+FEWEST = 20
+"""Samples in a memory or a watch of so many time scales: a slow loop has few in one."""
 SHORTEST_WATCH = 8
-"""Samples, also where the loop is slow."""
+"""Samples, whatever was asked for."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,14 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         raise ConfigError(f"network: {error}") from error
     adaptation, share = config.adaptation, model.period / model.time_scale
     again = Refit(adaptation.refit.window, adaptation.refit.ridge)
+    chosen, noisy = describe_filter(config, model.time_scale), config.estimator.kind != "none"
+    filtered = adaptation.enabled and (adaptation.law == "kalman" or (adaptation.law is None and noisy))
+    if filtered and description.features > FILTERED:
+        raise ConfigError(
+            f"the filter of the last layer keeps a covariance of {description.features} x {description.features} "
+            f"numbers; the last of network.hidden can have {FILTERED - 1} neurons at most with it, or take "
+            f'adaptation.law = "gradient"'
+        )
     return DnnOracle(
         description,
         adaptation.gamma if adaptation.enabled else 0.0,
@@ -134,40 +149,40 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
         adaptation.initial_scale * (min(share, COARSE) * model.plant.x_scale),
         adaptation.start,
         again if adaptation.at_adoption == "refit" else None,
-        describe_trial(config),
-        describe_filter(config, description.features),
-        None if config.estimator.kind == "none" else math.exp(-config.period / adaptation.kalman.memory),
+        describe_trial(config, model.time_scale),
+        chosen if filtered else None,
+        chosen if noisy else None,
     )
 
 
-def describe_filter(config: Config, features: int) -> Kalman | None:
-    """The filter of the last layer with so many features, at the configured rate; None where there is none.
+def describe_filter(config: Config, time_scale: float) -> Kalman:
+    """The filter of the last layer, and of the constant beside it, at the configured rate.
 
-    Raises:
-        ConfigError: its covariance would be too large.
+    time_scale: the plant's, in seconds.
     """
-    adaptation = config.adaptation
-    if adaptation.law != "kalman" or not adaptation.enabled:
-        return None
-    if features > FILTERED:
-        raise ConfigError(
-            f'adaptation.law = "kalman" keeps a covariance of {features} x {features} numbers; the last of '
-            f"network.hidden can have {FILTERED - 1} neurons at most with it"
-        )
-    settings = adaptation.kalman
-    kept = math.exp(-config.period / settings.memory)
-    return Kalman(settings.prior_variance, settings.label_variance, kept)
+    settings = config.adaptation.kalman
+    scales = MEMORY if config.estimator.kind == "none" else NOISY_MEMORY
+    memory = settings.memory
+    if memory is None:
+        memory = max(scales * time_scale, FEWEST * config.period)
+    return Kalman(settings.prior_variance, settings.label_variance, math.exp(-config.period / memory))
 
 
-def describe_trial(config: Config) -> Trial | None:
-    """The trial of hidden weights at the configured rate; None where it is switched off."""
+def describe_trial(config: Config, time_scale: float) -> Trial | None:
+    """The trial of hidden weights at the configured rate, for a plant with this time scale in seconds.
+
+    None where it is switched off.
+    """
     settings = config.adaptation.trial
     if not settings.enabled:
         return None
+    least = FEWEST * config.period
+    reach = REACH * time_scale if settings.seconds is None else settings.seconds
+    confirm = max(WATCH * time_scale, least) if settings.confirm is None else settings.confirm
     return Trial(
         capacity=settings.samples,
-        stride=max(1, round(settings.seconds * config.rate / settings.samples)),
-        window=max(SHORTEST_WATCH, math.ceil(settings.confirm * config.rate - 1e-9)),
+        stride=max(1, round(reach * config.rate / settings.samples)),
+        window=max(SHORTEST_WATCH, math.ceil(confirm * config.rate - 1e-9)),
         margin=settings.margin,
         floor=settings.floor,
         floor_after=settings.floor_after,
@@ -179,9 +194,10 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
+    S = None if settings.S is None else np.array(settings.S, dtype=float)
     try:
         plant = build_plant(config) if given is None else given.known
-        model = nominal_model(plant, config.period, Q, R, settings.terminal)
+        model = nominal_model(plant, config.period, Q, R, settings.terminal, S)
         require_horizon(model, settings.horizon)
         if given is None or given.equations is None:
             return model
@@ -207,9 +223,9 @@ class TimedSolver(Solver):
         self.seconds = time.perf_counter() - before
         return solution
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(self, *args: Any, **options: Any) -> Solution:
         before = time.perf_counter()
-        solution = super().feedback(x, first)
+        solution = super().feedback(*args, **options)
         self.seconds = time.perf_counter() - before
         return solution
 
@@ -256,7 +272,8 @@ def build_controller(
             solver,
             real_time=chosen.mode == "real_time",
             input_delay=seconds,
-            targets=build_targets(config, problem, realise),
+            targets=TargetSelector(problem, realise),
+            reference=configured_reference(config, model.plant),
             estimator=build_estimator(config, model),
         )
     except ModelError as error:
@@ -265,7 +282,7 @@ def build_controller(
     return controller, solver
 
 
-def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
+def build_estimator(config: Config, model: Model) -> Estimator | None:
     """The estimator of the configuration; None: a sample is the state.
 
     Raises:
@@ -286,18 +303,19 @@ def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
     if settings.process is not None:
         process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
     noise = in_half_widths(settings.noise, plant) * plant.x_scale
-    return KalmanEstimator(model, measured, noise, process, settings.correlation)
+    kalman = KalmanEstimator(model, measured, noise, process, settings.correlation)
+    return SupervisedEstimator(kalman, model, measured, noise)
 
 
-def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:
-    """What finds the targets of the configuration's reference; None where it has none: plans aim at (x_e, u_e)."""
-    outputs, plant = config.reference.outputs, problem.model.plant
+def configured_reference(config: Config, plant: Description) -> Reference | None:
+    """The reference of the configuration; None where it has none: plans aim at (x_e, u_e)."""
+    outputs = config.reference.outputs
     if outputs is None:
         return None
     indices = [plant.states.index(name) for name in outputs]
     at_equilibrium = plant.x_e[indices]
     values = at_equilibrium if config.reference.values is None else np.array(config.reference.values)
-    return TargetSelector(problem, indices, values - at_equilibrium, realise)
+    return Reference((*indices,), np.zeros(1), (values - at_equilibrium)[None, :])
 
 
 def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:

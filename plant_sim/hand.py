@@ -83,11 +83,12 @@ class Hand:
             self.end(LEASE_OVER if self._given_back is None else self._given_back)
         return self._u
 
-    def look(self, x: np.ndarray | None, written: Sequence[np.ndarray] = ()) -> None:
+    def look(self, x: np.ndarray | None, acting: np.ndarray, written: Sequence[np.ndarray] = ()) -> None:
         """At a sample: what was said since the last acts from now on, unless there is no way back inside X behind it.
 
-        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it. written: the
-        inputs, (m,), that are on their way through the plant's dead time, one a period, the oldest first.
+        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it. acting: the
+        input until now, (m,). written: those that are on their way through the plant's dead time, one a period, the
+        oldest first.
         """
         way_back = self._way_back
         if not self.acts or way_back is None:
@@ -96,11 +97,12 @@ class Hand:
         if now is None:
             self.end("the state is not measured")
             return
-        first, *others = (*written, self._wanted)
+        reached = way_back.reached(acting, self._wanted)
+        first, *others = (*written, reached)
         self._ahead = there = way_back.after(now, first)
         for u in others:
             there = way_back.after(there, u)
-        if why := way_back.lost(there):
+        if why := way_back.lost(there, reached):
             self.end(why)
         else:
             self._u = self._wanted

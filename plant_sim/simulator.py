@@ -156,6 +156,11 @@ class PlantSim:
         return self._shield.override(override, t)
 
     @property
+    def acting(self) -> np.ndarray:
+        """The input that acts, (m,)."""
+        return self._shield.acting
+
+    @property
     def hand(self) -> Hand:
         """Who drives it by hand, and why nobody does any more."""
         return self._shield.hand

@@ -1,9 +1,9 @@
 """Whether a plant under an input by hand can still be brought back inside X, one period later.
 
 A gateway knows the linear model and no h. So of the state after one more period under u it asks whether the feedback of
-the model, clipped to U, keeps what the model predicts in X from there on,
+the model, clipped to U and to the inputs' rates, keeps what the model predicts in X from there on,
 
-    z_1 = A x + B u,    v_i = clip(K z_i, U),    z_{i+1} = A z_i + B v_i,
+    z_1 = A x + B u,    v_i = clip(K z_i, U and the rate after v_{i-1}),    z_{i+1} = A z_i + B v_i,
     z_i in (1 - margin_i) X - (A + BK)^{i-1} W                                            i = 1 .. N,
 
 where W is what the model may miss in that one period, and margin_i grows to the margin of the backup policy. Who takes
@@ -51,6 +51,7 @@ class WayBack:
         inside = margin * shares * plant.x_scale
         self._low, self._high = plant.x_min - plant.x_e + inside, plant.x_max - plant.x_e - inside
         self._u_low, self._u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
+        self._step = plant.input_rates * model.period
         powers = [np.eye(model.d)]
         for _ in range(steps - 1):
             powers.append(model.closed_loop @ powers[-1])
@@ -65,9 +66,13 @@ class WayBack:
         model = self._model
         return Ahead(model.step(now.z, u - model.plant.u_e), self._absolute @ now.spread + self._w)
 
-    def lost(self, there: Ahead) -> str:
-        """What leaves X on the way back from there, for a person; empty where nothing does."""
-        model, z = self._model, there.z
+    def reached(self, acting: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """The input, (m,), that acts in the next period where `wanted` is asked for: as far as its rate allows."""
+        return np.minimum(np.maximum(wanted, acting - self._step), acting + self._step)
+
+    def lost(self, there: Ahead, u: np.ndarray) -> str:
+        """What leaves X on the way back from there, after the input u, (m,), for a person; empty where nothing does."""
+        model, z, v = self._model, there.z, u - self._model.plant.u_e
         with np.errstate(over="ignore", invalid="ignore"):
             beside = self._spread @ there.spread
             low, high = self._low + beside, self._high - beside
@@ -77,7 +82,8 @@ class WayBack:
                 if not inside.all():
                     state = model.plant.states[int(np.argmin(inside))]
                     return f"{state} would leave X within {(i + 1) * model.period:.3g} s"
-                z = model.step(z, np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high))
+                v = self.reached(v, np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high))
+                z = model.step(z, v)
         return ""
 
 

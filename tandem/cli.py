@@ -31,6 +31,7 @@ from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
 from tandem.commands.report import Report
 from tandem.commands.run import Run
+from tandem.commands.set_point import SetPoint
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
 from tandem.streams import never_failing
@@ -50,6 +51,7 @@ AnyCommand = (
     | Annotated[Manual, subcommand("manual")]
     | Annotated[Pause, subcommand("pause")]
     | Annotated[Auto, subcommand("auto")]
+    | Annotated[SetPoint, subcommand("set-point")]
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[SetsCommand, subcommand("sets")]
     | Annotated[ModelCommand, subcommand("model")]

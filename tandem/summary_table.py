@@ -8,7 +8,7 @@ import msgspec
 from rich.table import Column, Table
 from rich.text import Text
 
-from run_log.reporting.summary import Summary
+from run_log.reporting.summary import ADDS, Summary
 
 FOR_A_PERSON = ("skipped_slots",)
 """Shown in the table alone; programs may count on everything else, in `run` and `simulate` alike."""
@@ -25,6 +25,7 @@ MEANING = {
     "soft_ticks": "a soft state constraint gave way",
     "fallback_ticks": "input not from the solver",
     "unreached_ticks": "no rest has the outputs where they should be, or none was found",
+    "sensor_faults": "sensors that were not believed",
     "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
     "J": "sum of the stage costs, Q and R per second",
@@ -38,16 +39,31 @@ MEANING = {
     "solve_ms": "p50 / p99 / max",
     "tick_ms": "p50 / p99 / max",
     "prediction_error": "first / last second, or period if longer",
+    "weight": "what of the network counted in the last second",
+    "constant_weight": "what of a constant beside it",
     "outside_ticks": "outside of the certified sets",
     "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",
 }
 ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
 """What null means, where it is more than that there is no such figure."""
-OF_EACH_STATE = {"overshoot": "share", "settled_by_state_s": "settled_s", "offset": "share"}
+OF_EACH_STATE = {
+    "overshoot": "share",
+    "settled_by_state_s": "settled_s",
+    "offset": "share",
+    "weight": "share",
+    "constant_weight": "share",
+}
 """Which figure of each performance state these are."""
-WITH_A_REFERENCE = ("unreached_ticks", "target_distance", "offset")
-"""Rows that the table of another run has not."""
+WHERE_THERE_IS_ONE = (
+    "unreached_ticks",
+    "target_distance",
+    "offset",
+    "sensor_faults",
+    "weight",
+    "constant_weight",
+)
+"""Rows that the table of another run has not: one without a reference, an estimator, or such a fault."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -61,6 +77,7 @@ SHOULD_BE_ZERO = (
     "constraint_violations",
     "excess_between_samples",
     "outside_ticks",
+    "sensor_faults",
 )
 
 
@@ -78,10 +95,18 @@ def table(summary: Summary) -> Table:
     if len(episodes) > 1:
         figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
     for name, value in figures.items():
-        if name in WITH_A_REFERENCE and value in (None, {}):
+        if name in WHERE_THERE_IS_ONE and value in (None, {}, []):
             continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
+    counted = [
+        share
+        for weights in (summary.weight, summary.constant_weight)
+        if weights
+        for share in weights.values()
+    ]
+    if counted and max(counted) < ADDS:
+        shown.add_row("learning", Text("adds nothing", "bold yellow"), "noise exceeds h")
     return shown
 
 
@@ -90,6 +115,8 @@ def _text(name: str, value: Any) -> str:
         return ABSENT.get(name, "-")
     if name in OF_EACH_STATE:
         return ", ".join(f"{state} {_text(OF_EACH_STATE[name], one)}" for state, one in value.items())
+    if isinstance(value, list):
+        return "\n".join(value)
     if isinstance(value, dict):
         return " / ".join(_text("", part) for part in value.values())
     if name == "share":

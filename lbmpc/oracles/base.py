@@ -129,6 +129,11 @@ class Oracle(ABC):
         """
         return state
 
+    def weights(self, state: OracleState) -> np.ndarray:
+        """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; of no part where labels say nothing
+        of it."""
+        return np.zeros((0, self.d))
+
     def passed(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
         """The state with (x, u) as the last pair of its past, of which nothing is learned."""
         return state

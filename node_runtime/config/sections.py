@@ -67,6 +67,8 @@ class SensorsConfig(Section, frozen=True):
     """Seconds after the first sample from which on there is a bias."""
     stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
     """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
+    dead: dict[str, Instant] = msgspec.field(default_factory=dict)
+    """Seconds after the first sample from which on no number comes of a state, by name, while those of others do."""
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
 
@@ -90,6 +92,8 @@ class PlantConfig(Section, frozen=True):
     dead_time: Annotated[float, msgspec.Meta(ge=0, le=1e6)] | None = None
     """Seconds from when the gateway writes an input until the plant begins to answer; None: the plant's own. It is
     part of the model, and another thing than `controller.input_delay_ms`, which ends at the gateway."""
+    input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
+    """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """Parameters of the true plant where they differ from the model's, by name, `dead_time` among them: a model that is
     wrong. Or a reference to what moves in the plant's place: other equations, or an object with `step`."""
@@ -136,6 +140,9 @@ class ControllerConfig(Section, frozen=True):
     """Diagonal state weights, per second: a stage has Q / rate; None: ones."""
     R: list[Positive] | None = None
     """Diagonal input weights, per second; None: ones."""
+    S: list[NonNegative] | None = None
+    """Diagonal weights of how fast the inputs change, on (du/dt)^2, per second: a stage has S rate |u_i - u_{i-1}|^2.
+    None: zeros."""
     terminal: literals.TerminalName = "riccati"
     """P of the terminal cost: of the LQR with the stage weights, of the feedback K ("lyapunov"), or the one of the
     reimplementation of Aswani et al. (`lbmpc.terminal_cost`)."""
@@ -209,12 +216,14 @@ class TrialConfig(Section, frozen=True):
     """Of new hidden weights, before they are adopted and for a while after."""
 
     enabled: bool = True
-    seconds: Seconds = 4.0
-    """How far the controller's own samples reach back, on which a set on offer is tried."""
+    seconds: Seconds | None = None
+    """How far the controller's own samples reach back, on which a set on offer is tried; None: four time scales of the
+    plant, those of `network.output_scale`."""
     samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
     """How many there are of them; a fast loop takes one every few ticks, a slow one reaches further back."""
-    confirm: Seconds = 1.0
-    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back."""
+    confirm: Seconds | None = None
+    """Seconds after its adoption in which a set that predicts worse than the one before is rolled back; None: one time
+    scale, but 20 samples at least."""
     margin: NonNegative = 0.2
     """Share by which the mean squared error of a new set may be larger than the old one's."""
     floor: NonNegative = 0.003
@@ -224,21 +233,24 @@ class TrialConfig(Section, frozen=True):
 
 
 class KalmanConfig(Section, frozen=True):
-    """Of the last layer's filter; used where `adaptation.law` is "kalman". Variances in (output scale)^2."""
+    """Of the last layer's filter, where that is its law, and of the constant that is learned beside the network where
+    there is an estimator. Variances in (output scale)^2."""
 
     prior_variance: Variance = 0.02
     """Of each entry of K, before the first sample."""
     label_variance: Variance = 1e-3
     """Of each entry of a label: measuring noise, and what the features cannot explain."""
-    memory: Seconds = 2.0
-    """Seconds in which what is known fades towards the prior, by a factor of e."""
+    memory: Seconds | None = None
+    """Seconds in which what is known fades towards the prior, by a factor of e; None: two time scales of the plant, ten
+    where there is an estimator, but 20 samples at least."""
 
 
 class AdaptationConfig(Section, frozen=True):
     enabled: bool = True
     """False: the last layer stays at K_0 (hidden layers only)."""
-    law: literals.LawName = "gradient"
-    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter."""
+    law: literals.LawName | None = None
+    """How a sample moves the last layer: the paper's projected gradient, or a projected Kalman filter. None: kalman
+    where there is an estimator, which says how noisy labels are, and gradient where a sample is the state."""
     gamma: Unit = 0.8
     """Learning rate of the gradient law, 0 < gamma < 1."""
     column_bound: Positive = 2.0

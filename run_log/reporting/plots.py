@@ -43,11 +43,14 @@ def pictures(data: Traces) -> dict[str, Callable[[], Figure]]:
     shown = _model_errors(data)
     if shown:
         title = "Model error over one period, measured and estimated"
-        drawn["model_error"] = partial(_figure, title, [partial(_model_error, data, i) for i in shown])
+        parts: list[Draw] = [partial(_model_error, data, i) for i in shown]
+        if np.isfinite(data.weight).any():
+            parts += [partial(_weight, data, i) for i in shown]
+        drawn["model_error"] = partial(_figure, title, parts)
     if np.isfinite(data.tick_ms).any():
         drawn["timing"] = partial(_figure, "Time spent", [partial(_timing, data)], height=3.2)
     if _learns(data):
-        parts: list[Callable[[Axes], None]] = [partial(_weights, data), partial(_losses, data)]
+        parts = [partial(_weights, data), partial(_losses, data)]
         drawn["weights"] = partial(_figure, "Hidden weights", parts, height=2.4)
     return drawn
 
@@ -122,6 +125,9 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
     ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    if np.isfinite(data.reference[:, i]).any():
+        r = data.reference[:, i]
+        ax.step(data.t, r, where="post", color=GREEN, linestyle="--", linewidth=1.3, label="set-point")
     _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i], plant.x_scale[i])
     ax.set_ylabel(_label(plant, plant.states[i]))
 
@@ -158,6 +164,13 @@ def _model_error(data: Traces, i: int, ax: Axes) -> None:
     ax.plot(data.t, data.h_hat[:, i], color=VERMILION, linestyle="--", linewidth=1.4, label="estimated ĥ")
     ax.set_ylabel(_label(plant, plant.states[i], "h of "))
     ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
+
+
+def _weight(data: Traces, i: int, ax: Axes) -> None:
+    ax.step(data.t, data.weight[:, i], where="post", color=VERMILION, linestyle="--", label="of the network")
+    ax.step(data.t, data.constant_weight[:, i], where="post", color=BLUE, label="of a constant")
+    ax.set_ylim(-0.05, 1.05)
+    ax.set_ylabel(f"what counts in ĥ\nof {words(data.plant.states[i])}")
 
 
 def _error(data: Traces, ax: Axes) -> None:

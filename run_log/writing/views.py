@@ -23,9 +23,13 @@ from protocol.topics import Topic
 Json = dict[str, Any]
 Vector = list[float]
 NAMED_AFTER = dict.fromkeys(
-    ("x", "h", "h_hat", "oracle_norms", "column_norms", "target_x"), "states"
+    ["x", "h", "h_hat", "oracle_norms", "column_norms", "target_x", "weight", "constant_weight", "deviation"],
+    "states",
 ) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
 """Of each vector, the plant's attribute that has the names of its entries."""
+VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation")
+LACKING = (*VECTORS, "sensor_faults", "reference")
+"""What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
     inspect.IntType: "integer",
@@ -48,14 +52,9 @@ def _of_tick(tick: m.Tick) -> Json:
 def _of_result(result: m.TickResult) -> Json:
     piece = None if result.set_margin is None else result.set_piece
     aimed = None if result.target_status == "none" else result.target_status
-    return {
-        "x": result.x or None,
-        "oracle_norms": result.oracle_norms or None,
-        "set_piece": piece,
-        "target_status": aimed,
-        "target_x": result.target_x or None,
-        "target_u": result.target_u or None,
-    }
+    lacking = {name: getattr(result, name) or None for name in LACKING}
+    asked = None if result.reference_verdict == "none" else result.reference_verdict
+    return {**lacking, "set_piece": piece, "target_status": aimed, "reference_verdict": asked}
 
 
 def _of_samples(samples: m.Samples) -> Json:
@@ -97,12 +96,16 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
+        "sensor_faults reference reference_verdict weight constant_weight deviation",
         _of_result,
         {
-            **dict.fromkeys(("x", "oracle_norms", "target_x", "target_u"), Vector | None),
+            **dict.fromkeys(VECTORS, Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
+            "sensor_faults": dict[str, str] | None,
+            "reference": dict[str, float] | None,
+            "reference_verdict": str | None,
         },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
 from rich.table import Column, Table
 from rich.text import Text
 
+from run_log.reporting.summary import ADDS_NOTHING
 from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
-FIGURES = 8
+FIGURES = 9
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
@@ -73,12 +74,17 @@ def line(now: Snapshot) -> str:
         parts.append(f"solve p50 {now.solve_ms[0]:.1f} p99 {now.solve_ms[1]:.1f} ms")
     if now.prediction_error is not None:
         parts.append(f"error {now.prediction_error:.1e}")
+    if now.adds_nothing:
+        parts.append(ADDS_NOTHING)
     parts.append(
         f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused, {now.rolled_back} rolled back)"
     )
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
+    if now.reference:
+        parts.append(f"set-point {_set_point(now)}")
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
+    parts += now.sensor_faults.values()
     if now.phase:
         parts.append(f"waiting for {now.phase}")
     troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
@@ -92,6 +98,18 @@ def _sets(now: Snapshot) -> tuple[str, str]:
     if now.set_margin < 0.0:
         return f"OUTSIDE the sets by {-now.set_margin:.2g}", "bold red"
     return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
+
+
+def _set_point(now: Snapshot) -> str:
+    """Where outputs should be, how far off they are, and whether the plant can rest there."""
+    if not now.reference:
+        return "the equilibrium"
+    at = {gauge.name: gauge.value for gauge in now.states}
+    parts = []
+    for name, r in now.reference.items():
+        x = at.get(name)
+        parts.append(f"{name} {r:.4g}" + ("" if x is None else f", off by {abs(x - r):.2g}"))
+    return f"{'; '.join(parts)}, {now.target_status}"
 
 
 def _panel(title: str, body: RenderableType) -> Panel:
@@ -132,9 +150,15 @@ def _gauges(now: Snapshot, width: int) -> Table:
             f"{gauge.low:.4g}",
             _bar(gauge, cells) if cells >= 8 else "",
             f"{gauge.high:.4g}",
-            f"off by {gauge.value - gauge.target:+.4f}" if roomy and gauge.value is not None else "",
+            _beside(gauge, now.sensor_faults) if roomy else "",
         )
     return table
+
+
+def _beside(gauge: Gauge, faults: Mapping[str, str]) -> Text:
+    if gauge.name in faults:
+        return Text("not believed", "bold red")
+    return Text("" if gauge.value is None else f"off by {gauge.value - gauge.target:+.4f}")
 
 
 def _number(gauge: Gauge) -> str:
@@ -204,6 +228,7 @@ def _loop(now: Snapshot) -> Table:
             ("mode", Text.assemble(mode, "   ", _counted(now.fallback, "fallback"))),
             ("slack", Text.assemble(slack, "   ", _counted(now.soft, "soft ticks"))),
             ("sets", Text.assemble(_sets(now), "   ", _counted(now.outside, "ticks outside", "bold red"))),
+            ("set-point", Text(_set_point(now), "dim" if not now.reference else "default")),
             ("plant", source.get(now.source, now.source or "-")),
         ]
     )
@@ -222,7 +247,7 @@ def _learning(now: Snapshot, width: int) -> Table:
     loss = "-" if now.loss is None else f"{now.loss[0]:.2e} → {now.loss[1]:.2e}"
     return _pairs(
         [
-            ("pred. error", Text(error)),
+            ("pred. error", Text.assemble(error, "   ", _weight(now))),
             ("each second", spark(now.trend, max(4, width - 18))),
             ("weights", Text(f"version {_version(now)}   {now.adopted} adopted")),
             ("refused", _counted(now.refused, "sets")),
@@ -232,6 +257,13 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("bad messages", _counted(now.bad_messages, "not obeyed")),
         ]
     )
+
+
+def _weight(now: Snapshot) -> tuple[str, str]:
+    """What of h_hat counts, in words, and their style."""
+    if now.counts is None:
+        return "", "default"
+    return ("adds nothing", "bold yellow") if now.adds_nothing else (f"counts {now.counts:.0%}", "default")
 
 
 def spark(values: Sequence[float], cells: int) -> Text:

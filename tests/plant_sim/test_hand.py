@@ -236,10 +236,30 @@ def test_a_plant_without_a_model_is_not_driven_by_hand() -> None:
 
 def test_the_way_back_is_asked_of_numbers_that_are_none() -> None:
     beyond = WAY_BACK.of(np.array([1e308, 1e308]))
-    assert WAY_BACK.lost(WAY_BACK.after(beyond, np.array([1e308, 1e308])))
+    u = np.array([1e308, 1e308])
+    assert WAY_BACK.lost(WAY_BACK.after(beyond, u), u)
     far = replace(CART, x_min=[-np.inf, -np.inf], x_max=[np.inf, np.inf], scale={"place": 1.0, "speed": 1.0})
     free = way_back_of(Config(rate=1.0 / PERIOD), far)
-    assert not free.lost(free.after(free.of(np.array([5.0, 3.0])), np.array([1.0, 1.0])))
+    u = np.array([1.0, 1.0])
+    assert not free.lost(free.after(free.of(np.array([5.0, 3.0])), u), u)
+
+
+def test_a_slow_actuator_needs_a_longer_way_back() -> None:
+    ends = []
+    for rate in (np.inf, 1.0):
+        slow = replace(CART, u_rate_max=[rate, rate])
+        shield = Shield(slow, PERIOD, 1.25, "plant-a", True, way_back_of(Config(rate=1.0 / PERIOD), slow))
+        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD)
+        for k in range(200):
+            shield.advance(k * PERIOD, motion)
+            x = motion.read(k * PERIOD)
+            shield.sample(k * PERIOD, x)
+            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.3, 0.0])
+            if shield.override(word, k * PERIOD) == "ended":
+                break
+            shield.renew(k * PERIOD, x, motion)
+        ends.append(float(x[0]))
+    assert ends[1] < ends[0] - 0.05
 
 
 def _braking(x: np.ndarray) -> list[float]:

@@ -13,7 +13,7 @@ from lbmpc.plants import get_plant
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from run_log.writing.views import views
+from run_log.writing.views import LACKING, views
 
 RECORDED = Path(__file__).with_name("views.jsonl")
 """A line for each of `messages`: topic, the JSON text of its view, the text of its schema."""
@@ -25,7 +25,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
     who = {"run_id": "c-1", "seq": 7}
     x, u, K = [0.5, 1.25, -3e-9, 20.0], [1.5], m.Array.of(np.arange(12.0).reshape(3, 4))
     state = m.PlantState(**who, t=1e22, x=x, applied=u, source="command", command_seq=6)
-    held = m.PlantState(**who, t=0.0, x=x, applied=None, source="hold", command_seq=-1)
+    held = m.PlantState(**who, t=0.0, x=x, applied=None, source="hold", command_seq=-1, missing=["y"])
     weights = m.HiddenWeights(
         run_id="t-1", seq=3, for_run="c-1", trained_on=5, base_sha256="ab", samples=40, loss_before=0.1,
         loss_after=1e-9, network_sha256="cd", sha256="ef", layers=[K, m.Array.of(np.ones((5, 2)), "<f4")],
@@ -38,9 +38,12 @@ def messages() -> list[tuple[Topic, m.Message]]:
         h_hat=x, prediction_error=1e-3, oracle_norms=x, hidden_version=3, hidden_sha256="ef", tick_crc32=9,
         input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
+        sensor_faults={"y": "stuck; what it measures is estimated from the others"},
+        weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x,
     )  # fmt: skip
     absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
     absent |= {"target_status": "none", "target_distance": None}
+    absent |= {name: type(getattr(result, name))() for name in LACKING}
     replaced = msgspec.structs.replace
     return [
         (topics.PLANT_STATE, state),
@@ -52,7 +55,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
         (topics.TICK, tick),
         (topics.TICK, replaced(tick, state=None, weights=None, state_verdict="missing", late=False)),
         (topics.RESULT, result),
-        (topics.RESULT, replaced(result, x=[], oracle_norms=[], target_x=[], target_u=[], **absent)),
+        (topics.RESULT, replaced(result, **absent)),
         (topics.TIMING, m.TickTiming(**who, solve_ms=2.5, tick_ms=3.0, lateness_ms=0.1, state_age_ms=1.0)),
         (topics.SAMPLES, m.Samples(**who, samples=[m.Sample(i, x, u, x[::-1]) for i in (3, 4)])),
         (topics.SAMPLES, m.Samples(**who, samples=[])),

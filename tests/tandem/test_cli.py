@@ -52,6 +52,8 @@ KEYS = {
         "solve_ms",
         "tick_ms",
         "prediction_error",
+        "weight",
+        "constant_weight",
         "outside_ticks",
         "smallest_set_margin",
     ),

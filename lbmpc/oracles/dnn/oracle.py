@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 
 from lbmpc.oracles.base import HiddenSet, LearnedNetwork, OracleState, Realise, Variance, Verdict
-from lbmpc.oracles.dnn import evidence, rollback
+from lbmpc.oracles.dnn import rollback
 from lbmpc.oracles.dnn.adaptation_law import AdaptationLaw, project_columns, refit
 from lbmpc.oracles.dnn.adoption import IN_USE, NEWEST, Adoption, Refit
+from lbmpc.oracles.dnn.evidence import Evidence, counting, weights
 from lbmpc.oracles.dnn.expressions import NetworkExpressions
 from lbmpc.oracles.dnn.gradient_law import GradientLaw
 from lbmpc.oracles.dnn.kalman_law import Kalman, KalmanLaw
@@ -35,8 +36,8 @@ class DnnOracle(NetworkExpressions):
         refit: what happens to K when hidden layers are adopted; None: it is kept.
         trial: what hidden layers must show before and after they are adopted; None: nothing.
         kalman: the last layer learns by this filter; None: by the gradient law.
-        fading: h_hat weighs in the prediction what noisy labels bear out, and so much of an earlier label counts one
-            label later; None: it counts whole, as exact labels let it.
+        evidence: what is learned weighs in the prediction as much as noisy labels bear out, and this filters the
+            constant beside the network; None: the network alone counts, and whole, as exact labels let it.
     """
 
     name = "dnn"
@@ -51,7 +52,7 @@ class DnnOracle(NetworkExpressions):
         refit: Refit | None = None,
         trial: Trial | None = None,
         kalman: Kalman | None = None,
-        fading: float | None = None,
+        evidence: Kalman | None = None,
     ):
         super().__init__(description)
         self.gamma = gamma
@@ -60,7 +61,9 @@ class DnnOracle(NetworkExpressions):
         self.law: AdaptationLaw = (
             GradientLaw(gamma, self.bounds) if kalman is None else KalmanLaw(kalman, self.bounds)
         )
-        self.fading = fading
+        self.evidence: Evidence | None = None
+        if evidence is not None:
+            self.evidence = Evidence(evidence, self.output_scale, self.bounds * self.output_scale)
         self._adoption = Adoption(self, self.bounds, refit, trial)
         self._last_layer: LastLayer | None = None
 
@@ -75,8 +78,8 @@ class DnnOracle(NetworkExpressions):
         if self.refit is not None:
             state["samples"] = np.zeros((self.refit.window, self.pairs * (self.d + self.m) + self.d))
             state["sampled"] = np.zeros(1, dtype=np.int64)
-        if self.fading is not None:
-            state |= evidence.nothing(self.d)
+        if self.evidence is not None:
+            state |= self.evidence.nothing()
         if self.trial is not None:
             state |= empty(self.trial, self.pairs * (self.d + self.m) + self.d)
             state |= rollback.nothing(hidden, {name: state[name] for name in ("K", *self.law.remembers)})
@@ -124,9 +127,9 @@ class DnnOracle(NetworkExpressions):
     ) -> OracleState:
         before = self._before(state)
         learned = {**state, **self._every_tick().learn(self.hidden(state), state, x, before, u, h, variance)}
-        if self.fading is not None:
+        if self.evidence is not None:
             h_hat = self._every_tick().estimate(self.hidden(state), state["K"], x, before, u)
-            learned |= evidence.with_label(state, h, h_hat, variance, self.fading)
+            learned |= self.evidence.with_label(state, h, h_hat, variance)
         learned = self.passed(learned, x, u)
         if self.refit is not None or self.trial is not None:
             parts = (before, x, u, h / self.output_scale)
@@ -149,9 +152,12 @@ class DnnOracle(NetworkExpressions):
         version = state["version"]
         return LearnedNetwork(self.hidden(state), state["K"], int(version[IN_USE]), int(version[NEWEST]))
 
+    def weights(self, state: OracleState) -> np.ndarray:
+        return super().weights(state) if self.evidence is None else weights(state)
+
     def _counting(self, state: OracleState) -> np.ndarray:
         """K as it counts in the prediction, (1 + n_L, d)."""
-        return state["K"] if self.fading is None else state["K"] * evidence.weight(state)
+        return state["K"] if self.evidence is None else counting(state, state["K"], self.output_scale)
 
     def _every_tick(self) -> LastLayer:
         if self._last_layer is None:

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lbmpc.oracles import DnnOracle
-from lbmpc.oracles.dnn import evidence
 from lbmpc.oracles.dnn.adaptation_law import project_columns
+from lbmpc.oracles.dnn.evidence import Evidence, weights
+from lbmpc.oracles.dnn.kalman_law import Kalman
 from tests.helpers.science import adapt, compressor, describe, features, function
 
 
@@ -147,33 +148,47 @@ def test_lemma_1_where_labels_have_a_variance(
         assert corrected <= gamma / (1.0 - gamma) * start + 1e-8
 
 
+FILTER = Kalman(prior_variance=0.02, label_variance=1e-3, kept=0.975)
+
+
 def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
     rng = np.random.default_rng(0)
-    state = evidence.nothing(3)
-    np.testing.assert_array_equal(evidence.weight(state), 0.0)
-    variance = np.array([1e-4, 1e-4, 1e-12])
-    for _ in range(200):
-        h_hat = 0.02 * rng.normal(size=3)
-        # A true prediction, one that has nothing to do with h, a true one of exact labels.
-        h = np.array([h_hat[0], 0.0, h_hat[2]]) + np.sqrt(variance) * rng.normal(size=3)
-        state = evidence.with_label(state, h, h_hat, variance, 0.98)
-    good, bad, exact = evidence.weight(state)
+    evidence = Evidence(FILTER, np.full(4, 0.05), np.full(4, 0.1))
+    state = evidence.nothing()
+    np.testing.assert_array_equal(weights(state), 0.0)
+    variance = np.array([1e-4, 1e-4, 1e-12, 1e-4])
+    found, constants = [], []
+    for _ in range(400):
+        h_hat = 0.02 * rng.normal(size=4)
+        # A true prediction, one that has nothing to do with h, a true one of exact labels, and one that misses a
+        # constant.
+        h = np.array([h_hat[0], 0.0, h_hat[2], 0.005]) + np.sqrt(variance) * rng.normal(size=4)
+        state |= evidence.with_label(state, h, h_hat, variance)
+        found.append(weights(state))
+        constants.append(state["constant"][0])
+    (good, bad, exact, other), constant = np.mean(found[-200:], axis=0)
     assert good > 0.75
     assert bad < 0.1
     assert abs(exact - 1.0) < 1e-3
+    assert other < 0.1
+    assert (constant[:3] < 0.2).all()
+    assert constant[3] > 0.4
+    assert abs(np.mean(constants[-200:], axis=0)[3] - 0.005) < 0.001
 
 
 def test_the_prediction_and_its_parameters_have_that_weight_and_training_has_the_whole_K() -> None:
-    oracle = DnnOracle(describe(compressor(), [8]), fading=0.95)
+    oracle = DnnOracle(describe(compressor(), [8]), evidence=FILTER)
     plain = DnnOracle(describe(compressor(), [8]))
     state = oracle.initial_state(np.random.default_rng(1))
     x, u = np.full(4, 0.1), np.array([0.2])
     assert not oracle.estimate(state, x, u).any()
     for _ in range(10):
         state = oracle.learn(state, x, u, np.array([0.01, -0.01, 0.0, 1e-4]), np.full(4, 1e-8))
-    weight = evidence.weight(state)
-    assert 0.5 < weight[0] <= 1.0
-    np.testing.assert_allclose(oracle.estimate(state, x, u), weight * plain.estimate(state, x, u), rtol=1e-12)
+    network, constant = oracle.weights(state)
+    assert 0.5 < network[0] <= 1.0
+    expected = network * plain.estimate(state, x, u) + constant * state["constant"][0]
+    np.testing.assert_allclose(oracle.estimate(state, x, u), expected, rtol=1e-12)
     value = function(oracle)(x, u, oracle.theta(state))[0]
     np.testing.assert_allclose(np.array(value)[:, 0], oracle.estimate(state, x, u), rtol=1e-9, atol=1e-15)
     np.testing.assert_array_equal(oracle.network(state).K, state["K"])
+    assert plain.weights(state).shape == (0, 4)

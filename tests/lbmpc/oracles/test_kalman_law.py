@@ -277,11 +277,20 @@ def test_no_covariance_is_kept_where_there_is_no_filter() -> None:
     np.testing.assert_array_equal(weights[0], weights[-1])
 
 
-def test_the_memory_is_in_seconds() -> None:
-    for rate in (10, 1000):
-        filter = describe_filter(config(f"rate={rate}", "adaptation.kalman.memory=2.0"), 9)
-        assert filter is not None
-        assert filter.kept ** (2 * rate) == pytest.approx(np.exp(-1))
+@pytest.mark.parametrize(
+    ("settings", "time_scale", "samples"),
+    [
+        (["rate=20"], 1.0, 40),
+        (["rate=1000"], 0.25, 500),
+        (["rate=0.2"], 16.0, 20),
+        (["rate=20", "estimator.kind=kalman"], 1.0, 200),
+        (["rate=10", "adaptation.kalman.memory=0.5"], 16.0, 5),
+    ],
+)
+def test_the_memory_is_in_time_scales_of_the_plant_or_in_seconds(
+    settings: list[str], time_scale: float, samples: int
+) -> None:
+    assert describe_filter(config(*settings), time_scale).kept ** samples == pytest.approx(np.exp(-1))
 
 
 def test_too_wide_a_last_layer_is_refused_by_name() -> None:

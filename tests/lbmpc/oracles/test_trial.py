@@ -57,15 +57,27 @@ def test_the_ring_holds_the_newest_samples(stride: int) -> None:
     assert sorted(newest(trial, state, since=18)[:, 0]) == [number for number in kept if number >= 18]
 
 
-def test_the_configuration_says_it_in_seconds() -> None:
-    assert describe_trial(Config()) == Trial(80, 1, 20, margin=0.2, floor=0.003, floor_after=0.1)
-    fast = describe_trial(override(Config(), ["rate=1000"]))
-    assert fast is not None
-    assert (fast.capacity, fast.stride, fast.window) == (80, 50, 1000)
-    slow = describe_trial(override(Config(), ["rate=2"]))
-    assert slow is not None
-    assert (slow.stride, slow.window) == (1, 8)
-    assert describe_trial(override(Config(), ["adaptation.trial.enabled=false"])) is None
+@pytest.mark.parametrize(
+    ("settings", "time_scale", "stride", "window"),
+    [
+        (["rate=20"], 1.0, 1, 20),
+        (["rate=1000"], 1.0, 50, 1000),
+        (["rate=1000"], 0.25, 12, 250),
+        (["rate=10"], 64.0, 32, 640),
+        # Where a time scale has few samples, so many.
+        (["rate=2"], 1.0, 1, 20),
+        (["rate=20", "adaptation.trial.seconds=20.0", "adaptation.trial.confirm=0.1"], 64.0, 5, 8),
+    ],
+)
+def test_a_trial_is_in_time_scales_of_the_plant_or_in_seconds(
+    settings: list[str], time_scale: float, stride: int, window: int
+) -> None:
+    trial = describe_trial(override(Config(), settings), time_scale)
+    assert trial == Trial(80, stride, window, margin=0.2, floor=0.003, floor_after=0.1)
+
+
+def test_a_trial_can_be_switched_off_and_needs_samples() -> None:
+    assert describe_trial(override(Config(), ["adaptation.trial.enabled=false"]), 1.0) is None
     with pytest.raises(ConfigError, match="samples"):
         override(Config(), ["adaptation.trial.samples=3"])
 

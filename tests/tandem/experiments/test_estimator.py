@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import io
+
+import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
 from controller_node.core import ControllerCore
 from lbmpc.plants import get_plant
 from node_runtime.config.loading import load
 from node_runtime.config.sections import Config
 from run_log.replaying.replay import replay
+from run_log.reporting.summary import summarise
 from run_log.run import Run
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow, simulate
+from tandem.summary_table import table
 
 PLANT = get_plant("moore_greitzer")
 SETTINGS = [
@@ -64,6 +70,30 @@ def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
     assert "oracle.evidence" not in exact.keyframes[0].arrays
 
 
+def test_a_result_says_what_of_the_network_counts_and_how_well_the_state_is_known(lossy: Run) -> None:
+    after = [result for result in lossy.results if result.seq >= 5]
+    deviations = np.array([result.deviation for result in after])
+    # Better than one sample, worse where there was none.
+    known = np.array([lossy.ticks[result.seq].state is not None for result in after])
+    assert (deviations[known] < 0.01 * PLANT.x_scale).all()
+    assert deviations[~known].mean() > deviations[known].mean()
+    for result in after:
+        for weight in (result.weight, result.constant_weight):
+            assert len(weight) == 4
+            assert all(0.0 <= share <= 1.0 for share in weight)
+    assert any(max(result.weight + result.constant_weight) > 0.0 for result in after)
+    summary = summarise(lossy)
+    last = np.mean([result.weight for result in lossy.results[-20:]], axis=0)
+    assert summary.weight == pytest.approx(dict(zip(PLANT.states, last, strict=True)))
+    console = Console(width=200, file=io.StringIO())
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.01})))
+    console.print(table(msgspec.structs.replace(summary, weight={"z": 0.02}, constant_weight={"z": 0.4})))
+    assert console.file.getvalue().count("noise exceeds h") == 1
+    exact = simulate(config("estimator.kind=none"), 3)
+    assert all(not (r.weight or r.constant_weight or r.deviation) for r in exact.results)
+    assert summarise(exact).weight is None
+
+
 def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) -> None:
     core = ControllerCore(config("adaptation.law=kalman"), "controller-a")
     core.memory.restore(lossy.keyframes[2])
@@ -97,3 +127,38 @@ def test_learning_costs_little_more_than_the_nominal_model_where_noise_exceeds_h
     assert J("adaptation.law=kalman") < 1.05 * linear
     # What it was without any of it.
     assert J("estimator.kind=none") > 3.0 * linear
+
+
+@pytest.fixture(scope="module")
+def misled() -> Run:
+    faults = ["plant.sensors.stuck={y=0.5}", "plant.sensors.dead={rdot=1.0}"]
+    return simulate(config("adaptation.law=kalman", *faults), 60)
+
+
+def test_a_stuck_and_a_dead_sensor_are_named_in_the_log_and_not_learned_from(misled: Run) -> None:
+    named = [set(result.sensor_faults) for result in misled.results]
+    assert not any(named[:10])
+    assert "y" in named[30]
+    assert "rdot" in named[23]
+    assert named[-1] == {"y", "rdot"}
+    lost = [tick.state for tick in misled.ticks if tick.t > 0.99]
+    assert all(state is not None and state.missing == ["rdot"] for state in lost)
+    # Of a stuck y the label would be what the model says it should have moved.
+    labels = np.array([sample.h for sample in misled.samples if sample.seq > 12])[:, 1]
+    assert np.abs(labels).max() < 0.02 * PLANT.x_scale[1]
+    assert np.abs(true(misled)[:, 1] - PLANT.x_e[1]).max() < PLANT.x_scale[1]
+    assert all(np.isfinite(sample.variance).all() for sample in misled.samples)
+
+
+def test_it_replays_and_is_told_in_the_summary(misled: Run) -> None:
+    assert replay(misled, from_tick=30).equal
+    told = summarise(misled).sensor_faults
+    assert [text[:14] for text in sorted(told)] == ["sensor rdot is", "sensor y is st"]
+    assert simulate(config("controller.oracle=linear"), 5).results[-1].sensor_faults == {}
+
+
+def test_without_an_estimator_a_sample_with_a_gap_is_no_sample() -> None:
+    run = follow(
+        config("estimator.kind=none", "plant.sensors.dead={y=0.1}", "controller.oracle=linear"), 6
+    ).run
+    assert [result.mode for result in run.results][2:] == ["shifted_plan"] * 4

@@ -100,6 +100,25 @@ def result(
     )
 
 
+def test_a_sensor_that_is_not_believed_is_said_once_and_shown(monitor: Monitor) -> None:
+    stuck = {"y": "stuck; what it measures is estimated from the others"}
+    for k, faults in ((50, stuck), (51, stuck), (52, {})):
+        answer = msgspec.structs.replace(result(k), sensor_faults=faults)
+        monitor.feed(delivery(topics.RESULT, answer, START + 0.05 * k))
+        if k == 51:
+            assert "sensor y is stuck since 2.5 s; what it measures is estimated" in view.line(
+                monitor.snapshot(START + 2.6)
+            )
+            console = Console(file=io.StringIO(), width=120, height=40)
+            console.print(view.render(monitor.snapshot(START + 2.6), 120, 40))
+            assert "not believed" in console.file.getvalue()  # type: ignore[attr-defined]
+    said = [event.text for event in monitor.snapshot(START + 2.7).events if "sensor" in event.text]
+    assert said == [
+        "tick 50: sensor y is stuck since 2.5 s; what it measures is estimated from the others",
+        "tick 52: sensor y is believed again",
+    ]
+
+
 def health(process: str, counters: dict[str, int], note: str = "") -> m.Health:
     return m.Health(run_id=process, seq=0, process=process, status="running", counters=counters, note=note)
 
@@ -215,6 +234,39 @@ def test_a_value_outside_its_bounds_is_marked(z: float, mark: str):
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed(delivery(topics.PLANT_STATE, state(0, z), START))
     assert mark in "\n".join(drawn(seen.snapshot(START), 100, 30))
+
+
+def test_it_is_said_when_learning_adds_nothing_for_seconds_and_when_it_counts_again() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    seen.feed(delivery(topics.COMMAND, command(0), START))
+
+    def after(k: int, weight: float, constant: float = 0.0) -> tuple[str, str, str]:
+        of_a_state = msgspec.structs.replace(
+            result(k), weight=[0.0, weight, 0.0, 0.0], constant_weight=[0.0, 0.0, constant, 0.0]
+        )
+        at = START + 0.05 * k
+        seen.feed(delivery(topics.RESULT, of_a_state, at))
+        now = seen.snapshot(at)
+        return (
+            "\n".join(drawn(now, 100, 30)),
+            view.line(now),
+            " ".join(event.text for event in seen.new_events()),
+        )
+
+    assert "counts 80%" in after(0, 0.8)[0]
+    for k in range(1, 60):
+        panel, line, _events = after(k, 0.05)
+        assert "counts 5%" in panel
+        assert "learning adds nothing" not in line
+    panel, line, events = after(61, 0.05)
+    assert "adds nothing" in panel
+    for text in (line, events):
+        assert "learning adds nothing: noise exceeds h" in text
+    assert "learning" not in after(62, 0.02)[2]
+    panel, line, events = after(63, 0.0, 0.3)
+    assert "counts 30%" in panel
+    assert "nothing" not in line
+    assert "learning counts again" in events
 
 
 def test_one_line(monitor: Monitor):
