@@ -194,7 +194,8 @@ class Shield:
         self._write(drive, t, machine)
         self._written = False
 
-    def _acting_now(self) -> np.ndarray:
+    @property
+    def acting(self) -> np.ndarray:
         """The input that acts, (m,); where nobody knows, what the actuator has without anybody."""
         u = self._tape[-1].u
         return within(self.plant, self.plant.safe_input) if u is None else u

@@ -118,7 +118,7 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
     key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
     issued_by = credentials.load_certificate(authority / "certificate.pem")
     (keys / "brief").mkdir(mode=0o700)
-    seconds = timedelta(seconds=6) / timedelta(days=1)
+    seconds = timedelta(seconds=4) / timedelta(days=1)
     with open_router(local):
         gateway.start()
         assert main(["manual", f"u={U + 0.01}", *far("operator")]) == 2
@@ -126,7 +126,7 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
         certificate_authority.issue(keys / "brief", "commander.jet1", key, issued_by, seconds, [])  # type: ignore[arg-type]
         done: list[int] = []
         session = threading.Thread(
-            target=lambda: done.append(main(["manual", f"u={U + 0.02}", "--seconds", "9", *far("brief")]))
+            target=lambda: done.append(main(["manual", f"u={U + 0.02}", "--seconds", "5", *far("brief")]))
         )
         session.start()
         wait_for(lambda: U + 0.02 in machine.written)
