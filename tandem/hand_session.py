@@ -33,8 +33,8 @@ class Follower:
         self._said_at: int | None = None
         self.state: m.PlantState | None = None
         """The newest."""
-        self.begun = of is m.Reference
-        """Whether the plant took it; a controller is not asked."""
+        self.begun = False
+        """Whether it was taken, by the plant or by its controller."""
         self.mine = True
         """Whether nobody else has ended it."""
         self.elsewhere = False
@@ -54,6 +54,9 @@ class Follower:
         match message:
             case m.PlantState():
                 return self._take_state(message)
+            case m.TickResult() if message.reference_from == self._run_id:
+                self.begun = message.reference_verdict == "taken"
+                return "" if self.begun else f"the controller {message.reference_verdict}"
             case m.Health():
                 self.told = message.note.partition(NO_LONGER)[2]
             case m.Override(mode="auto", seq=0) if self._said_at is not None:

@@ -41,7 +41,10 @@ def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
     from protocol import topics
     from tandem.commander import commanding
 
-    heard = topics.PLANT_STATE, topics.HEALTH["plant"], topics.OVERRIDE, topics.REFERENCE
+    heard = (
+        *(topics.PLANT_STATE, topics.RESULT, topics.HEALTH["plant"]),
+        *(topics.OVERRIDE, topics.REFERENCE),
+    )
     with stopped_by_signals() as stopping, commanding(config, *heard) as commander:
         yield commander, stopping
 
@@ -117,7 +120,7 @@ class ByHand(Configured):
             heard = commander.hear(min(said + every - now, end - now, LOOK_S))
             why = "" if heard is None else follower.take(heard)
             if not why and not follower.begun and now - began > limit:
-                why = "the plant did not take it"
+                why = "nobody took it"
             if why:
                 return self._reason(commander, follower, why)
             if follower.state is not None and now - shown >= 1.0:
