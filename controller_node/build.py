@@ -12,7 +12,9 @@ import numpy as np
 
 from lbmpc.controller.backup_policy import BackupPlanner
 from lbmpc.controller.step import Controller
+from lbmpc.estimator.base import Estimator
 from lbmpc.estimator.kalman import KalmanEstimator, unobservable
+from lbmpc.estimator.supervision import SupervisedEstimator
 from lbmpc.model import Model, ModelError, require_horizon
 from lbmpc.model import build_model as nominal_model
 from lbmpc.oracles import ConstantOracle, DnnOracle, L2nwOracle, LinearOracle, Oracle, PerfectOracle
@@ -20,11 +22,11 @@ from lbmpc.oracles.base import Realise
 from lbmpc.oracles.dnn.adoption import Refit
 from lbmpc.oracles.dnn.kalman_law import Kalman
 from lbmpc.oracles.dnn.trial import Trial
-from lbmpc.plants import Known, Plant, PlantError, TrueMotion, get_plant, get_truth
+from lbmpc.plants import Description, Known, Plant, PlantError, TrueMotion, get_plant, get_truth
 from lbmpc.problem import Problem, build_problem
+from lbmpc.references import Reference
 from lbmpc.sets.certificate import Certificate, CertificateError
 from lbmpc.sets.geometry.polytope import EmptySetError
-from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution
 from lbmpc.targets import TargetSelector
@@ -192,9 +194,10 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
+    S = None if settings.S is None else np.array(settings.S, dtype=float)
     try:
         plant = build_plant(config) if given is None else given.known
-        model = nominal_model(plant, config.period, Q, R, settings.terminal)
+        model = nominal_model(plant, config.period, Q, R, settings.terminal, S)
         require_horizon(model, settings.horizon)
         if given is None or given.equations is None:
             return model
@@ -220,9 +223,9 @@ class TimedSolver(Solver):
         self.seconds = time.perf_counter() - before
         return solution
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(self, *args: Any, **options: Any) -> Solution:
         before = time.perf_counter()
-        solution = super().feedback(x, first)
+        solution = super().feedback(*args, **options)
         self.seconds = time.perf_counter() - before
         return solution
 
@@ -269,7 +272,8 @@ def build_controller(
             solver,
             real_time=chosen.mode == "real_time",
             input_delay=seconds,
-            targets=build_targets(config, problem, realise),
+            targets=TargetSelector(problem, realise),
+            reference=configured_reference(config, model.plant),
             estimator=build_estimator(config, model),
         )
     except ModelError as error:
@@ -278,7 +282,7 @@ def build_controller(
     return controller, solver
 
 
-def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
+def build_estimator(config: Config, model: Model) -> Estimator | None:
     """The estimator of the configuration; None: a sample is the state.
 
     Raises:
@@ -299,18 +303,19 @@ def build_estimator(config: Config, model: Model) -> KalmanEstimator | None:
     if settings.process is not None:
         process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
     noise = in_half_widths(settings.noise, plant) * plant.x_scale
-    return KalmanEstimator(model, measured, noise, process, settings.correlation)
+    kalman = KalmanEstimator(model, measured, noise, process, settings.correlation)
+    return SupervisedEstimator(kalman, model, measured, noise)
 
 
-def build_targets(config: Config, problem: Problem, realise: Realise) -> TargetSelector | None:
-    """What finds the targets of the configuration's reference; None where it has none: plans aim at (x_e, u_e)."""
-    outputs, plant = config.reference.outputs, problem.model.plant
+def configured_reference(config: Config, plant: Description) -> Reference | None:
+    """The reference of the configuration; None where it has none: plans aim at (x_e, u_e)."""
+    outputs = config.reference.outputs
     if outputs is None:
         return None
     indices = [plant.states.index(name) for name in outputs]
     at_equilibrium = plant.x_e[indices]
     values = at_equilibrium if config.reference.values is None else np.array(config.reference.values)
-    return TargetSelector(problem, indices, values - at_equilibrium, realise)
+    return Reference((*indices,), np.zeros(1), (values - at_equilibrium)[None, :])
 
 
 def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:

@@ -10,6 +10,7 @@ import hashlib
 import platform
 
 import msgspec
+import numpy as np
 
 from controller_node.build import GivenPlant, build_backup, build_controller, build_model
 from controller_node.certified_sets import CertifiedSets, find_sets
@@ -89,6 +90,13 @@ class ControllerCore:
         state = self.controller.initial_state(self.config.seed)
         theta = self.controller.oracle.theta(state.oracle)
         self._planner().policy(state.predicted, theta, state.plan.u)
+
+    def ready_targets(self) -> None:
+        """Build now what the first reference would build: a loop has no time for it."""
+        model, aims = self.controller.model, self.controller.aims
+        if aims.targets is not None:
+            theta = self.controller.oracle.theta(self.controller.initial_state(self.config.seed).oracle)
+            aims.targets.find(theta, np.zeros(model.d + model.m), (), np.zeros(0))
 
     def _planner(self) -> BackupPlanner:
         if self._backup is None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from lbmpc.controller.state import ControllerState
 from lbmpc.controller.step import Controller
@@ -13,6 +15,8 @@ from network_model.description import hash_layers
 from node_runtime.config.sections import Config
 from protocol import messages as m
 
+GIVEN = ("target", "reference.")
+"""Arrays that are there where somebody gave a reference."""
 WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
 
 
@@ -59,15 +63,30 @@ class Memory:
             ValueError: the keyframe does not fit this configuration; the text names the array.
         """
         arrays = {name: array.numpy() for name, array in keyframe.arrays.items()}
-        expected = self.state.to_arrays()
+        expected, unfit = (
+            self._expected(arrays),
+            f"the keyframe of tick {keyframe.seq} does not fit this configuration",
+        )
         for name in sorted(expected.keys() | arrays.keys()):
             if name not in arrays or name not in expected or arrays[name].shape != expected[name].shape:
-                raise ValueError(
-                    f"the keyframe of tick {keyframe.seq} does not fit this configuration: array {name}"
-                )
-        self.state = ControllerState.from_arrays(arrays)
+                raise ValueError(f"{unfit}: array {name}")
+        try:
+            self.state = ControllerState.from_arrays(arrays)
+        except ValueError as error:
+            raise ValueError(f"{unfit}: array {error}") from error
         self._hash_hidden()
         self._resumed = keyframe.resumed
+
+    def _expected(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What a memory with these arrays has: only a reference that was given, and its target, may be missing."""
+        expected = {
+            name: array for name, array in self.state.to_arrays().items() if not name.startswith(GIVEN)
+        }
+        if "target" in arrays or self._controller.aims.nothing_yet.size:
+            model = self._controller.model
+            expected["target"] = np.zeros(model.d + model.m)
+        # Whether these are a reference is for themselves to say.
+        return expected | {name: array for name, array in arrays.items() if name.startswith("reference.")}
 
     def lasting(self) -> dict[str, m.Array]:
         """What of the memory outlives this process: all that was learned, nothing that was planned."""
@@ -82,7 +101,7 @@ class Memory:
         """
         begin = self.keyframe(-1).arrays
         expected = {name for name in begin if _lasts(name)}
-        for name in sorted(expected ^ lasting.keys()):
+        for name in sorted(expected ^ {name for name in lasting if not name.startswith("reference.")}):
             raise ValueError(f"array {name} is {'missing' if name in expected else 'not known'}")
         for name in sorted(expected):
             if (lasting[name].shape, lasting[name].dtype) != (begin[name].shape, begin[name].dtype):
@@ -130,4 +149,4 @@ class Memory:
 
 def _lasts(name: str) -> bool:
     """Whether a new process can go on with this array. Not with a plan, or with a state whose successor it missed."""
-    return name == "delay" or name.startswith(("oracle.", "estimator."))
+    return name == "delay" or name.startswith(("oracle.", "estimator.", "reference."))

@@ -64,6 +64,7 @@ COUNTS = (
     "weights adopted",
     "weights refused",
     "weights rolled back",
+    "references taken",
     "checkpoints written",
     "checkpoints failed",
 )
@@ -111,6 +112,7 @@ class ControllerNode:
             # Fed back behind a dead time, its stiff K may be unstable.
             and not core.plant.dead_time
         )
+        core.ready_targets()
         if self._backs_up:
             core.ready_backup()
         self._weights_every = topics.OUTPUT_WEIGHTS.every(self._period)
@@ -120,6 +122,7 @@ class ControllerNode:
             bus, topics.PLANT_STATE, states=core.plant.d, inputs=core.plant.m, sent=lambda state: state.t
         )
         self._trainers: Inbox[m.HiddenWeights] = Inbox(bus, topics.HIDDEN_WEIGHTS, capacity=8)
+        self._commanders: Inbox[m.Reference] = Inbox(bus, topics.REFERENCE, capacity=4)
         self._grid = Grid(self._period, clock.now())
         self._first: Received[m.PlantState] | None = None
         self._followed = ""
@@ -127,9 +130,11 @@ class ControllerNode:
         self._seq = -1
         self._missing = 0
         self._weights: m.HiddenWeights | None = None
+        self._reference: m.Reference | None = None
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
+        self._faults: dict[str, str] = {}
         self._hidden = core.memory.hidden_snapshot(-1)
         self._keyframes = Keyframes(bus, core.memory, self._settings.keyframe_every)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
@@ -151,6 +156,7 @@ class ControllerNode:
                 self._tick(slot, lateness, latched)
                 self._follow_phase(slot, latched)
                 self._take_weights()
+                self._take_reference()
                 self._keyframes.greet(self._seq, clock.now())
                 if self._checkpoint is not None and self._checkpoint.wanted:
                     self._save(self._checkpoint)
@@ -183,7 +189,7 @@ class ControllerNode:
                 self._missing = 0
                 self._followed = self._first.message.run_id
                 self._grid.reanchor(self._states.undelayed(self._first) + self._phase)
-                self._health.set("running")
+                self._health.set("running", "; ".join(self._faults.values()))
                 return True
             self._health.set("ready", "no plant: its states come too late to act on")
             old_since = now if old_since is None else old_since
@@ -237,6 +243,16 @@ class ControllerNode:
                 self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "superseded", detail)
             self._weights = weights
 
+    def _take_reference(self) -> None:
+        """The newest, for the next tick; whoever sends more of them than there are ticks is not followed in each."""
+        for received in self._commanders.take_all():
+            if self._reference is not None:
+                detail = (
+                    f"message {self._reference.seq} of {self._reference.run_id} by {received.message.seq}"
+                )
+                self._bus.bad.count(topics.REFERENCE.name, "superseded", detail)
+            self._reference = received.message
+
     # -- the step and what follows from it ---------------------------------------------------------------
 
     def _tick(self, slot: Slot, lateness: float, latched: Latched) -> None:
@@ -255,14 +271,22 @@ class ControllerNode:
             state_verdict=latched.verdict,
             state=latched.state,
             weights=self._weights,
+            reference=msgspec.UNSET if self._reference is None else self._reference,
         )
-        self._weights = None
+        self._weights = self._reference = None
         outputs = self._core.step(tick)
         self._bus.publish(topics.COMMAND, outputs.command)
         sent = clock.now()
-        # The plant obeys no command that answers none of its samples, and no policy that belongs to one.
+        # The plant obeys no command that answers none of its samples, and no policy that belongs to one. And the policy
+        # would feed back a sensor that is not believed.
         obeyed = latched.verdict == "fresh"
-        if self._backs_up and obeyed and (backup := self._core.backup(outputs.command)) is not None:
+        believed = not outputs.result.sensor_faults
+        if (
+            self._backs_up
+            and obeyed
+            and believed
+            and (backup := self._core.backup(outputs.command)) is not None
+        ):
             self._bus.publish(topics.BACKUP, backup)
         timing = m.TickTiming(
             run_id=self._run_id,
@@ -311,9 +335,27 @@ class ControllerNode:
         if result.weights_outcome == "refused":
             counts["weights refused"] += 1
             self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", result.weights_verdict)
+        if (verdict := result.reference_verdict).startswith("refused"):
+            self._bus.bad.count(topics.REFERENCE.name, "refused", f"{verdict} (of {result.reference_from})")
+        counts["references taken"] += verdict == "taken"
         if rolled_back := result.weights_rolled_back:
             counts["weights rolled back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
+        if result.sensor_faults or self._faults:
+            self._say_faults(tick, result.sensor_faults)
+
+    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
+        """In health and in this process's log, where sensors are believed no longer, or again."""
+        before = self._faults
+        words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}
+        self._faults = {name: before.get(name, text) for name, text in words.items()}
+        if self._faults.keys() == before.keys():
+            return
+        for name in faults.keys() - before.keys():
+            log.warning("tick %d: %s", tick.seq, self._faults[name])
+        for name in before.keys() - faults.keys():
+            log.info("tick %d: sensor %s is believed again", tick.seq, name)
+        self._health.set("running", "; ".join(self._faults.values()))
 
     def _send_samples(self) -> None:
         for batch in self._outbox.batches(self._unsent):

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
+from controller_node.asked import RefusedReference, change_of, source_of, verdict_on
 from lbmpc.controller.backup_policy import Policy
 from lbmpc.controller.signals import Observation, StepResult
 from lbmpc.oracles.base import HiddenSet, LearnedNetwork
 from lbmpc.plants import Description
+from lbmpc.references import Change
 from lbmpc.targets import SteadyState
 from protocol import messages as m
 from protocol.codec import encode
@@ -55,8 +57,11 @@ class Translation:
         if tick.weights is not None:
             layers = [array.numpy().astype(float) for array in tick.weights.layers]
             hidden = HiddenSet(tick.weights.seq, layers, tick.weights.sha256, tick.weights.network_sha256)
+        asked = self._asked(tick)
         if state is None:
-            return Observation(None, None, 0, -1, hidden, truth=tick.truth)
+            return Observation(
+                None, None, 0, -1, hidden, truth=tick.truth, reference=asked, skipped=tick.skipped
+            )
         applied = None if state.applied is None else np.array(state.applied) - self.plant.u_e
         pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
         total = sum(seconds for seconds, _u in pieces)
@@ -64,7 +69,19 @@ class Translation:
             # Not the whole period: what acted in the rest of it is not known, but what acts now is.
             applied = None
         x = np.array(state.x) - self.plant.x_e
-        return Observation(x, applied, _source(state.run_id), state.seq, hidden, pieces, tick.truth)
+        if state.missing:
+            x[[name in state.missing for name in self.plant.states]] = math.nan
+        source = source_of(state.run_id)
+        return Observation(x, applied, source, state.seq, hidden, pieces, tick.truth, asked, tick.skipped)
+
+    def _asked(self, tick: m.Tick) -> Change | None:
+        """What the tick's reference comes to; None without one, and for one that is refused."""
+        if tick.reference is UNSET:
+            return None
+        try:
+            return change_of(tick.reference, self.plant, self.period)
+        except RefusedReference:
+            return None
 
     def outputs(
         self, tick: m.Tick, result: StepResult, network: LearnedNetwork | None, hidden_sha256: str
@@ -141,10 +158,19 @@ class Translation:
             set_margin=result.first.margin if result.first else None,
             set_piece=result.first.piece if result.first else -1,
             weights_rolled_back=result.rolled_back,
+            sensor_faults=result.sensor_faults,
             **self._target(result.target),
             **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
             deviation=result.deviation.tolist(),
+            **self._judged(tick),
         )
+
+    def _judged(self, tick: m.Tick) -> dict[str, Any]:
+        """The fields of a `TickResult` that answer whoever gave a reference."""
+        if tick.reference is UNSET:
+            return {}
+        verdict = verdict_on(tick.reference, self.plant, self.period)
+        return {"reference_verdict": verdict, "reference_from": tick.reference.run_id}
 
     def _target(self, target: SteadyState | None) -> dict[str, Any]:
         """The fields of a `TickResult` that tell of it."""
@@ -156,6 +182,10 @@ class Translation:
             "target_x": x.tolist(),
             "target_u": u.tolist(),
             "target_distance": target.distance,
+            "reference": {
+                self.plant.states[i]: float(r + self.plant.x_e[i])
+                for i, r in zip(target.outputs, target.r, strict=True)
+            },
         }
 
     def _sample(self, tick: m.Tick, result: StepResult) -> m.Sample | None:
@@ -177,12 +207,6 @@ class Translation:
             hidden_sha256=hidden_sha256,
             K=m.Array.of(network.K),
         )
-
-
-@lru_cache(maxsize=16)
-def _source(run_id: str) -> int:
-    """A number for a run id, the same in every process."""
-    return int.from_bytes(hashlib.sha256(run_id.encode()).digest()[:7], "little")
 
 
 def _norm(vector: np.ndarray) -> float:

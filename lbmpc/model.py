@@ -38,7 +38,7 @@ class ModelError(ValueError):
 class Model:
     """x+ = A x + B u + h(x, u) with everything known but h.
 
-    Shapes: A (d, d), B (d, m), K (m, d), P (d, d), Q (d, d), R (m, m).
+    Shapes: A (d, d), B (d, m), K (m, d), P (d, d), Q (d, d), R (m, m), S (m, m).
     """
 
     plant: Known
@@ -51,6 +51,8 @@ class Model:
     """Weight of the states of one stage: its density times the period."""
     R: np.ndarray
     """Weight of the inputs of one stage, likewise."""
+    S: np.ndarray
+    """Weight of the change of the inputs from stage to stage: its density on (du/dt)^2 over the period."""
     K: np.ndarray
     """Feedback of the tubes and of the fallback."""
     P: np.ndarray
@@ -78,6 +80,11 @@ class Model:
     def closed_loop(self) -> np.ndarray:
         """A + BK, Schur stable."""
         return self.A + self.B @ self.K
+
+    @cached_property
+    def changes_cost(self) -> bool:
+        """Whether S is not zero."""
+        return bool(self.S.any())
 
     @cached_property
     def time_scale(self) -> float:
@@ -125,6 +132,7 @@ def build_model(
     Q: np.ndarray | None = None,
     R: np.ndarray | None = None,
     terminal: TerminalCost = "riccati",
+    S: np.ndarray | None = None,
 ) -> Model:
     """The model at a sampling period T.
 
@@ -136,6 +144,8 @@ def build_model(
         Q, R: diagonals of the weights as densities, per second, (d,) and (m,); ones by default. A stage weighs T times
             as much, so that the cost of a motion does not depend on how often it is sampled.
         terminal: the equation for P.
+        S: diagonal of the weight on (du/dt)^2, likewise, (m,); zeros by default. T ((u_i - u_{i-1}) / T)^2 is what a
+            stage has of it, so that a ramp costs the same however often it is sampled. P does not know of it.
 
     Raises:
         ModelError: the plant cannot be used as it is described, is not stabilisable, weights of the wrong length, or no
@@ -154,13 +164,15 @@ def build_model(
     units = balanced(known)
     A, B = _of_a_period(known, period, units)
     q, r = period * _weights("Q", Q, plant.d), period * _weights("R", R, plant.m)
+    s = _weights("S", np.zeros(plant.m) if S is None else S, plant.m) / period
     x, u = units[: plant.d], units[plant.d :]
     a, b = A * x / x[:, None], B * u / x[:, None]
     k, p = _gain_and_terminal_weight(plant, period, terminal, a, b, np.diag(q * x**2), np.diag(r * u**2), x)
     gain, terminal_weight = k * u[:, None] / x, p / np.outer(x, x)
     equations = plant if isinstance(plant, Plant) else None
     within = within_period(known, period)
-    return Model(known, period, within, A, B, np.diag(q), np.diag(r), gain, terminal_weight, equations)
+    weights = np.diag(q), np.diag(r), np.diag(s)
+    return Model(known, period, within, A, B, *weights, gain, terminal_weight, equations)
 
 
 def _of_a_period(known: Known, period: float, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

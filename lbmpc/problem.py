@@ -1,20 +1,22 @@
 """The optimisation problem of learning-based MPC, (e:LBMPC), as data.
 
-    min over v      |z_N - x^r_N|_P^2 + sum_i |z_i - x^r_i|_Q^2 + |u_i - u^r_i|_R^2         (learned trajectory z)
-    subject to      z_{i+1}    = A z_i + B u_i + h_hat(z_i, u_i),       z_0 = x_t
+    min over v      |z_N - x^r_N|_P^2 + sum_i |z_i - x^r_i|_Q^2 + |u_i - u^r_i|_R^2 + |u_i - u_{i-1}|_S^2
+    subject to      z_{i+1}    = A z_i + B u_i + h_hat(z_i, u_i),       z_0 = x_t           (learned trajectory)
                     u_i        = v_i + K (z_i - zbar_i)
                     zbar_{i+1} = A zbar_i + B v_i,                      zbar_0 = x_t         (nominal trajectory)
-                    v_i in V_i,   zbar_{i+1} in Z_{i+1}                                      i = 0 .. N-1
+                    v_i in V_i,   |v_i - v_{i-1}| <= rate T,   zbar_{i+1} in Z_{i+1}         i = 0 .. N-1
 
 in deviation coordinates. With the paper's c_i = v_i - K zbar_i each trajectory is steered by its own state, v_i =
 K zbar_i + c_i and u_i = K z_i + c_i: what h_hat moves z away from zbar by grows with A + BK, not with A, and zbar need
 not follow what h_hat asks of z (docs/decisions/0033). u_0 is v_0. Deciding in v and in c is the same, and v is far
-better conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices.
+better conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices. u_{-1} and
+v_{-1} are what acts now. By default S is 0 and the rate infinite: inputs may step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -51,6 +53,16 @@ class Problem:
     guard: Guard | None = None
     """Bounds v_0 by a certified family of sets; None: nothing is certified."""
 
+    @cached_property
+    def input_steps(self) -> np.ndarray:
+        """By how much an input may change from stage to stage, (m,); infinite where it may step."""
+        return self.model.plant.input_rates * self.model.period
+
+    @cached_property
+    def looks_back(self) -> bool:
+        """Whether v_0 depends on the input before."""
+        return bool(self.model.changes_cost or np.isfinite(self.input_steps).any())
+
 
 def build_problem(
     model: Model,
@@ -73,9 +85,12 @@ def build_problem(
     Raises:
         ModelError: the plant runs away within the horizon.
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
-        CertificateError: `invariant` without a certificate, with that of another model, or with a dead time.
+        CertificateError: `invariant` without a certificate, with that of another model, or with a dead time; `tube` or
+            `invariant` where an input has a rate limit.
     """
     require_horizon(model, horizon)
+    if tightening in ("tube", "invariant"):
+        _require_steps(model, tightening)
     guard = None
     if tightening == "invariant":
         require_no_dead_time(model)
@@ -106,6 +121,19 @@ def build_problem(
         states[0] = x_set.minus(low, high)
         states[0].require_rows(1, "state")
     return Problem(model, oracle, n, tightening, tuple(states), (u_set,) * n, True, penalty, guard)
+
+
+def _require_steps(model: Model, tightening: Tightening) -> None:
+    """What these two claim, X for ever, they claim of inputs that may step. The actuator's rate is physics: it wins."""
+    plant = model.plant
+    if limited := [
+        name for name, rate in zip(plant.inputs, plant.input_rates, strict=True) if np.isfinite(rate)
+    ]:
+        raise CertificateError(
+            f"the tightening `{tightening}` claims that X can be kept for ever, and its sets do not know of a limit on "
+            f"how fast {', '.join(limited)} may change: leave out plant.input_rate_max (u_rate_max of the plant), or "
+            "take the tightening `first_step`, which claims nothing"
+        )
 
 
 def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytope, n: int) -> Polytope:

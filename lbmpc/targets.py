@@ -14,7 +14,7 @@ constrained least-squares problem; where its solution is outside the rows, a QP 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,62 +57,82 @@ class SteadyState:
     status: TargetStatus
     distance: float
     """Largest distance of an output from r, as a share of its half-width."""
+    outputs: tuple[int, ...]
+    """Indices of the outputs, p."""
+    r: np.ndarray
+    """(p,)"""
 
 
 class TargetSelector:
-    """Finds targets of one problem, for one parameter theta of its oracle after another.
+    """Finds targets of one problem, for one parameter theta of its oracle and one reference after another.
 
     Args:
         problem: its model, oracle, cost, X and U.
-        outputs: indices of the states that are outputs, (p,); more than there are inputs meet their r in part.
-        r: where they should be, (p,), deviations.
         realise: what turns a CasADi function into the one that is called.
     """
 
     def __init__(
         self,
         problem: Problem,
-        outputs: Sequence[int] = (),
-        r: np.ndarray | Sequence[float] = (),
         realise: Callable[[ca.Function], ca.Function] = lambda function: function,
     ):
         model, plant = problem.model, problem.model.plant
-        chosen = list(outputs)
+        self._problem, self._realise = problem, realise
         self._scale = np.concatenate([plant.x_scale, plant.u_scale])
-        there = np.asarray(r, dtype=float) / plant.x_scale[chosen]
-        self._wanted = [*zip(chosen, there.tolist(), strict=True)]
         weights = np.concatenate([np.diag(model.Q), np.diag(model.R)]) * self._scale**2
-        weights = np.maximum(weights / weights.max(), LEAST)
-        if chosen:
-            weights *= SECOND
-            weights[chosen] += 1.0
-        self._per_weight = 1.0 / np.sqrt(weights)
-        wanted = np.zeros_like(weights)
-        wanted[chosen] = there
+        self._weights = np.maximum(weights / weights.max(), LEAST)
         self._rows, self._lower, self._upper = _rows(problem, self._scale)
         ranges = row_ranges(self._rows, 1.0)
         self._penalty = Penalty(np.ones(len(self._rows), dtype=bool), ranges, PENALTY)
         low, high = np.concatenate([plant.x_min, plant.u_min]), np.concatenate([plant.x_max, plant.u_max])
         equilibrium = np.concatenate([plant.x_e, plant.u_e])
         self._low, self._high = (low - equilibrium) / self._scale, (high - equilibrium) / self._scale
-        w, theta = ca.MX.sym("w", len(weights)), ca.MX.sym("theta", problem.oracle.parameters)
+        # Built at the first search: a controller without a reference does not need it.
+        self._function: Bound | None = None
+        self._chosen: tuple[int, ...] | None = None
+        self._per_weight = np.zeros(0)
+
+    @property
+    def _newton(self) -> Bound:
+        if self._function is None:
+            self._function = Bound(self._realise(self._build()))
+        return self._function
+
+    def _build(self) -> ca.Function:
+        problem, size = self._problem, len(self._scale)
+        w, theta = ca.MX.sym("w", size), ca.MX.sym("theta", problem.oracle.parameters)
+        weights, wanted = ca.MX.sym("weights", size), ca.MX.sym("wanted", size)
         free, rests, wrong = newton_step(problem, self._scale, weights, wanted, w, theta)
         moved = ca.mmax(ca.fabs(free - w))
         values = ca.DM(self._rows) @ free
-        outside = ca.mmax(ca.fmax(self._lower - values, values - self._upper) / ranges)
+        outside = ca.mmax(ca.fmax(self._lower - values, values - self._upper) / self._penalty.scale)
         inside = ca.fmin(ca.fmax(free, self._low), self._high)
         said = ca.vertcat(wrong, moved, outside)
         found = {"free": free, "inside": inside, "rests": ca.densify(rests), "said": said}
-        function = ca.Function("newton", [w, theta], [*found.values()], ["w", "theta"], list(found))
-        self._newton = Bound(realise(function))
+        inputs = {"w": w, "theta": theta, "weights": weights, "wanted": wanted}
+        return ca.Function("newton", [*inputs.values()], [*found.values()], [*inputs], list(found))
 
-    def find(self, theta: np.ndarray, start: np.ndarray) -> SteadyState:
-        """The target under the oracle's parameters theta, from `start`, (d + m,): x and u of the last one.
+    def find(
+        self, theta: np.ndarray, start: np.ndarray, outputs: tuple[int, ...], r: np.ndarray
+    ) -> SteadyState:
+        """The target under the oracle's parameters theta.
 
         Never raises for numbers; where they cannot be used it is the equilibrium, with the status `no rest`.
+
+        Args:
+            theta: the oracle's.
+            start: x and u of the last target, (d + m,).
+            outputs: indices of the states that are outputs, p; more than there are inputs meet their r in part.
+            r: where they should be, (p,), deviations.
         """
         w, rests = start / self._scale, False
-        self._newton.inputs["theta"][:, 0] = theta
+        chosen = list(outputs)
+        wanted = r / self._scale[chosen]
+        inputs = self._newton.inputs
+        inputs["theta"][:, 0] = theta
+        self._weigh(outputs)
+        inputs["wanted"][:, 0] = 0.0
+        inputs["wanted"][chosen, 0] = wanted
         for _ in range(STEPS):
             w, moved, outside = self._step(w)
             if not np.isfinite(moved):
@@ -120,9 +140,20 @@ class TargetSelector:
             if moved < ARRIVED:
                 rests = outside <= INSIDE
                 break
-        distance = max(abs(float(w[i]) - r) for i, r in self._wanted) if self._wanted else 0.0
+        distance = float(np.abs(w[chosen] - wanted).max(initial=0.0))
         status: TargetStatus = "no rest" if not rests else "reached" if distance < REACHED else "nearest"
-        return SteadyState(w * self._scale, status, distance)
+        return SteadyState(w * self._scale, status, distance, outputs, r)
+
+    def _weigh(self, outputs: tuple[int, ...]) -> None:
+        """Weights of x and u for these outputs."""
+        if outputs == self._chosen:
+            return
+        weights = self._weights.copy()
+        if outputs:
+            weights *= SECOND
+            weights[list(outputs)] += 1.0
+        self._newton.inputs["weights"][:, 0] = weights
+        self._per_weight, self._chosen = 1.0 / np.sqrt(weights), outputs
 
     def _step(self, w: np.ndarray) -> tuple[np.ndarray, float, float]:
         """One Newton step from w, (d + m,), in half-widths.
@@ -154,7 +185,7 @@ class TargetSelector:
 
 
 def newton_step(
-    problem: Problem, scale: np.ndarray, weights: np.ndarray, wanted: np.ndarray, w: ca.MX, theta: ca.MX
+    problem: Problem, scale: np.ndarray, weights: ca.MX, wanted: ca.MX, w: ca.MX, theta: ca.MX
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """One Newton step from w, (d + m,), in units of `scale`, (d + m,).
 
@@ -167,7 +198,7 @@ def newton_step(
     h, slopes = _h_at_rest(problem.oracle, w * scale, theta)
     motion = (linear @ (w * scale) + h) / scale[:d]
     rests = (linear + slopes) * (scale / scale[:d, None])
-    matrix = ca.vertcat(ca.horzcat(ca.DM(np.diag(weights)), rests.T), ca.horzcat(rests, ca.DM.zeros(d, d)))
+    matrix = ca.vertcat(ca.horzcat(ca.diag(weights), rests.T), ca.horzcat(rests, ca.DM.zeros(d, d)))
     matrix, right = ca.densify(matrix), ca.densify(ca.vertcat(wanted, rests @ w - motion))
     solution = ca.solve(matrix, right, "qr")
     # A sum of squares, since a largest one of CasADi overlooks what is no number.

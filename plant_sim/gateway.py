@@ -107,7 +107,8 @@ class Gateway:
         depend on the state.
 
         Args:
-            read: the state, (d,), plant units, as it is now.
+            read: the state, (d,), plant units, as it is now. With an estimator NaN may stand for states of which no
+                number comes, as of a sensor that is dead.
             write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where
                 the input is the same, and at least every two periods, for a watchdog of the machine's own.
             stop: outside the main thread, where no signal arrives, the only way to end it.
@@ -119,7 +120,8 @@ class Gateway:
         config, run_id = self.config, new_run_id("plant")
         place = core_for(config, "plant", os.sched_getaffinity(0))
         shield = Shield(self.known, config.period, config.plant.plan_patience, run_id, held=self._simulated)
-        machine = Guarded(read, write, self.known.d, config.period, self._simulated)
+        gaps = config.estimator.kind != "none"
+        machine = Guarded(read, write, self.known.d, config.period, self._simulated, gaps)
         self._serving = shield, machine
         # Until there is a router, too.
         _leave_safe(shield, machine)

@@ -34,9 +34,14 @@ class NotMeasured(Exception):
 class Guarded:
     """Calls them, never both at a time, and counts what goes wrong. `trouble` may be asked by any thread."""
 
-    def __init__(self, read: Read, write: Write, states: int, period: float, simulated: bool):
-        """states: d. simulated: each call counts as made when it was due, and what it raises is an error of its own."""
-        self._read, self._write = read, write
+    def __init__(
+        self, read: Read, write: Write, states: int, period: float, simulated: bool, gaps: bool = False
+    ):
+        """states: d. simulated: each call counts as made when it was due, and what it raises is an error of its own.
+
+        gaps: NaN may stand for some of the states.
+        """
+        self._read, self._write, self._gaps = read, write, gaps
         self._states, self._slow, self._simulated = states, SLOW * period, simulated
         self._under_way: tuple[Call, float] | None = None
         self._failures: dict[Call, tuple[str, float]] = {}
@@ -71,7 +76,8 @@ class Guarded:
         x = np.array(self._read(), dtype=float)
         if x.shape != (self._states,):
             raise ValueError(f"x has the shape {x.shape}, the plant has {self._states} states")
-        if not np.isfinite(x).all():
+        gaps = np.isnan(x)
+        if not np.isfinite(x).all() and (not self._gaps or gaps.all() or np.isinf(x).any()):
             raise ValueError("x is not finite")
         return x
 

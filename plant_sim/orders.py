@@ -13,7 +13,8 @@ from lbmpc.plants import Description
 from protocol.messages import Backup, Command, InputSource
 
 Measure = Callable[[], np.ndarray | None]
-"""x, (d,), of this moment; None where it cannot be measured. Called only by what depends on it."""
+"""x, (d,), of this moment, NaN for a state of which no number came; None where none of it can be measured. Called only
+by what depends on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +94,8 @@ def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
     if plant.safe_gain is None:
         return Drive(within(plant, plant.safe_input), "safe", math.inf)
     x = measure()
-    return Drive(within(plant, plant.safe_input if x is None else plant.safe_input_at(x)), "safe", ends)
+    u = plant.safe_input if x is None or not np.isfinite(x).all() else plant.safe_input_at(x)
+    return Drive(within(plant, u), "safe", ends)
 
 
 def within(plant: Description, u: list[float] | np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Sensors of a simulated plant that err: noise, white or coloured, quantisation, bias, lost samples, a stuck value."""
+"""Sensors of a simulated plant that err: noise, white or coloured, quantisation, bias, lost samples, stuck, dead."""
 
 from __future__ import annotations
 
@@ -29,15 +29,19 @@ class Sensors:
         self._step = in_half_widths(settings.quantisation, plant) * self._scale
         self._bias = in_half_widths(settings.bias, plant) * self._scale
         self._stuck_from = np.array([settings.stuck.get(name, math.inf) for name in names])
+        self._dead_from = np.array([settings.dead.get(name, math.inf) for name in names])
         self._draws = np.random.default_rng([config.seed, SENSORS])
         self._last: tuple[float, np.ndarray] | None = None
         self._first: float | None = None
         self._held = np.full(len(names), math.nan)
-        err = self._noise.any() or self._step.any() or self._bias.any() or settings.stuck or settings.dropouts
-        self._perfect = not err
+        shares = self._noise.any() or self._step.any() or self._bias.any()
+        self._perfect = not (shares or settings.stuck or settings.dead or settings.dropouts)
 
     def measure(self, x: np.ndarray, t: float) -> np.ndarray | None:
-        """What is measured of x, (d,), at t, seconds, plant units; None where the sample is lost. t must not fall."""
+        """What is measured of x, (d,), at t, seconds, plant units; None where the sample is lost. t must not fall.
+
+        NaN is in the place of a state whose sensor is dead.
+        """
         if self._perfect:
             return x
         self._first = t if self._first is None else self._first
@@ -49,7 +53,7 @@ class Sensors:
         seen[coarse] = np.rint(seen[coarse] / self._step[coarse]) * self._step[coarse]
         stuck = since >= self._stuck_from
         self._held = np.where(stuck & ~np.isnan(self._held), self._held, np.where(stuck, seen, math.nan))
-        seen = np.where(stuck, self._held, seen)
+        seen = np.where(since >= self._dead_from, math.nan, np.where(stuck, self._held, seen))
         lost = self._settings.dropouts > 0.0 and self._draws.uniform() < self._settings.dropouts
         return None if lost else seen
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from operator import mul
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from lbmpc.plants import Description
 from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
+from plant_sim.rate_limit import RateLimit
 from protocol.messages import Backup, Command, InputSource, Piece, PlantState
 
 Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
@@ -61,6 +62,8 @@ class Shield:
         self.plant = plant
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
+        # Before anything acts, the actuator is where it is without anybody.
+        self._rate_limit = RateLimit(plant.input_rates, period, within(plant, plant.safe_input))
         self._first: float | None = None
         self._t = self._measured = self._acted = -math.inf
         self._seq = -1
@@ -162,7 +165,7 @@ class Shield:
         self._written = False
 
     def rest(self) -> np.ndarray | None:
-        """The input, (m,), to leave a machine with; None: one that stood still before its first command needs none."""
+        """The input, (m,), to leave a machine with, at once; None: one that stood still before its first command needs none."""
         return None if self._held else within(self.plant, self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
@@ -173,10 +176,17 @@ class Shield:
         return orders.drive(t, measure, self._standby.get(orders.seq) or self._standby.get(orders.seq - 1))
 
     def _write(self, drive: Drive, due: float, machine: Machine) -> None:
-        since = machine.write(drive.u, due)
-        self._acted, self._until = due, drive.until
+        """Whatever acts passes here: as far as its rate allows, and the rest of the way as soon as that does."""
+        reached = self._rate_limit.nearest(drive.u, due)
+        since = machine.write(reached, due)
+        self._acted = due
         self._written = since is not None
-        u = None if since is None else drive.u
+        if self._written:
+            self._rate_limit.acts(reached, due)
+        self._until = drive.until
+        if reached is not drive.u:
+            self._until = min(drive.until, self._rate_limit.next_step(due))
+        u = None if since is None else reached
         self._tape.append(
             _Acting(max(due if since is None else since, self._tape[-1].since), u, drive.source)
         )
@@ -185,7 +195,9 @@ class Shield:
     # -- what a sample says ------------------------------------------------------------------------------
 
     def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
-        """x(t), (d,), and what acted since the sample before; t must rise by about whole periods, after `advance`.
+        """x(t), (d,), NaN where no number came, and what acted since the sample before.
+
+        t must rise by about whole periods, after `advance`.
 
         `applied` is the time average of the input over the last period, that input itself when only one
         acted, and None when a part of it is not known or the last sample is not one period ago.
@@ -213,11 +225,11 @@ class Shield:
             run_id=self._run_id,
             seq=self._seq,
             t=t,
-            x=x.tolist(),
             applied=applied,
             pieces=pieces if applied is None or len(pieces) > 1 else [],
             source=acted[-1][1].source if acted else self._tape[0].source,
             command_seq=-1 if orders is None else orders.seq,
+            **measurement(self.plant, x),
         )
 
     def _begin_epoch(self, t: float) -> None:
@@ -252,6 +264,15 @@ class Shield:
             return inputs[0]
         shares = [seconds / total for seconds, _one in acted]
         return [sum(map(mul, shares, entries)) for entries in zip(*inputs, strict=True)]
+
+
+def measurement(plant: Description, x: np.ndarray) -> dict[str, Any]:
+    """The fields of a `PlantState` that tell of x, (d,): NaN, where no number came, does not travel."""
+    missing = np.isnan(x)
+    if not missing.any():
+        return {"x": x.tolist()}
+    names = [plant.states[i] for i in np.flatnonzero(missing)]
+    return {"x": np.where(missing, plant.x_e, x).tolist(), "missing": names}
 
 
 def _pieces(acted: list[tuple[float, _Acting]]) -> list[Piece]:

@@ -123,6 +123,8 @@ def _surely_finite(value: object) -> bool:
         if type(first) is list and first and type(first[0]) is float:
             return isfinite(sum(map(sum, value)))
         return all(map(_surely_finite, value))
+    if isinstance(value, dict):
+        return all(map(_surely_finite, value.values()))
     if not isinstance(value, msgspec.Struct) or isinstance(value, m.Array):
         return False
     return all(_surely_finite(getattr(value, name)) for name in _fields_with_floats(type(value)))

@@ -97,6 +97,8 @@ class PlantState(Message, frozen=True, kw_only=True):
     source: InputSource
     command_seq: Sequence
     """Tick of the last command received, -1 before the first."""
+    missing: list[str] = msgspec.field(default_factory=list)
+    """States of which no number came, by name; their entries of x count nothing."""
 
 
 class Command(Message, frozen=True):
@@ -250,12 +252,26 @@ class TickResult(Message, frozen=True):
     """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
     deviation: list[float] = []
     """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
+    sensor_faults: dict[str, str] = msgspec.field(default_factory=dict)
+    """Sensors that are not believed, by the names of their states: what is wrong, and what is known of these states."""
+    reference: dict[str, float] = {}
+    """Where the outputs should be in this tick, by name, plant units; empty where there are none."""
+    reference_verdict: str = "none"
+    """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
+    reference_from: str = ""
+    """run_id of who sent that; empty without one."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:
         """What became of the hidden weights on offer."""
         outcome = self.weights_verdict.partition(": ")[0]
         return "adopted" if outcome == "adopted" else "refused" if outcome == "refused" else "none"
+
+
+def words_of_fault(state: str, fault: str, since: float) -> str:
+    """One entry of `TickResult.sensor_faults` that is there since so many seconds, for a person."""
+    kind, _, known = fault.partition("; ")
+    return f"sensor {state} is {kind} since {since:.1f} s; {known}"
 
 
 def weights_verdict(outcome: WeightsOutcome, reason: str = "") -> str:

@@ -30,6 +30,7 @@ from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
 from tandem.commands.report import Report
 from tandem.commands.run import Run
+from tandem.commands.set_point import SetPoint
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
 from tandem.streams import never_failing
@@ -46,6 +47,7 @@ AnyCommand = (
     | Annotated[Plant, subcommand("plant")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Health, subcommand("health")]
+    | Annotated[SetPoint, subcommand("set-point")]
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[SetsCommand, subcommand("sets")]
     | Annotated[ModelCommand, subcommand("model")]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from controller_node.asked import change_of
 from controller_node.build import GivenPlant, build_plant
 from lbmpc.plants import (
     PLANTS,
@@ -32,10 +33,11 @@ from node_runtime.config.sections import Config, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
-from protocol.messages import TickResult
+from protocol.messages import Reference, TickResult
 from run_log.reporting.summary import Summary, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import Run
+from tandem import set_points
 from tandem.experiments.simulation.lockstep import LockStep
 
 if TYPE_CHECKING:
@@ -131,6 +133,32 @@ class Loop:
                 f"({', '.join(self.plant.states)})"
             )
         return self._step(state).u
+
+    def set_point(self, values: Mapping[str, float], over: float = 0.0, lease: float | None = None) -> None:
+        """Where outputs shall be, from the next period on: {"y": 1.8}.
+
+        Args:
+            values: by the name of a state, plant units.
+            over: seconds in which a straight line leads there; 0: at once.
+            lease: seconds after which the configured reference is back; None: it stays.
+
+        Raises:
+            ValueError: no such state, or a value outside X; nothing has happened then.
+        """
+        self.reference(set_points.set_point(values, over, lease))
+
+    def reference(self, reference: Reference | None) -> None:
+        """Where the plant shall go, from the next period on; None: where the configuration says.
+
+        Args:
+            reference: for instance of `tandem.set_points.trajectory`, or `from_file`.
+
+        Raises:
+            ValueError: it is none of this plant; nothing has happened then.
+        """
+        asked = reference or Reference(run_id=set_points.UNSAID, seq=0, kind="configured")
+        change_of(asked, self.plant, self.config.period)
+        self._lockstep.ask(asked)
 
     def start_again(self) -> None:
         """Another episode: the plant is put back, what was learned is kept, and no label reaches across.

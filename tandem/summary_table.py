@@ -25,6 +25,7 @@ MEANING = {
     "soft_ticks": "a soft state constraint gave way",
     "fallback_ticks": "input not from the solver",
     "unreached_ticks": "no rest has the outputs where they should be, or none was found",
+    "sensor_faults": "sensors that were not believed",
     "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
     "J": "sum of the stage costs, Q and R per second",
@@ -54,8 +55,15 @@ OF_EACH_STATE = {
     "constant_weight": "share",
 }
 """Which figure of each performance state these are."""
-WHERE_ASKED_FOR = ("unreached_ticks", "target_distance", "offset", "weight", "constant_weight")
-"""Rows that the table of a run without a reference, or without an estimator, has not."""
+WHERE_THERE_IS_ONE = (
+    "unreached_ticks",
+    "target_distance",
+    "offset",
+    "sensor_faults",
+    "weight",
+    "constant_weight",
+)
+"""Rows that the table of another run has not: one without a reference, an estimator, or such a fault."""
 # Anything but zero is worth a look.
 SHOULD_BE_ZERO = (
     "late_ticks",
@@ -69,6 +77,7 @@ SHOULD_BE_ZERO = (
     "constraint_violations",
     "excess_between_samples",
     "outside_ticks",
+    "sensor_faults",
 )
 
 
@@ -86,7 +95,7 @@ def table(summary: Summary) -> Table:
     if len(episodes) > 1:
         figures = {"J_by_episode": {str(i): one["J"] for i, one in enumerate(episodes)}} | figures
     for name, value in figures.items():
-        if name in WHERE_ASKED_FOR and value in (None, {}):
+        if name in WHERE_THERE_IS_ONE and value in (None, {}, []):
             continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
@@ -106,6 +115,8 @@ def _text(name: str, value: Any) -> str:
         return ABSENT.get(name, "-")
     if name in OF_EACH_STATE:
         return ", ".join(f"{state} {_text(OF_EACH_STATE[name], one)}" for state, one in value.items())
+    if isinstance(value, list):
+        return "\n".join(value)
     if isinstance(value, dict):
         return " / ".join(_text("", part) for part in value.values())
     if name == "share":

@@ -63,6 +63,7 @@ class LyingSolver:
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         plant, m = self._model.plant, self._model.m
         low, high = (plant.u_min - plant.u_e, plant.u_max - plant.u_e) if first is None else first
@@ -79,10 +80,13 @@ class LyingSolver:
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None:
         """Never asked."""
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution:
         raise AssertionError("only asked to solve")
 
 

@@ -2,6 +2,9 @@
 
 Lock-step runs of the paper's start: undisturbed, with measurement noise, and under a stolen trainer that sends a set at
 every tick, at every seventh, or in place of each set that the real one trained; each with the trial and without it.
+What follows the number of seeds is settings of every run, and then only those with the trial are made. With noise:
+
+    python -m verification.stolen_trainer 1 plant.sensors.noise=0.01 estimator.kind=kalman
 """
 
 from __future__ import annotations
@@ -38,19 +41,22 @@ ATTACKS: dict[str, Forge] = {
 SENT = {"every tick": (1, False), "every 7th": (7, False), "instead": (1, True)}
 
 
-def measure(seeds: range) -> Table:
+def measure(seeds: range, settings: list[str]) -> Table:
     """One row a case: means over the seeds."""
     table = Table(
         "what is sent", "when", "trial", "adopted", "refused", "rolled back", "J", "overshoot", "outside"
     )
-    for trial in (True, False):
-        for name, sensors in DISTURBANCES.items():
-            runs = [follow(load(None, [*_settings(seed, trial), *sensors]), STEPS).run for seed in seeds]
+    for trial in (True,) if settings else (True, False):
+        for name, sensors in {"none": []}.items() if settings else DISTURBANCES.items():
+            changed = [*settings, *sensors]
+            runs = [follow(load(None, [*_settings(seed, trial), *changed]), STEPS).run for seed in seeds]
             _row(table, (name, "-"), trial, runs)
         for name, forge in ATTACKS.items():
             for when, (every, instead) in SENT.items():
                 runs = [
-                    follow_attacked(load(None, _settings(seed, trial)), STEPS, forge, every, instead)
+                    follow_attacked(
+                        load(None, [*_settings(seed, trial), *settings]), STEPS, forge, every, instead
+                    )
                     for seed in seeds
                 ]
                 _row(table, (name, when), trial, runs)
@@ -78,4 +84,5 @@ def _row(table: Table, words: tuple[str, str], trial: bool, runs: list[Run]) -> 
 
 
 if __name__ == "__main__":
-    Console(width=140).print(measure(range(int(sys.argv[1])) if len(sys.argv) > 1 else SEEDS))
+    seeds = range(int(sys.argv[1])) if len(sys.argv) > 1 else SEEDS
+    Console(width=140).print(measure(seeds, sys.argv[2:]))

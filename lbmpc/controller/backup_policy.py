@@ -4,16 +4,16 @@ The plan of (e:LBMPC) keeps the constraints of the *nominal* model, step after s
 and each new sample mends what h did. Followed blindly it is no more than a guess. So besides it there is a second
 problem, solved where there is time, with the same cost and the learned states in the place of the nominal ones:
 
-    min over v      |z_N - x^r|_P^2 + sum_i |z_i - x^r|_Q^2 + |v_i - u^r|_R^2
+    min over v      |z_N - x^r|_P^2 + sum_i |z_i - x^r|_Q^2 + |v_i - u^r|_R^2 + |v_i - v_{i-1}|_S^2
     subject to      z_{i+1} = A z_i + B v_i + h_hat(z_i, v_i),
-                    v_i in U,   z_{i+1} in (1 - margin) X                                    i = 0 .. N-1
+                    v_i in U,   |v_i - v_{i-1}| <= rate T,   z_{i+1} in (1 - margin) X       i = 0 .. N-1
 
 from z_0, the state to which the command that was just given leads, to the target of that command's plan. Its solution
 is followed with feedback,
 
     u_i = v_i + K (x_i - z_i),
 
-which takes no more than the plant's own sensors. K is stiffer than the model's: what the plan does not know must not
+which takes no more than the plant's own sensors; the plant keeps u to its range and its rate. K is stiffer than the model's: what the plan does not know must not
 add up. Nothing of this is certified: h_hat is what was learned so far.
 
 The margin is room for what h_hat does not know, and where the way to x^r leads along a bound it can cost the way
@@ -41,7 +41,7 @@ from lbmpc.problem import Problem
 from lbmpc.sets.constraint_sets import state_set
 from lbmpc.solver.constraint_rows import Rows
 from lbmpc.solver.least_distance import NO_ROWS
-from lbmpc.solver.riccati import build_rows, build_sweep
+from lbmpc.solver.riccati import build_rows, build_sweep, with_input
 from lbmpc.solver.subproblem import Subproblem
 
 STEPS = 2
@@ -109,6 +109,7 @@ class BackupPlanner:
         plan: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> Policy | None:
         """The policy from the predicted state s, (D,), on.
 
@@ -117,12 +118,15 @@ class BackupPlanner:
             theta: the oracle's parameters.
             plan: the nominal plan from there on, (N, m).
             xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`, the same at every step.
+            previous: that command, (m,), as for `Solver.solve`.
 
         Returns:
             None when the numbers are unusable.
         """
         with np.errstate(all="ignore"):
-            self._subproblem.load(s, theta, xr, ur)
+            for rows in (self._kept, self._plain):
+                rows.bound_first(None, previous)
+            self._subproblem.load(with_input(self.problem.model, s, previous), theta, xr, ur)
             kept = self._best(self._kept, np.asarray(plan, dtype=float), STEPS)
             if kept is None:
                 return None

@@ -32,11 +32,35 @@ def shift(plan: Plan) -> Plan:
 
 
 def feedback_plan(
-    model: Model, x: np.ndarray, horizon: int, xs: np.ndarray | float = 0.0, us: np.ndarray | float = 0.0
+    model: Model,
+    x: np.ndarray,
+    horizon: int,
+    xs: np.ndarray | float = 0.0,
+    us: np.ndarray | float = 0.0,
+    previous: np.ndarray | None = None,
 ) -> np.ndarray:
-    """us + K (x - xs) clipped to U, along the nominal prediction from x, (N, m); xs (d,) and us (m,): the target."""
+    """us + K (x - xs) clipped to U, along the nominal prediction from x, (N, m); xs (d,) and us (m,): the target.
+
+    Where inputs have rate limits, each is brought within reach of the one before, the first of `previous`, (m,).
+    """
     plant, inputs = model.plant, np.zeros((horizon, model.m))
     for i in range(horizon):
         inputs[i] = np.clip(us + model.K @ (x - xs), plant.u_min - plant.u_e, plant.u_max - plant.u_e)
+        if previous is not None:
+            previous = inputs[i] = reachable(model, inputs[i], previous)
         x = model.A @ x + model.B @ inputs[i]
     return inputs
+
+
+def reachable(model: Model, u: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,)."""
+    step = model.plant.input_rates * model.period
+    return np.clip(u, previous - step, previous + step)
+
+
+def all_reachable(model: Model, inputs: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    """`reachable` for one input of (N, m) after the other."""
+    kept = np.empty_like(inputs)
+    for i, u in enumerate(inputs):
+        previous = kept[i] = reachable(model, u, previous)
+    return kept

@@ -10,6 +10,7 @@ import numpy as np
 
 from lbmpc.oracles.base import HiddenSet, Verdict
 from lbmpc.plants.linear_motion import Pieces
+from lbmpc.references import Change
 from lbmpc.sets.guard import FirstInputs
 from lbmpc.solver.solution import Solution
 from lbmpc.targets import SteadyState
@@ -34,6 +35,10 @@ class Observation:
     now."""
     truth: Mapping[str, float] = field(default_factory=dict)
     """Parameters of the true plant that are others from now on, by name; for the oracle that knows the truth."""
+    reference: Change | None = None
+    """Where the outputs should be from now on; None: as before."""
+    skipped: int = 0
+    """Periods without a step since the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +78,8 @@ class StepResult:
     """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; (0, d) where nothing weighs it."""
     deviation: np.ndarray
     """Standard deviation of the state that is known, (d,); (0,) where a sample is the state."""
+    sensor_faults: dict[str, str] = field(default_factory=dict)
+    """Which sensors are not believed, by the names of their states, and in words what is wrong."""
 
     @property
     def new_network(self) -> bool:

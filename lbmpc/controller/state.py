@@ -10,6 +10,7 @@ from lbmpc.controller.dead_time import LineState
 from lbmpc.controller.fallback import Plan
 from lbmpc.estimator.base import EstimatorState
 from lbmpc.oracles.base import OracleState
+from lbmpc.references import Reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +31,12 @@ class ControllerState:
     target: np.ndarray
     """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
     estimator: EstimatorState
+    commanded: np.ndarray
+    """The last input that was commanded, (m,), or the safe one; (0,) where no plan depends on it."""
     line: LineState = field(default_factory=dict)
     """What was written and has not acted yet, `lbmpc.controller.dead_time`; empty without a dead time."""
+    reference: Reference | None = None
+    """The one that was given, as of the next tick; None: the configured one."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -43,18 +48,23 @@ class ControllerState:
             "predicted": self.predicted,
             "delay": np.array([self.delay]),
             **({"target": self.target} if self.target.size else {}),
+            **({"commanded": self.commanded} if self.commanded.size else {}),
+            **{f"reference.{name}": array for name, array in self._reference_arrays().items()},
             **{f"estimator.{name}": array for name, array in self.estimator.items()},
             **{f"line.{name}": array for name, array in self.line.items()},
             **{f"oracle.{name}": array for name, array in self.oracle.items()},
         }
 
+    def _reference_arrays(self) -> dict[str, np.ndarray]:
+        return {} if self.reference is None else self.reference.to_arrays()
+
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
-        """Raises KeyError when an array is missing."""
+        """Raises KeyError when an array is missing, ValueError where those of a reference are none."""
         source, sequence = (int(value) for value in arrays["pending"])
-        oracle, estimator, line = (
+        oracle, estimator, line, reference = (
             {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-            for prefix in ("oracle.", "estimator.", "line.")
+            for prefix in ("oracle.", "estimator.", "line.", "reference.")
         )
         plan = Plan(arrays["plan.u"], arrays["plan.c"], int(arrays["plan.left"][0]))
         return cls(
@@ -66,5 +76,7 @@ class ControllerState:
             oracle,
             arrays.get("target", np.zeros(0)),
             estimator,
+            arrays.get("commanded", np.zeros(0)),
             line,
+            Reference.from_arrays(reference, len(arrays["pending.x"])) if reference else None,
         )

@@ -12,20 +12,22 @@ from typing import Protocol
 
 import numpy as np
 
+from lbmpc.controller.aims import Aim, Aims
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
 from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
-from lbmpc.controller.fallback import Plan, empty_plan, feedback_plan, shift
+from lbmpc.controller.fallback import Plan, all_reachable, empty_plan, feedback_plan, shift
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
 from lbmpc.model import Model
 from lbmpc.oracles.base import OracleState, Verdict, follow
 from lbmpc.problem import Problem
+from lbmpc.references import Reference
 from lbmpc.sets.guard import FirstInputs
 from lbmpc.sets.motion import LATEST, motion_of
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.solution import Solution
-from lbmpc.targets import SteadyState, TargetSelector
+from lbmpc.targets import TargetSelector
 
 DELAY_GAIN = 0.2
 """Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
@@ -42,6 +44,7 @@ class Solves(Protocol):
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution: ...
 
     def prepare(
@@ -51,9 +54,12 @@ class Solves(Protocol):
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None: ...
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution: ...
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution: ...
 
 
 ABSURD = 1e6
@@ -69,7 +75,8 @@ class Controller:
         solver: solves it.
         real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
         input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
-        targets: finds where plans aim; None: at the equilibrium.
+        targets: finds where plans aim; None: at the equilibrium, whatever is asked for.
+        reference: the configured one, until another is given; None: the equilibrium.
         estimator: the state from what is measured; None: a sample is the state.
     """
 
@@ -80,14 +87,15 @@ class Controller:
         real_time: bool = False,
         input_delay: float = 0.0,
         targets: TargetSelector | None = None,
+        reference: Reference | None = None,
         estimator: Estimator | None = None,
     ):
         self.problem, self._solver, self.real_time = problem, solver, real_time
-        self._targets = targets
         self._prepared_for: ControllerState | None = None
-        self._prepared_target: SteadyState | None = None
+        self._prepared_aim = Aim()
         self.model: Model = problem.model
         self.line = InputLine(self.model.plant, self.model.period)
+        self.aims = Aims(self.model, problem.horizon, targets, reference)
         self._first_delay = self._acceptable(input_delay)
         guard = problem.guard
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
@@ -101,10 +109,13 @@ class Controller:
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
         s = self._with_past(oracle, nothing)
-        target = np.zeros(0 if self._targets is None else self.model.d + self.model.m)
+        target = self.aims.nothing_yet
         memory = self.estimator.initial_state()
-        line = self.line.initial_state()
-        return ControllerState(plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, line)
+        plant, line = self.model.plant, self.line.initial_state()
+        commanded = plant.safe_input - plant.u_e if self.problem.looks_back else np.zeros(0)
+        return ControllerState(
+            plan, nothing, (0, -1), s, self._first_delay, oracle, target, memory, commanded, line
+        )
 
     def prepare(self, state: ControllerState) -> None:
         """Do now what the next step from this state would do first: linearise about the predicted state.
@@ -114,9 +125,10 @@ class Controller:
         """
         if self._prepares(state) and self._prepared_for is not state:
             theta = self.oracle.theta(state.oracle)
-            self._prepared_target = target = self._find_target(state, theta)
-            references = self._references(_aim(target))
-            self._solver.prepare(state.predicted, theta, state.plan.c, *references)
+            self._prepared_aim = aim = self._aim(state, state.reference, theta, state.delay)
+            self._solver.prepare(
+                state.predicted, theta, state.plan.c, *aim.references, previous=_known(state.commanded)
+            )
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
@@ -126,8 +138,10 @@ class Controller:
         """
         if state.plan.left == 0 or self.line.dead_time:
             return None
-        theta, references = self.oracle.theta(state.oracle), self._references(state.target)
-        return planner.policy(state.predicted, theta, state.plan.u, *references)
+        theta = self.oracle.theta(state.oracle)
+        aim = self._aim(state, state.reference, theta, state.delay, new=False)
+        previous = _known(state.commanded)
+        return planner.policy(state.predicted, theta, state.plan.u, *aim.references, previous=previous)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
         """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
@@ -149,9 +163,16 @@ class Controller:
         first = None if guard is None or start is None else guard.first_inputs(start)
         # A prepared step goes on from what was known when it was prepared.
         theta = None if self._prepares(state) else self.oracle.theta(oracle)
-        target = self._target(state, theta)
+        x = state.predicted[: self.model.d] if seen.x is None else seen.x
+        reference = self.aims.latched(state.reference, seen.reference, seen.skipped, x, state.target)
+        if theta is None:
+            self.prepare(state)
+            aim = self._prepared_aim
+        else:
+            aim = self._aim(state, reference, theta, delay)
         s = state.predicted if start is None else self._with_past(there, start)
-        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, target)
+        previous = self._previous(state, written)
+        plan, mode, solution = self._plan(state, theta, None if start is None else s, first, aim, previous)
         pending_x, pending = (
             (seen.x, (seen.source, seen.sequence)) if seen.x is not None else (state.pending_x, (0, -1))
         )
@@ -159,17 +180,29 @@ class Controller:
         after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
         estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
         memory = ControllerState(
-            shift(plan), pending_x, pending, after, delay, oracle, _aim(target), estimator, line
+            shift(plan),
+            pending_x,
+            pending,
+            after,
+            delay,
+            oracle,
+            aim.xu,
+            estimator,
+            u if self.problem.looks_back else state.commanded,
+            line,
+            None if reference is None else reference.advanced(1),
         )
+        faults = self.estimator.faults(estimator)
         known = self.oracle.weights(oracle), self.estimator.deviation(estimator)
         return memory, StepResult(
-            plan.u, mode, solution, label, verdict, rolled_back, delay, first, target, *known
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known, faults
         )
 
     def _without_absurd(self, seen: Observation) -> Observation:
         most_x, most_u = self._absurd
         if seen.x is not None and not (np.abs(seen.x) <= most_x).all():
-            seen = replace(seen, x=None)
+            x = np.where(np.abs(seen.x) <= most_x, seen.x, np.nan)
+            seen = replace(seen, x=x if self.estimator.tells(x) else None)
         inputs = [u for _seconds, u in seen.pieces] + ([] if seen.applied is None else [seen.applied])
         if any(not (np.abs(u) <= most_u).all() for u in inputs):
             seen = replace(seen, applied=None, pieces=())
@@ -244,27 +277,20 @@ class Controller:
                 return there, oracle
         return predicted(self.model, self.oracle, oracle, x, inputs)
 
+    def _aim(
+        self,
+        state: ControllerState,
+        reference: Reference | None,
+        theta: np.ndarray,
+        delay: float,
+        new: bool = True,
+    ) -> Aim:
+        """Where a plan leads that begins to act after the delay and the plant's dead time."""
+        return self.aims.find(reference, theta, state.target, delay + self.line.dead_time, new)
+
     def _prepares(self, state: ControllerState) -> bool:
         """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
         return self.real_time and state.plan.left > 0
-
-    def _target(self, state: ControllerState, theta: np.ndarray | None) -> SteadyState | None:
-        """Where the step's plan aims, by theta; None: by that of the prepared step."""
-        if self._targets is None:
-            return None
-        if theta is None:
-            self.prepare(state)
-            return self._prepared_target
-        return self._find_target(state, theta)
-
-    def _find_target(self, state: ControllerState, theta: np.ndarray) -> SteadyState | None:
-        return None if self._targets is None else self._targets.find(theta, state.target)
-
-    def _references(self, target: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """x^r (1, d) and u^r (1, m) of a plan to `target`, (d + m,), or (0,) for the equilibrium: None."""
-        if not target.size:
-            return None, None
-        return target[None, : self.model.d], target[None, self.model.d :]
 
     def _plan(
         self,
@@ -272,23 +298,24 @@ class Controller:
         theta: np.ndarray | None,
         s: np.ndarray | None,
         certified: FirstInputs | None,
-        target: SteadyState | None,
+        aim: Aim,
+        previous: np.ndarray | None,
     ) -> tuple[Plan, Mode, Solution | None]:
         horizon, plan = self.problem.horizon, state.plan
         first = _box(certified)
         solution = None
         if s is not None:
-            solution = self._solve(state, theta, s, first, target)
+            solution = self._solve(state, theta, s, first, aim, previous)
             if solution.usable:
                 return Plan(solution.u, solution.c, horizon), "solver", solution
         if plan.left > 0:
-            return _begun_within(plan, first), "shifted_plan", solution
+            return self._kept(_begun_within(plan, first), previous), "shifted_plan", solution
         nothing, d = empty_plan(horizon, self.model.m), self.model.d
-        xs, us = (0.0, 0.0) if target is None else (target.xu[:d], target.xu[d:])
+        xs, us = (aim.xu[:d], aim.xu[d:]) if aim.xu.size else (0.0, 0.0)
         if s is None:
             # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
-            return replace(nothing, u=nothing.u + us), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us))
+            return self._kept(replace(nothing, u=nothing.u + us), previous), "feedback", solution
+        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us, previous))
         return _begun_within(fed_back, first), "feedback", solution
 
     def _solve(
@@ -297,23 +324,33 @@ class Controller:
         theta: np.ndarray | None,
         s: np.ndarray,
         first: Box | None,
-        target: SteadyState | None,
+        aim: Aim,
+        previous: np.ndarray | None,
     ) -> Solution:
         if theta is not None:
-            references = self._references(_aim(target))
-            return self._solver.solve(s, theta, state.plan.c, *references, first=first)
+            return self._solver.solve(s, theta, state.plan.c, *aim.references, first=first, previous=previous)
         self.prepare(state)
         self._prepared_for = None
-        return self._solver.feedback(s, first)
+        return self._solver.feedback(s, first, previous)
+
+    def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
+        """What acts before v_0, (m,): the plant says so, or else it is what was commanded; None: nothing depends on it."""
+        if not self.problem.looks_back:
+            return None
+        acts = acting(written)
+        return state.commanded if acts is None else acts
+
+    def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
+        """The plan within the rate limits from `previous` on."""
+        return plan if previous is None else replace(plan, u=all_reachable(self.model, plan.u, previous))
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
 
 
-def _aim(target: SteadyState | None) -> np.ndarray:
-    """x and u, (d + m,); (0,) without a reference."""
-    return np.zeros(0) if target is None else target.xu
+def _known(commanded: np.ndarray) -> np.ndarray | None:
+    return commanded if commanded.size else None
 
 
 def _box(first: FirstInputs | None) -> Box | None:

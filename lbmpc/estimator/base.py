@@ -38,6 +38,10 @@ class Estimate(NamedTuple):
     """The state, (d,), whose distance from A x + B u, x the estimate before, is that one's label."""
     variance: np.ndarray
     """Of that label, (d,), units of h squared; zeros where a sample is the state."""
+    innovation: np.ndarray
+    """What was measured less what was predicted, (d,); NaN where either is missing."""
+    innovation_variance: np.ndarray
+    """What the innovation's would be if all is as the estimator takes it, (d,); NaN likewise."""
 
 
 class Estimator(ABC):
@@ -47,8 +51,14 @@ class Estimator(ABC):
     """Whether every state is measured."""
 
     @abstractmethod
-    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
-        """The memory and the estimate after one more sample."""
+    def update(
+        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
+    ) -> tuple[EstimatorState, Estimate]:
+        """The memory and the estimate after one more sample.
+
+        trusted: of which states, (d,) of booleans, the measurement counts, of those that are measured; None: of all.
+            Others have an innovation all the same.
+        """
 
     def initial_state(self) -> EstimatorState:
         """The memory before the first sample."""
@@ -57,6 +67,14 @@ class Estimator(ABC):
     def deviation(self, state: EstimatorState) -> np.ndarray:
         """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
         return np.zeros(0)
+
+    def tells(self, y: np.ndarray) -> bool:
+        """Whether a sample, (d,), NaN where there is no number, says anything."""
+        return bool(np.isfinite(y).all())
+
+    def faults(self, state: EstimatorState) -> dict[str, str]:
+        """Which sensors are not believed, by the names of their states, and in words what is wrong."""
+        return {}
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""
@@ -73,7 +91,9 @@ class Samples(Estimator):
     sees_all = True
 
     def __init__(self, d: int):
-        self._exact = np.zeros(d)
+        self._exact, self._none = np.zeros(d), np.full(d, np.nan)
 
-    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
-        return state, Estimate(seen.y, seen.y, self._exact)
+    def update(
+        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
+    ) -> tuple[EstimatorState, Estimate]:
+        return state, Estimate(seen.y, seen.y, self._exact, self._none, self._none)

@@ -59,7 +59,7 @@ class KalmanEstimator(Estimator):
         self.sees_all = len(measured) == d
         units = self._units = balanced(model.plant)[:d]
         least = LEAST * model.plant.x_scale
-        self._R = (np.maximum(noise, least) / units)[measured] ** 2
+        self._R = (np.maximum(noise, least) / units) ** 2
         sigma = np.maximum(process, least * model.period) / units
         rho = self._kept = float(np.exp(-model.period / correlation))
         self._F = np.block(
@@ -85,16 +85,19 @@ class KalmanEstimator(Estimator):
             "inputs": np.zeros((2, self._model.m)),
         }
 
-    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+    def update(
+        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
+    ) -> tuple[EstimatorState, Estimate]:
         source, sequence = state["sample"].tolist()
+        measured = self._measured if trusted is None else self._measured[trusted[self._measured]]
         periods, u = seen.sequence - sequence, seen.applied
         if u is None or sequence < 0 or seen.source != source or periods > LONGEST_GAP:
-            after, estimate = self._begun(state, seen)
+            after, estimate = self._begun(state, seen, measured)
         elif periods <= 0:
             # The period was counted as missed, and its sample comes late.
-            after, estimate = self._unlabelled(state, seen)
+            after, estimate = self._unlabelled(state, seen, measured)
         else:
-            after, estimate = self._followed(state, seen, u, periods)
+            after, estimate = self._followed(state, seen, measured, u, periods)
         return {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}, estimate
 
     def deviation(self, state: EstimatorState) -> np.ndarray:
@@ -114,39 +117,59 @@ class KalmanEstimator(Estimator):
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}
 
-    def _begun(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+    def _begun(
+        self, state: EstimatorState, seen: Measured, measured: np.ndarray
+    ) -> tuple[EstimatorState, Estimate]:
         """After a sample of which nothing is known that came before."""
         begun = {**self.initial_state(), "inputs": state["inputs"]}
-        begun["x"][self._measured] = seen.y[self._measured]
-        return self._unlabelled(begun, seen)
+        begun["x"][measured] = seen.y[measured]
+        after, estimate = self._unlabelled(begun, seen, measured)
+        nothing = np.full(self._model.d, np.nan)
+        return after, estimate._replace(innovation=nothing, innovation_variance=nothing)
 
-    def _unlabelled(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+    def _unlabelled(
+        self, state: EstimatorState, seen: Measured, measured: np.ndarray
+    ) -> tuple[EstimatorState, Estimate]:
         """After a sample of the time that the memory is of, which says nothing of the period before."""
-        after = self._corrected(state, seen.y[self._measured])
-        return after, Estimate(after["x"], after["x"], np.full(self._model.d, np.inf))
+        after = self._corrected(state, seen.y, measured)
+        unknown = np.full(self._model.d, np.inf)
+        return after, Estimate(after["x"], after["x"], unknown, *self._innovation(state, seen.y))
 
     def _is_lost(self, state: EstimatorState) -> bool:
         return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()
 
     def _followed(
-        self, state: EstimatorState, seen: Measured, u: np.ndarray, periods: int
+        self, state: EstimatorState, seen: Measured, measured: np.ndarray, u: np.ndarray, periods: int
     ) -> tuple[EstimatorState, Estimate]:
         """After a sample so many periods behind the one before, under u, (m,), in the last of them."""
-        measured, d = self._measured, self._model.d
+        d = self._model.d
         for _ in range(periods - 1):
             # What acted then is not known.
             state = self._predicted(state, self._nominal(state["x"], u, ()))
             state = {**state, "covariance": state["covariance"] + self._any_input}
             if self._is_lost(state):
-                return self._begun(state, seen)
+                return self._begun(state, seen, measured)
         nominal, before = self._nominal(state["x"], u, seen.pieces), state["covariance"][:d, :d]
-        after = self._corrected(self._predicted(state, nominal), seen.y[measured])
+        predicted = self._predicted(state, nominal)
+        if self._is_lost(predicted):
+            return self._begun(state, seen, measured)
+        after = self._corrected(predicted, seen.y, measured)
         reached = nominal + after["disturbance"]
         reached[measured] = seen.y[measured]
         variance = np.diag(after["covariance"])[d:] * self._repeats
         A = self._F[measured, :d]
-        variance[measured] = self._R + ((A @ before) * A).sum(axis=1)
-        return after, Estimate(after["x"], reached, variance * self._units**2)
+        variance[measured] = self._R[measured] + ((A @ before) * A).sum(axis=1)
+        innovation = self._innovation(predicted, seen.y)
+        return after, Estimate(after["x"], reached, variance * self._units**2, *innovation)
+
+    def _innovation(self, predicted: EstimatorState, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of every measured state, trusted or not, and the variance that it would have, (d,) each."""
+        d, measured = self._model.d, self._measured
+        innovation, variance = np.full(d, np.nan), np.full(d, np.nan)
+        innovation[measured] = y[measured] - predicted["x"][measured]
+        spread = np.diag(predicted["covariance"])[:d] + self._R
+        variance[measured] = (spread * self._units**2)[measured]
+        return innovation, variance
 
     def _nominal(self, x: np.ndarray, u: np.ndarray, pieces: Pieces) -> np.ndarray:
         """Where the nominal model leads within a period, (d,)."""
@@ -161,15 +184,15 @@ class KalmanEstimator(Estimator):
             "covariance": 0.5 * (P + P.T),
         }
 
-    def _corrected(self, state: EstimatorState, y: np.ndarray) -> EstimatorState:
-        d, P, measured = self._model.d, state["covariance"], self._measured
-        S = P[np.ix_(measured, measured)] + np.diag(self._R)
+    def _corrected(self, state: EstimatorState, y: np.ndarray, measured: np.ndarray) -> EstimatorState:
+        d, P, R = self._model.d, state["covariance"], self._R[measured]
+        S = P[np.ix_(measured, measured)] + np.diag(R)
         gain = np.linalg.solve(S, P[measured]).T
-        moved = gain @ ((y - state["x"][measured]) / self._units[measured])
+        moved = gain @ ((y - state["x"])[measured] / self._units[measured])
         # Joseph's form: rounding cannot make it indefinite.
         left = np.eye(2 * d)
         left[:, measured] -= gain
-        P = left @ P @ left.T + (gain * self._R) @ gain.T
+        P = left @ P @ left.T + (gain * R) @ gain.T
         return {
             **state,
             "x": state["x"] + self._units * moved[:d],

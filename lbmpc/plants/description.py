@@ -64,9 +64,11 @@ class Description:
     dead_time: float = 0.0
     """Seconds from when an input is written until the plant begins to answer: transport, a pipe, a bus behind the
     gateway. Of all inputs."""
+    u_rate_max: np.ndarray | None = None
+    """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
 
     def __post_init__(self) -> None:
-        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain"):
+        for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain", "u_rate_max"):
             object.__setattr__(self, name, as_array(getattr(self, name)))
         for name in TUPLES:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
@@ -77,6 +79,7 @@ class Description:
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
+        input_rate_max: Mapping[str, float] | None = None,
     ) -> Self:
         """With other bounds, or about another point.
 
@@ -84,9 +87,10 @@ class Description:
             bounds: lower and upper by the name of a state or input, None where there is none; others stay.
             x_e, u_e: (d,) and (m,), where equations are linearised.
             dead_time: seconds; None: its own.
+            input_rate_max: how fast an input may change, per second, by its name; others stay.
 
         Raises:
-            KeyError: a bound of what is no state or input.
+            KeyError: a bound of what is no state or input, a rate of what is no input.
         """
         for name in bounds:
             if name not in (*self.states, *self.inputs):
@@ -105,6 +109,13 @@ class Description:
                         low[names.index(name)] = -np.inf if lower is None else lower
                         high[names.index(name)] = np.inf if upper is None else upper
                 new |= {f"{axis}_min": low, f"{axis}_max": high}
+        if input_rate_max:
+            rates = self.input_rates.copy()
+            for name, rate in input_rate_max.items():
+                if name not in self.inputs:
+                    raise KeyError(name)
+                rates[self.inputs.index(name)] = rate
+            new["u_rate_max"] = rates
         return replace(self, **new) if new else self
 
     def safe_input_at(self, x: np.ndarray) -> np.ndarray:
@@ -123,6 +134,11 @@ class Description:
     @property
     def m(self) -> int:
         return len(self.inputs)
+
+    @cached_property
+    def input_rates(self) -> np.ndarray:
+        """`u_rate_max`, (m,), infinite where there is no limit."""
+        return np.full(self.m, np.inf) if self.u_rate_max is None else self.u_rate_max
 
     @cached_property
     def x_scale(self) -> np.ndarray:

@@ -62,9 +62,10 @@ class Plant(Description):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
+        input_rate_max: Mapping[str, float] | None = None,
     ) -> Plant:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
-        there = super().changed(bounds, x_e, u_e, dead_time)
+        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max)
         if x_e is None or u_e is not None:
             return there
         rest = there.resting_near()

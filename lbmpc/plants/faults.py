@@ -81,6 +81,12 @@ def number_faults(plant: Description) -> Iterator[str]:
         yield f"safe_gain is {shown(gain)}: it needs finite numbers, a row for each input and a column for each state"
     if not (isinstance(plant.dead_time, int | float) and 0.0 <= plant.dead_time < np.inf):
         yield f"dead_time is {plant.dead_time!r}: give seconds, 0 where the plant answers at once"
+    rates = plant.u_rate_max
+    if rates is not None and not (numeric(rates) and rates.shape == (plant.m,) and (rates > 0.0).all()):
+        yield (
+            f"u_rate_max is {shown(rates)}: give how fast each of {', '.join(plant.inputs)} may change, per second, "
+            "a positive number or inf"
+        )
 
 
 def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:

@@ -70,9 +70,10 @@ class Known(Description):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
+        input_rate_max: Mapping[str, float] | None = None,
     ) -> Known:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
-        there = super().changed(bounds, x_e, u_e, dead_time)
+        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max)
         if x_e is None and u_e is None:
             return there
         refuse(self.name, all_faults(there))
@@ -115,6 +116,7 @@ class Known(Description):
         x_max: Any = None,
         u_min: Any = None,
         u_max: Any = None,
+        u_rate_max: Any = None,
         x0: Any = None,
         safe_input: Any = None,
         safe_gain: Any = None,
@@ -141,7 +143,7 @@ class Known(Description):
             safe_input: u_e by default.
             performance: all states by default.
             kernel: all states and inputs by default.
-            safe_gain, poles, scale, names, dead_time: as the fields of these names.
+            safe_gain, poles, scale, names, dead_time, u_rate_max: as the fields of these names.
 
         Raises:
             PlantDefinitionError: it cannot be used; the text names every fault.
@@ -173,6 +175,7 @@ class Known(Description):
             scale=scale or {},
             names=names or {},
             dead_time=dead_time,
+            u_rate_max=u_rate_max,
             A=A,
             B=B,
             period=period,

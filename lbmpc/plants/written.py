@@ -41,7 +41,8 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
     dead_time: float = 0.0
-    """Left out where there is none, as in what was written before there was such a field."""
+    """Left out where there is none, as in what was written before there was such a field; so is the next."""
+    u_rate_max: list[Number] | None = None
 
 
 FIELDS = Written.__struct_fields__
@@ -55,6 +56,7 @@ def written(fields: dict[str, Any]) -> dict[str, Any]:
     """
     given = {name: _plain(fields[name]) for name in FIELDS}
     if given["dead_time"] == 0.0:
+        # Only the default itself is left out, not what equals it.
         del given["dead_time"]
     return msgspec.to_builtins(_typed(given))
 
@@ -63,8 +65,9 @@ def read(data: object) -> dict[str, Any]:
     """The fields of a `Known` from what JSON gave. Raises `PlantDefinitionError`: it is something else."""
     found = _typed(data)
     fields = msgspec.structs.asdict(found)
-    for name in ("x_min", "x_max", "u_min", "u_max"):
-        fields[name] = [float(value) for value in fields[name]]
+    for name in ("x_min", "x_max", "u_min", "u_max", "u_rate_max"):
+        if fields[name] is not None:
+            fields[name] = [float(value) for value in fields[name]]
     if found.poles is not None:
         fields["poles"] = [complex(*pole) if isinstance(pole, tuple) else pole for pole in found.poles]
     return fields

@@ -1,11 +1,17 @@
-"""All constraint rows of a problem over (v, zbar) as one block: inputs first, then states step by step."""
+"""All constraint rows of a problem over (v, zbar) as one block: inputs, their changes, then states step by step.
+
+The rows of inputs are hard, and kept exactly: each input in turn is clipped to its box and to what it can reach from
+the one before. What acts is in U, so that there always is such an input.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
+from lbmpc.casadi_buffers import Bound
 from lbmpc.problem import Problem
 from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.least_distance import (
@@ -39,15 +45,22 @@ class Rows:
         self.terminal_rows = last.F[common:]
         # Boxes throughout: the rows are the variables themselves.
         self._plain = problem.states[0].is_box and not len(self.terminal_rows)
-        parts = [*problem.inputs, *problem.states]
-        self.lower = np.concatenate([part.lower for part in parts])
-        self.upper = np.concatenate([part.upper for part in parts])
-        self.count_inputs = len(self.input_rows) * n
-        # The same numbers as seen by inputs (N, m).
-        self._lower_v, self._upper_v = (
-            b[: self.count_inputs].reshape(n, m) for b in (self.lower, self.upper)
+        self._steps = problem.input_steps
+        self._limited = bool(np.isfinite(self._steps).any())
+        # Of all inputs, stage by stage, those with a row for the change from the one before. That of v_0 is a bound.
+        self._changing = m + np.flatnonzero(np.tile(np.isfinite(self._steps), n - 1))
+        change = np.tile(self._steps, n)[self._changing]
+        self._one_by_one = Bound(build_clip(n, self._steps)) if len(change) else None
+        self.lower = np.concatenate(
+            [*(part.lower for part in problem.inputs), -change, *(part.lower for part in problem.states)]
         )
-        self._first = self.lower[: self.m].copy(), self.upper[: self.m].copy()
+        self.upper = np.concatenate(
+            [*(part.upper for part in problem.inputs), change, *(part.upper for part in problem.states)]
+        )
+        self.count_inputs = m * n + len(change)
+        # The same numbers as seen by inputs (N, m).
+        self._lower_v, self._upper_v = (b[: m * n].reshape(n, m) for b in (self.lower, self.upper))
+        self._first = self.lower[:m].copy(), self.upper[:m].copy()
         plant = problem.model.plant
         # Of the plain sets' half-widths: tightening must not make a violation weigh more.
         of_inputs, of_states, of_terminal = (
@@ -58,7 +71,8 @@ class Rows:
                 (self.terminal_rows, plant.x_scale),
             )
         )
-        scale = np.concatenate([np.tile(of_inputs, n), np.tile(of_states, n), of_terminal])
+        inputs = np.tile(of_inputs, n)
+        scale = np.concatenate([inputs, inputs[self._changing], np.tile(of_states, n), of_terminal])
         soft = np.arange(len(self.lower)) >= self.count_inputs
         self.penalty = Penalty(soft, scale, problem.penalty)
         self._hard = replace(self.penalty, soft=np.zeros_like(soft))
@@ -66,16 +80,41 @@ class Rows:
             f"{name} at step {i + 1}" for i, part in enumerate(problem.states) for name in part.names
         ]
 
-    def bound_first(self, first: Box | None) -> None:
-        """Bounds on v_0 from now on; None: those of the problem. Always inside these."""
+    @property
+    def first(self) -> Box:
+        """The bounds on v_0 that are in force."""
+        return self.lower[: self.m], self.upper[: self.m]
+
+    def bound_first(self, first: Box | None, previous: np.ndarray | None) -> None:
+        """Bounds on v_0 from now on.
+
+        Args:
+            first: taken into those of the problem; None: those of the problem.
+            previous: what acts before v_0, (m,), from which rate limits count; None: the equilibrium's.
+        """
         low, high = self._first
-        self.lower[: self.m] = low if first is None else np.clip(first[0], low, high)
-        self.upper[: self.m] = high if first is None else np.clip(first[1], low, high)
+        if first is not None:
+            low, high = np.clip(first[0], low, high), np.clip(first[1], low, high)
+        if self._limited:
+            before = np.clip(0.0 if previous is None else previous, *self._first)
+            low, high = (np.clip(end, before - self._steps, before + self._steps) for end in (low, high))
+        self.lower[: self.m], self.upper[: self.m] = low, high
 
     def clip(self, v: np.ndarray) -> np.ndarray:
         """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""
-        # np.clip takes twice as long for so few numbers.
-        return np.minimum(np.maximum(v, self._lower_v), self._upper_v)
+        if self._one_by_one is None:
+            # np.clip takes twice as long for so few numbers.
+            return np.minimum(np.maximum(v, self._lower_v), self._upper_v)
+        return self.within_steps(v)
+
+    def within_steps(self, v: np.ndarray) -> np.ndarray:
+        """The same, for what is to keep U and the rate limits; as it is where inputs may step."""
+        if self._one_by_one is None:
+            return v
+        inputs = self._one_by_one.inputs
+        inputs["v"][:], inputs["lower"][:], inputs["upper"][:] = v.T, self._lower_v.T, self._upper_v.T
+        self._one_by_one()
+        return self._one_by_one.outputs["clipped"].T.copy()
 
     def values(self, v: np.ndarray, zbar: np.ndarray) -> np.ndarray:
         """Row values of inputs v (m, n) and nominal states zbar (d, n)."""
@@ -83,15 +122,16 @@ class Rows:
 
     def apply(self, y: np.ndarray) -> np.ndarray:
         """The rows of y = (v_0..n-1, zbar_1..n), stage by stage: ((m + d) n,) -> (rows,), or for many columns."""
+        n, split, later = self.n, self.m * self.n, self._changing
         if self._plain:
-            return y
-        n, split = self.n, self.m * self.n
+            return np.concatenate([y[:split], y[later] - y[later - self.m], y[split:]]) if len(later) else y
         many = y.reshape(len(y), -1)
         inputs = np.matmul(self.input_rows, many[:split].reshape(n, self.m, -1))
         states = np.matmul(self.state_rows, many[split:].reshape(n, self.d, -1))
         k = many.shape[1]
         last = self.terminal_rows @ many[len(y) - self.d :]
-        return np.concatenate([inputs.reshape(-1, k), states.reshape(-1, k), last]).reshape(-1, *y.shape[1:])
+        blocks = [inputs.reshape(-1, k), many[later] - many[later - self.m], states.reshape(-1, k), last]
+        return np.concatenate(blocks).reshape(-1, *y.shape[1:])
 
     def kept(self, values: np.ndarray) -> bool:
         """Whether values (rows,) are inside their bounds."""
@@ -121,3 +161,19 @@ class Rows:
         worst = int(states.argmax())
         slack = float(states[worst])
         return (slack, self.names[worst]) if slack > KEPT else (0.0, "")
+
+
+def build_clip(n: int, steps: np.ndarray) -> ca.Function:
+    """(v, lower, upper) -> clipped, (m, n) each: each input in its bounds and within `steps`, (m,), of the one before.
+
+    The first is within its bounds alone.
+    """
+    m = len(steps)
+    v, lower, upper = (ca.SX.sym(name, m, n) for name in ("v", "lower", "upper"))
+    clipped = [ca.fmin(ca.fmax(v[:, 0], lower[:, 0]), upper[:, 0])]
+    for i in range(1, n):
+        before = clipped[-1]
+        low, high = ca.fmax(lower[:, i], before - steps), ca.fmin(upper[:, i], before + steps)
+        clipped.append(ca.fmin(ca.fmax(v[:, i], low), high))
+    names = ["v", "lower", "upper"]
+    return ca.Function("clip", [v, lower, upper], [ca.densify(ca.horzcat(*clipped))], names, ["clipped"])

@@ -21,7 +21,7 @@ from lbmpc.problem import Problem
 from lbmpc.solver.constraint_rows import Box, Rows
 from lbmpc.solver.least_distance import NO_ROWS, Shown
 from lbmpc.solver.nominal_rollout import build_nominal, build_start
-from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent
+from lbmpc.solver.riccati import build_rows, build_sweep, build_tangent, with_input
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
@@ -34,30 +34,32 @@ FAST = 0.1
 class Prepared:
     """A linearisation about a predicted state, waiting for the measured one."""
 
-    x: np.ndarray
-    """Predicted state, (D,)."""
+    s: np.ndarray
+    """Predicted state, (D,), and where changes cost something the input before, (m,): here D counts that too."""
+    first: Box
+    """Bounds on v_0."""
     status: Status
     cost: float
     values: np.ndarray
-    """Row values at w = 0 and x, (rows,)."""
+    """Row values at w = 0 and s, (rows,)."""
     slopes: np.ndarray
     """Their slopes in w, (rows, m N)."""
     follow: np.ndarray
-    """Their slopes in x, (rows, D)."""
+    """Their slopes in s, (rows, D)."""
     free: np.ndarray
     """The unconstrained minimiser's inputs, (N, m)."""
     slopes_v: np.ndarray
     """How those move with w, (m N, m N)."""
     follow_v: np.ndarray
-    """How they follow x, (m N, D)."""
+    """How they follow s, (m N, D)."""
     steered: np.ndarray
     """The inputs of the minimiser's learned trajectory, (N, m)."""
     slopes_u: np.ndarray
     """How those move with w, (m N, m N)."""
     follow_u: np.ndarray
-    """How they follow x, (m N, D)."""
+    """How they follow s, (m N, D)."""
     shown: Shown | None
-    """The QP as it was solved at x; None where no row was violated there."""
+    """The QP as it was solved at s; None where no row was violated there."""
 
 
 class Solver:
@@ -108,6 +110,7 @@ class Solver:
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         """Minimise from x_t = x.
 
@@ -119,19 +122,22 @@ class Solver:
             xr, ur: references over the horizon, (N + 1, d) and (N, m), or one row for all of it; the equilibrium by
                 default.
             first: hard bounds on v_0 for this solve, (m,) each, inside U; U itself by default.
+            previous: what acts now, (m,): v_{-1} and u_{-1}; the equilibrium's input by default. Without rate limits
+                and S nothing depends on it.
 
         Returns:
             A `Solution`; never raises for numbers, whatever they are.
         """
-        self._rows.bound_first(first)
+        self._rows.bound_first(first, previous)
         # Wild oracles overflow on their way to being refused.
         with np.errstate(all="ignore"):
             start = self._start(x, warm_start)
-            self._learned.load(x, oracle_parameters, xr, ur)
+            s = with_input(self.problem.model, x, previous)
+            self._learned.load(s, oracle_parameters, xr, ur)
             solution = self._solve(self._learned, x, start)
             if solution.usable or self._learned is self._nominal:
                 return solution
-            self._nominal.load(x, np.zeros(0), xr, ur)
+            self._nominal.load(s, np.zeros(0), xr, ur)
             nominal = self._solve(self._nominal, x, start)
             return replace(nominal, status=Status.ORACLE_REFUSED) if nominal.usable else nominal
 
@@ -144,23 +150,24 @@ class Solver:
         warm_start: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None:
         """Linearise ahead of the sample, about a predicted state x, (D,); everything that needs no x_t is done here.
 
-        Arguments as for `solve`. One Gauss-Newton step is left for `feedback`.
+        Arguments as for `solve`; `previous` is what will act then. One Gauss-Newton step is left for `feedback`.
         """
         if self._tangent is None:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
             self._tangent = Bound(self._realise(function))
-        self._rows.bound_first(None)
-        rows = self._rows
+        self._rows.bound_first(None, previous)
+        rows, s = self._rows, with_input(self.problem.model, x, previous)
         with np.errstate(all="ignore"):
             v, status = self._start(x, warm_start), Status.NUMERICAL
             for subproblem, theta, trusted in (
                 (self._learned, oracle_parameters, Status.REAL_TIME),
                 (self._nominal, np.zeros(0), Status.ORACLE_REFUSED),
             ):
-                subproblem.load(x, theta, xr, ur)
+                subproblem.load(s, theta, xr, ur)
                 cost = subproblem.linearise(v)
                 if isfinite(cost) and finite(subproblem.sweep.outputs["zs"]):
                     status = trusted
@@ -173,7 +180,8 @@ class Solver:
                 # At the measured state mostly the same rows will matter.
                 guess, _feasible = rows.nearest(values, all_slopes)
             self._prepared = Prepared(
-                np.array(x, dtype=float),
+                np.array(s, dtype=float),
+                (rows.first[0].copy(), rows.first[1].copy()),
                 status,
                 cost,
                 values,
@@ -188,10 +196,13 @@ class Solver:
                 guess.shown if guess is not None else None,
             )
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution:
         """Complete the prepared step for the measured state x, (D,): a correction of x, and a few QP rows.
 
-        `first` as for `solve`: it depends on x, so that the preparation does not know it.
+        `first` as for `solve`: it depends on x, so that the preparation does not know it. `previous` likewise, where
+        something else acts than the preparation was told.
 
         The nominal trajectory is linear in x, so the constraints hold for x itself, not for its prediction.
 
@@ -202,8 +213,9 @@ class Solver:
         ready, self._prepared = self._prepared, None
         if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
-        rows, change = self._rows, np.asarray(x, dtype=float) - ready.x
-        rows.bound_first(first)
+        s = with_input(self.problem.model, np.asarray(x, dtype=float), previous)
+        rows, change = self._rows, s - ready.s
+        rows.bound_first(first, previous)
         with np.errstate(all="ignore"):
             values = ready.values + ready.follow.dot(change)
             shape, status = ready.free.shape, ready.status
@@ -213,7 +225,8 @@ class Solver:
                 return self._finish(Status.NUMERICAL, x, ready.free, ready.steered, np.inf, 0)
             if not rows.kept(values):
                 shown, hint = ready.shown, NO_ROWS
-                if shown is not None and first is not None and (shown.seen < rows.m).any():
+                others = first is not None or not np.array_equal(rows.first, ready.first)
+                if shown is not None and others and (shown.seen < rows.m).any():
                     # It was set up with other bounds on v_0.
                     hint, shown = shown.seen, None
                 nearest, feasible = rows.nearest(values, ready.slopes, hint, shown)
@@ -307,6 +320,7 @@ class Solver:
         """Inputs inside their bounds, (N, m), from x or s by c, (N, m)."""
         inputs = self._begin.inputs
         inputs["x"][:, 0], inputs["c"][:] = x[: self.problem.model.d], _numbers(c).T
+        inputs["lower"][:, 0], inputs["upper"][:, 0] = self._rows.first
         self._begin()
         return self._rows.clip(_numbers(self._begin.outputs["v"].T))
 
@@ -331,6 +345,7 @@ class Solver:
         u = np.minimum(np.maximum(u, self._u_min), self._u_max)
         # Both begin in x_t: bounds on v_0 are bounds on u_0.
         u[0] = v[0]
+        u = self._rows.within_steps(u)
         cost = merit * self.problem.model.cost_scale
         c, zbar = found["c"].T.copy(), found["zbar"].T.copy()
         return Solution(status, v, c, u, zbar, cost, iterations, slack, slack_row)

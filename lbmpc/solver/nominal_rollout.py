@@ -6,7 +6,10 @@ the rest of the feedback.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
+import numpy as np
 
 from lbmpc.problem import Problem
 
@@ -26,6 +29,8 @@ def build_nominal(problem: Problem) -> ca.Function:
         states.append(a @ states[-1] + b @ entry)
     of_inputs, of_states = problem.inputs[0], problem.states[0]
     blocks = [entry if of_inputs.is_box else ca.DM(of_inputs.F) @ entry for entry in inputs]
+    if limited := np.flatnonzero(np.isfinite(problem.input_steps)).tolist():
+        blocks += [(entry - before)[limited] for before, entry in pairwise(inputs)]
     blocks += [state if of_states.is_box else ca.DM(of_states.F) @ state for state in states[1:]]
     # The last step may carry the rows of a terminal set behind those that all steps share.
     if len(terminal := problem.states[-1].F[len(of_states.F) :]):
@@ -43,15 +48,21 @@ def build_nominal(problem: Problem) -> ca.Function:
 
 
 def build_start(problem: Problem) -> ca.Function:
-    """(x, c) -> v: inputs K zbar_i + c_i, (m, n), brought inside their bounds one after the other.
+    """(x, c, lower, upper) -> v: inputs K zbar_i + c_i, (m, n), brought inside their bounds one after the other.
 
-    A plan from before, put in this way, stays near its own trajectory from a state that it did not expect.
+    `lower` and `upper`, (m,), are those of v_0; where inputs may step, they are left to whoever clips v. A plan from before, put in this way, stays near its own trajectory from a state that it did not expect.
     """
     model, n = problem.model, problem.horizon
     a, b, gain = ca.DM(model.A), ca.DM(model.B), ca.DM(model.K)
     x, c = ca.MX.sym("x", model.d), ca.MX.sym("c", model.m, n)
+    lower, upper, steps = ca.MX.sym("lower", model.m), ca.MX.sym("upper", model.m), problem.input_steps
     state, inputs = x, []
     for entry, bounds in zip(ca.horzsplit(c), problem.inputs, strict=True):
-        inputs.append(ca.fmin(ca.fmax(gain @ state + entry, bounds.lower), bounds.upper))
+        low, high = bounds.lower, bounds.upper
+        if np.isfinite(steps).any():
+            low = ca.fmax(low, inputs[-1] - steps) if inputs else lower
+            high = ca.fmin(high, inputs[-1] + steps) if inputs else upper
+        inputs.append(ca.fmin(ca.fmax(gain @ state + entry, low), high))
         state = a @ state + b @ inputs[-1]
-    return ca.Function("start", [x, c], [ca.horzcat(*inputs)], ["x", "c"], ["v"])
+    names = ["x", "c", "lower", "upper"]
+    return ca.Function("start", [x, c, lower, upper], [ca.horzcat(*inputs)], names, ["v"])

@@ -20,7 +20,8 @@ states z instead, of which the recursion holds the linearisation anyway, and the
 
 Where the oracle looks back, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D: the
 cost sees x alone, and of the Jacobians only the d rows of x+ are stored, since the rest of s+ is a shift. Without a
-look back s is x and D is d.
+look back s is x and D is d. Where changes of the input cost something, the input before stands behind all that, so that
+D has m entries more: it is what s+ has of u.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from __future__ import annotations
 from typing import Literal
 
 import casadi as ca
+import numpy as np
 
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, follow_symbols, remembered
@@ -39,24 +41,30 @@ Constrained = Literal["nominal", "learned"]
 def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
     """(x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
 
-    Inputs: x (D,), which is s_0, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
+    Inputs: x (D,), which is s_0 and, where it counts, u_{-1}, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
     Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m,
     n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along
     the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
     With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
     """
-    d, m, behind = model.d, model.m, remembered(oracle)
+    d, m, behind, before = model.d, model.m, remembered(oracle), input_before(model)
     # The cost's own scale is the unit: w, the penalty and the QP's tolerances then mean the same for any Q and R.
-    q, r, p = (ca.DM(weight / model.cost_scale) for weight in (model.Q, model.R, model.P))
+    q, r, p, change = (
+        ca.DM(weight / model.cost_scale) for weight in (model.Q, model.R, model.P, model.S[:before, :before])
+    )
     a, b = ca.DM(model.A), ca.DM(model.B)
-    x, v, theta = ca.MX.sym("x", d + behind), ca.MX.sym("v", m, n), ca.MX.sym("theta", oracle.parameters)
+    x, v, theta = (
+        ca.MX.sym("x", d + behind + before),
+        ca.MX.sym("v", m, n),
+        ca.MX.sym("theta", oracle.parameters),
+    )
     xr, ur = ca.MX.sym("xr", d, n + 1), ca.MX.sym("ur", m, n)
     inputs = ca.horzsplit(v)
     parts = oracle.split(theta)
 
     stage = _learned_stage(model, oracle, parts)
     gain = _gain(model, constrained)
-    states, applied, nominal = [x], [], x[:d]
+    states, applied, nominal = [x[: d + behind] if before else x], [], x[:d]
     for i in range(n):
         applied.append(inputs[i] + gain @ (states[i][:d] - nominal))
         states.append(follow_symbols(states[i], applied[i], stage(states[i], applied[i], *parts)))
@@ -68,30 +76,44 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
     gradient_z, gradient_v = q @ dz[:, :n], r @ du
     gradient_end = p @ dz[:, n]
     cost = 0.5 * (ca.dot(gradient_z, dz[:, :n]) + ca.dot(gradient_v, du) + ca.dot(gradient_end, dz[:, n]))
+    gradient_s = gradient_z
+    if before:
+        changed = u - ca.horzcat(x[d + behind :], u[:, :-1])
+        gradient_change = change @ changed
+        cost += 0.5 * ca.dot(gradient_change, changed)
+        gradient_v += gradient_change
+        gradient_s = ca.vertcat(gradient_z, ca.MX.zeros(behind, n), -gradient_change)
+    elif behind:
+        gradient_s = ca.vertcat(gradient_z, ca.MX.zeros(behind, n))
 
     stages = oracle.jacobians(ca.vertcat(s[:, :n], u), parts)
     linear = ca.horzcat(a, ca.DM(d, behind)) if behind else a
     a_i = [linear + jacobian[:, : d + behind] for jacobian in stages]
+    if before:
+        a_i = [ca.horzcat(slopes, ca.MX.zeros(d, before)) for slopes in a_i]
     b_i = [b + jacobian[:, d + behind :] for jacobian in stages]
 
-    riccati = _riccati_stage_behind(d, m, behind, q, r) if behind else _riccati_stage(d, m, q, r)
-    p_matrix, p_vector = _padded(p, behind), ca.vertcat(gradient_end, ca.DM(behind, 1))
+    longer = behind + before
+    riccati = _riccati_stage_behind(d, m, behind, q, r, change) if longer else _riccati_stage(d, m, q, r)
+    p_matrix, p_vector = _padded(p, longer), ca.vertcat(gradient_end, ca.DM(longer, 1))
     gains: list[ca.MX] = [ca.MX()] * n
     offsets: list[ca.MX] = [ca.MX()] * n
     inverses: list[ca.MX] = [ca.MX()] * n
-    columns_z, columns_v = ca.horzsplit(gradient_z), ca.horzsplit(gradient_v)
+    columns_s, columns_v = ca.horzsplit(gradient_s), ca.horzsplit(gradient_v)
     for i in reversed(range(n)):
         p_matrix, p_vector, gains[i], offsets[i], inverses[i] = riccati(
-            p_matrix, p_vector, a_i[i], b_i[i], columns_z[i], columns_v[i]
+            p_matrix, p_vector, a_i[i], b_i[i], columns_s[i], columns_v[i]
         )
 
-    step, nominal = ca.MX.zeros(d + behind), x[:d]
+    step, nominal = ca.MX.zeros(d + longer), x[:d]
     minimiser, steered, nominal_states, learned_states = [], [], [], []
     for i in range(n):
         move = gains[i] @ step + offsets[i]
         steered.append(applied[i] + move)
         minimiser.append(steered[i] - gain @ (z[:, i] + step[:d] - nominal))
-        step = follow_symbols(step, move, a_i[i] @ step + b_i[i] @ move)
+        after = a_i[i] @ step + b_i[i] @ move
+        shifted = follow_symbols(step[: d + behind] if before else step, move, after)
+        step = ca.vertcat(shifted, move) if before else shifted
         nominal = a @ nominal + b @ minimiser[i]
         nominal_states.append(nominal)
         learned_states.append(z[:, i + 1] + step[:d])
@@ -133,18 +155,19 @@ def _propagation(
     model: Model, n: int, behind: int, follow_state: bool, constrained: Constrained = "nominal"
 ) -> ca.Function:
     """Forward sensitivities, one row a direction: the blocks of all stages then lie side by side in memory."""
-    d, m, length = model.d, model.m, model.d + behind
+    d, m, past, before = model.d, model.m, model.d + behind, input_before(model)
+    length = past + before
     a, b = ca.DM(model.A).T, ca.DM(model.B).T
     a_all, b_all = ca.MX.sym("A", d, length * n), ca.MX.sym("B", d, m * n)
     k_all, l_all = ca.MX.sym("K", m, length * n), ca.MX.sym("L", m, m * n)
     a_i, b_i = ca.horzsplit(a_all, length), ca.horzsplit(b_all, m)
     k_i, l_i = ca.horzsplit(k_all, length), ca.horzsplit(l_all, m)
     # Directions: those of s_0, where they are followed, then all of w.
-    before = length if follow_state else 0
-    rows = before + m * n
+    of_state = length if follow_state else 0
+    rows = of_state + m * n
     start = (
-        ca.densify(ca.vertcat(ca.DM.eye(before), ca.DM(m * n, length)))
-        if before
+        ca.densify(ca.vertcat(ca.DM.eye(of_state), ca.DM(m * n, length)))
+        if of_state
         else ca.DM.zeros(rows, length)
     )
     step, nominal = ca.MX(start), ca.MX(start[:, :d])
@@ -152,19 +175,32 @@ def _propagation(
     moves, steered, states = [], [], []
     for i in range(n):
         # w_i begins to act at stage i.
-        own = ca.vertcat(ca.MX(before + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
+        own = ca.vertcat(ca.MX(of_state + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
         steered.append(step @ k_i[i].T + own)
         moves.append(steered[i] - (step[:, :d] - nominal) @ gain)
         after = step @ a_i[i].T + steered[i] @ b_i[i].T
-        step = ca.horzcat(after, step[:, 2 * d + m :], step[:, :d], steered[i]) if behind else after
+        if behind:
+            after = ca.horzcat(after, step[:, 2 * d + m : past], step[:, :d], steered[i])
+        step = ca.horzcat(after, steered[i]) if before else after
         nominal = nominal @ a + moves[i] @ b
         states.append(nominal if constrained == "nominal" else step[:, :d])
     rows_move, inputs_move = ca.densify(ca.horzcat(*moves, *states)), ca.densify(ca.horzcat(*steered))
-    outputs, names = [rows_move[before:, :], inputs_move[before:, :]], ["M", "U"]
-    if before:
-        outputs, names = [*outputs, rows_move[:before, :], inputs_move[:before, :]], [*names, "Y", "X"]
+    outputs, names = [rows_move[of_state:, :], inputs_move[of_state:, :]], ["M", "U"]
+    if of_state:
+        outputs, names = [*outputs, rows_move[:of_state, :], inputs_move[:of_state, :]], [*names, "Y", "X"]
     name = "tangent" if follow_state else "rows" if constrained == "nominal" else "backup_rows"
     return ca.Function(name, [a_all, b_all, k_all, l_all], outputs, ["A", "B", "K", "L"], names)
+
+
+def input_before(model: Model) -> int:
+    """Entries of the recursion's state for the input before: m where changes of it cost something."""
+    return model.m if model.changes_cost else 0
+
+
+def with_input(model: Model, s: np.ndarray, previous: np.ndarray | None) -> np.ndarray:
+    """What `sweep` takes for x: s, and where it counts the input before, (m,), behind it; None: the equilibrium's."""
+    before = input_before(model)
+    return np.concatenate([s, np.zeros(before) if previous is None else previous]) if before else s
 
 
 def _gain(model: Model, constrained: Constrained) -> ca.DM:
@@ -207,40 +243,51 @@ def _riccati_stage(d: int, m: int, q: ca.DM, r: ca.DM) -> ca.Function:
     )
 
 
-def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM) -> ca.Function:
+def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM, change: ca.DM) -> ca.Function:
     """`_riccati_stage` where s+ = (A s + B v, s without x and its oldest pair, x, v): A (d, D), B (d, m).
 
-    The shift costs no product: the transposed dynamics pick rows.
+    Where changes of the input cost something, `change` (m, m), s ends with the input before, and s+ with v. q is then
+    (D,), as it is where s has pairs. The shift costs no product: the transposed dynamics pick rows.
     """
-    length, pair = d + behind, d + m
+    past, pair, before = d + behind, d + m, change.shape[0]
+    length = past + before
     p_matrix, p_vector = ca.MX.sym("P", length, length), ca.MX.sym("p", length)
     a, b = ca.MX.sym("A", d, length), ca.MX.sym("B", d, m)
-    gradient_z, gradient_v = ca.MX.sym("q", d), ca.MX.sym("r", m)
+    gradient_s, gradient_v = ca.MX.sym("q", length), ca.MX.sym("r", m)
 
     def back(rows: ca.MX) -> ca.MX:
         """From the derivative along s+, one row an entry, to that along s."""
-        forgotten = ca.MX.zeros(pair, rows.shape[1])
-        return a.T @ rows[:d, :] + ca.vertcat(
-            rows[length - pair : length - m, :], forgotten, rows[d : length - pair, :]
-        )
+        derivative = a.T @ rows[:d, :]
+        if behind:
+            forgotten, free = ca.MX.zeros(pair, rows.shape[1]), ca.MX.zeros(before, rows.shape[1])
+            newest = rows[past - pair : past - m, :]
+            derivative += ca.vertcat(newest, forgotten, rows[d : past - pair, :], free)
+        return derivative
 
     def back_input(rows: ca.MX) -> ca.MX:
-        return b.T @ rows[:d, :] + rows[length - m :, :]
+        derivative = b.T @ rows[:d, :]
+        if behind:
+            derivative += rows[past - m : past, :]
+        return derivative + rows[past:, :] if before else derivative
 
     pa, pb = back(p_matrix).T, back_input(p_matrix).T
+    curvature, mixed, weight = r + back_input(pb), back_input(pa), q
+    if before:
+        curvature, mixed = curvature + change, mixed - ca.horzcat(ca.DM.zeros(m, past), change)
+        weight = ca.diagcat(q, ca.DM.zeros(behind, behind), change)
     s = ca.SX.sym("S", m, m)
     # ca.chol gives the upper factor U with U'U = S; L' = U.
-    inverse = ca.Function("whiten", [s], [ca.inv(ca.chol(s))])(r + back_input(pb))
-    half = inverse.T @ back_input(pa)
+    inverse = ca.Function("whiten", [s], [ca.inv(ca.chol(s))])(curvature)
+    half = inverse.T @ mixed
     residual = inverse.T @ (gradient_v + back_input(p_vector))
     gain, offset = -inverse @ half, -inverse @ residual
-    previous = _padded(q, behind) + back(pa) - half.T @ half
+    previous = _padded(weight, length - weight.shape[0]) + back(pa) - half.T @ half
     return ca.Function(
         "riccati",
-        [p_matrix, p_vector, a, b, gradient_z, gradient_v],
+        [p_matrix, p_vector, a, b, gradient_s, gradient_v],
         [
             0.5 * (previous + previous.T),
-            ca.vertcat(gradient_z, ca.DM.zeros(behind)) + back(p_vector) - half.T @ residual,
+            gradient_s + back(p_vector) - half.T @ residual,
             gain,
             offset,
             inverse,
@@ -249,5 +296,5 @@ def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM) -> ca
 
 
 def _padded(matrix: ca.DM, behind: int) -> ca.MX:
-    """A weight on x as a weight on s."""
+    """A weight on x as a weight on s, `behind` entries longer."""
     return ca.MX(ca.densify(ca.diagcat(matrix, ca.DM(behind, behind))) if behind else matrix)

@@ -38,6 +38,8 @@ class Described(Protocol):
     @property
     def u_max(self) -> np.ndarray: ...
     @property
+    def input_rates(self) -> np.ndarray: ...
+    @property
     def W(self) -> np.ndarray: ...
     @property
     def x0(self) -> np.ndarray: ...
@@ -54,6 +56,7 @@ class Plant(Described, Protocol):
         x_e: Sequence[float] | None = None,
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
+        input_rate_max: Mapping[str, float] | None = None,
     ) -> Self: ...
     def varied(self, **changes: float) -> Self: ...
 
@@ -183,6 +186,8 @@ def spelt_out(config: Config, plant: Described) -> Config:
         )
         for name, low, high in zip(names, lows.tolist(), highs.tolist(), strict=True)
     }
+    limits = zip(plant.inputs, plant.input_rates.tolist(), strict=True)
+    rates = {name: rate for name, rate in limits if np.isfinite(rate)}
     settings = config.controller
     return msgspec.structs.replace(
         config,
@@ -193,6 +198,7 @@ def spelt_out(config: Config, plant: Described) -> Config:
             u_e=plant.u_e.tolist(),
             bounds=bounds,
             dead_time=plant.dead_time,
+            input_rate_max=rates,
         ),
         controller=msgspec.structs.replace(
             settings,
@@ -226,6 +232,7 @@ def _as_configured(config: Config, plant: P) -> P:
         ("controller.W", config.controller.W, "states", plant.states),
         ("controller.Q", config.controller.Q, "states", plant.states),
         ("controller.R", config.controller.R, "inputs", plant.inputs),
+        ("controller.S", config.controller.S, "inputs", plant.inputs),
     ):
         if values is not None and len(values) != len(names):
             rule = f"{plant.name} has {len(names)} {what} ({', '.join(names)})"
@@ -239,9 +246,13 @@ def _as_configured(config: Config, plant: P) -> P:
         if name not in known:
             hint = did_you_mean(name, known, f"it has {', '.join(known)}")
             raise ConfigError(f"plant.bounds: {plant.name} has no state or input {name!r}; {hint}")
-    return plant.changed(
-        config.plant.bounds, config.plant.x_e, config.plant.u_e, dead_time=config.plant.dead_time
-    )
+    rates = config.plant.input_rate_max
+    for name in rates:
+        if name not in plant.inputs:
+            hint = did_you_mean(name, plant.inputs, f"it has {', '.join(plant.inputs)}")
+            raise ConfigError(f"plant.input_rate_max: {plant.name} has no input {name!r}; {hint}")
+    there = config.plant
+    return plant.changed(there.bounds, there.x_e, there.u_e, there.dead_time, rates)
 
 
 def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
@@ -276,6 +287,7 @@ def _check_names_of_states(config: Config, plant: Described) -> None:
         ("plant.sensors.quantisation", sensors.quantisation),
         ("plant.sensors.bias", sensors.bias),
         ("plant.sensors.stuck", sensors.stuck),
+        ("plant.sensors.dead", sensors.dead),
         ("estimator.noise", estimator.noise),
         ("estimator.process", estimator.process),
         ("estimator.measured", estimator.measured),

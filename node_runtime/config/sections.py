@@ -67,6 +67,8 @@ class SensorsConfig(Section, frozen=True):
     """Seconds after the first sample from which on there is a bias."""
     stuck: dict[str, Instant] = msgspec.field(default_factory=dict)
     """Seconds after the first sample from which on a state's sensor shows what it showed then, by name."""
+    dead: dict[str, Instant] = msgspec.field(default_factory=dict)
+    """Seconds after the first sample from which on no number comes of a state, by name, while those of others do."""
     dropouts: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     """Share of samples that are lost, at random."""
 
@@ -90,6 +92,8 @@ class PlantConfig(Section, frozen=True):
     dead_time: Annotated[float, msgspec.Meta(ge=0, le=1e6)] | None = None
     """Seconds from when the gateway writes an input until the plant begins to answer; None: the plant's own. It is
     part of the model, and another thing than `controller.input_delay_ms`, which ends at the gateway."""
+    input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
+    """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """Parameters of the true plant where they differ from the model's, by name, `dead_time` among them: a model that is
     wrong. Or a reference to what moves in the plant's place: other equations, or an object with `step`."""
@@ -136,6 +140,9 @@ class ControllerConfig(Section, frozen=True):
     """Diagonal state weights, per second: a stage has Q / rate; None: ones."""
     R: list[Positive] | None = None
     """Diagonal input weights, per second; None: ones."""
+    S: list[NonNegative] | None = None
+    """Diagonal weights of how fast the inputs change, on (du/dt)^2, per second: a stage has S rate |u_i - u_{i-1}|^2.
+    None: zeros."""
     terminal: literals.TerminalName = "riccati"
     """P of the terminal cost: of the LQR with the stage weights, of the feedback K ("lyapunov"), or the one of the
     reimplementation of Aswani et al. (`lbmpc.terminal_cost`)."""

@@ -102,7 +102,10 @@ def _without_later_fields(payload: bytes, entry: Entry[Any]) -> bytes:
     if not payload:
         return payload
     written = msgspec.msgpack.decode(entry.payload)
-    defaults = {field.name: field.default for field in msgspec.structs.fields(type(entry.message))}
+    defaults = {
+        field.name: field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        for field in msgspec.structs.fields(type(entry.message))
+    }
     fields = msgspec.msgpack.decode(payload).items()
     kept = {name: value for name, value in fields if name in written or value != defaults.get(name)}
     return msgspec.msgpack.encode(kept)

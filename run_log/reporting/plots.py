@@ -117,6 +117,9 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
     ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    if np.isfinite(data.reference[:, i]).any():
+        r = data.reference[:, i]
+        ax.step(data.t, r, where="post", color=GREEN, linestyle="--", linewidth=1.3, label="set-point")
     _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i], plant.x_scale[i])
     ax.set_ylabel(_label(plant, plant.states[i]))
 

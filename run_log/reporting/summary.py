@@ -59,6 +59,8 @@ class Summary(Performance, frozen=True, kw_only=True):
     """Ticks whose input did not come from the solver."""
     unreached_ticks: int | None
     """Ticks whose target's outputs are not where they should be, or that found no rest; null without a reference."""
+    sensor_faults: list[str]
+    """Which sensors were not believed, and when, in words."""
     target_distance: float | None
     """How far the outputs of the last tick's target are from there, the largest share of an output's half-width."""
     solve_ms: Spread | None
@@ -100,6 +102,7 @@ def summarise(run: Run) -> Summary:
         soft_ticks=sum(r.slack > SOFT for r in results),
         fallback_ticks=sum(r.mode != "solver" for r in results),
         unreached_ticks=sum(r.target_status != "reached" for r in aimed) if aimed else None,
+        sensor_faults=_sensor_faults(run.config.period, ticks, results),
         target_distance=aimed[-1].target_distance if aimed else None,
         solve_ms=_spread([timing.solve_ms for timing in timings]),
         tick_ms=_spread([timing.tick_ms for timing in timings]),
@@ -115,6 +118,19 @@ def summarise(run: Run) -> Summary:
 def _weight(run: Run, states: tuple[str, ...], found: list[list[float]]) -> dict[str, float] | None:
     last = [one for one in found[-max(1, round(run.config.rate)) :] if len(one) == len(states)]
     return dict(zip(states, np.mean(last, axis=0).tolist(), strict=True)) if last else None
+
+
+def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResult]) -> list[str]:
+    when = {(tick.run_id, tick.seq): tick.t for tick in ticks}
+    told: list[str] = []
+    now: dict[str, str] = {}
+    for result in results:
+        t = when.get((result.run_id, result.seq), result.seq * period)
+        for name in now.keys() - result.sensor_faults.keys():
+            told.append(f"{now.pop(name)}; believed again from {t:.1f} s")
+        for name, fault in result.sensor_faults.items():
+            now.setdefault(name, m.words_of_fault(name, fault, t))
+    return [*told, *now.values()]
 
 
 def _spread(values: list[float]) -> Spread | None:

@@ -33,6 +33,8 @@ class Traces:
     weight: np.ndarray
     constant_weight: np.ndarray
     """(n, d) what counted of the network, and of a constant beside it."""
+    reference: np.ndarray
+    """(n, d) where each state should be, NaN for what is no output, plant units."""
     fallback: np.ndarray
     """(n,) whether the input did not come from the solver."""
     version: np.ndarray
@@ -78,6 +80,7 @@ def traces(run: Run) -> Traces:
         error=np.array([np.nan if r.prediction_error is None else r.prediction_error for r in results]),
         weight=vectors([r.weight for r in results], plant.d),
         constant_weight=vectors([r.constant_weight for r in results], plant.d),
+        reference=np.array([[r.reference.get(name, np.nan) for name in plant.states] for r in results]),
         fallback=np.array([r.mode != "solver" for r in results]),
         version=np.array([r.hidden_version for r in results]),
         adopted=np.array([r.weights_outcome == "adopted" for r in results]),

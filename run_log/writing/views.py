@@ -27,7 +27,8 @@ NAMED_AFTER = dict.fromkeys(
     "states",
 ) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
 """Of each vector, the plant's attribute that has the names of its entries."""
-LACKING = ["x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation"]
+LACKING_VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation")
+LACKING = (*LACKING_VECTORS, "sensor_faults", "reference")
 """What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
@@ -52,7 +53,8 @@ def _of_result(result: m.TickResult) -> Json:
     piece = None if result.set_margin is None else result.set_piece
     aimed = None if result.target_status == "none" else result.target_status
     lacking = {name: getattr(result, name) or None for name in LACKING}
-    return {**lacking, "set_piece": piece, "target_status": aimed}
+    verdict = None if result.reference_verdict == "none" else result.reference_verdict
+    return {**lacking, "set_piece": piece, "target_status": aimed, "reference_verdict": verdict}
 
 
 def _of_samples(samples: m.Samples) -> Json:
@@ -94,13 +96,16 @@ SHOWN: dict[type[m.Message], Shown] = {
     ),
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
-        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance weight "
-        "constant_weight deviation",
+        "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
+        "sensor_faults reference reference_verdict weight constant_weight deviation",
         _of_result,
         {
-            **dict.fromkeys(LACKING, Vector | None),
+            **dict.fromkeys(LACKING_VECTORS, Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
+            "sensor_faults": dict[str, str] | None,
+            "reference": dict[str, float] | None,
+            "reference_verdict": str | None,
         },
     ),
     m.TickTiming: Shown("solve_ms tick_ms lateness_ms state_age_ms"),

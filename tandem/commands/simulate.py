@@ -50,11 +50,15 @@ class Simulate(Configured):
     """Initial state, in the plant's own units."""
     noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint=FROM_CONFIG)] = None
     """Noise in what is measured of every state, its standard deviation as a share of the half-width: 0.01."""
+    set_points: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: the configured reference)")
+    ] = None
+    """Where the plant shall go from the beginning of each episode on: a CSV file of times and states."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
     """Write the run's log too, in the format of a live run."""
 
     def run(self) -> int:
-        config, _ = self.resolve_with_plant()
+        config, plant = self.resolve_with_plant()
         terminal.limited("--steps", self.steps, 1, MOST_STEPS)
         terminal.limited("--episodes", self.episodes, 1, MOST_STEPS // self.steps)
         if self.log is not None and self.log.exists():
@@ -67,10 +71,14 @@ class Simulate(Configured):
         from node_runtime.config.loading import override
         from run_log.reporting.summary import summarise
         from run_log.writing.save import save
-        from tandem import summary_table
+        from tandem import set_points, summary_table
         from tandem.experiments.simulation.lockstep import simulate
 
         require("zstandard")
+        asked = None
+        if self.set_points is not None:
+            asked = set_points.from_file(self.set_points)
+            set_points.require_fit(asked, plant, config.period, str(self.set_points))
         if self.adapt_only:
             config = override(config, ["trainer.enabled=false"])
         self.say(guarantee(config, build_model(config)))
@@ -82,6 +90,7 @@ class Simulate(Configured):
                     self.steps,
                     progress=lambda step: bar.update(task, completed=step),
                     episodes=self.episodes,
+                    set_points=asked,
                 )
             except PlantError as error:
                 terminal.complain(f"the plant was lost: {error}", self.json)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -88,6 +88,8 @@ class Snapshot:
     late: int = 0
     skipped: int = 0
     mode: str = ""
+    sensor_faults: dict[str, str] = field(default_factory=dict)
+    """What is wrong with sensors that are not believed, in words, by the names of their states."""
     fallback: int = 0
     slack: float = 0.0
     slack_row: str = ""
@@ -98,6 +100,9 @@ class Snapshot:
     set_piece: int = -1
     outside: int = 0
     """Ticks outside of them."""
+    reference: dict[str, float] = field(default_factory=dict)
+    """Where outputs should be now, by name; empty where there are none."""
+    target_status: str = "none"
     solve_ms: tuple[float, float] | None = None
     """p50 and p99 of the recent ticks."""
     tick_ms: tuple[float, float] | None = None
@@ -237,6 +242,11 @@ class Monitor:
         self._take_margin(result, now)
         if result.weight:
             self._take_weight(max(result.weight + result.constant_weight), tick, now)
+        self._take_faults(result, now)
+        seen.reference, seen.target_status = result.reference, result.target_status
+        if result.reference_verdict != "none":
+            taken = result.reference_verdict == "taken"
+            self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1
@@ -260,6 +270,16 @@ class Monitor:
         if nothing != seen.adds_nothing:
             seen.adds_nothing = nothing
             self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning counts again'}", now)
+
+    def _take_faults(self, result: m.TickResult, now: float) -> None:
+        before, began = self._seen.sensor_faults, self.first_command
+        since = 0.0 if began is None else now - began
+        told = {name: m.words_of_fault(name, fault, since) for name, fault in result.sensor_faults.items()}
+        for name in told.keys() - before.keys():
+            self.say(f"tick {result.seq}: {told[name]}", now, "bad")
+        for name in before.keys() - told.keys():
+            self.say(f"tick {result.seq}: sensor {name} is believed again", now, "good")
+        self._seen.sensor_faults = {name: before.get(name, text) for name, text in told.items()}
 
     def _take_margin(self, result: m.TickResult, now: float) -> None:
         margin = result.set_margin
@@ -332,7 +352,7 @@ class Monitor:
             self._seen,
             phase=self.phase or ("the plant" if silent else ""),
             elapsed=None if self.first_command is None else now - self.first_command,
-            states=_gauges(plant.states, x, plant.x_min, plant.x_max, plant.x_e, plant.x_scale),
+            states=_gauges(plant.states, x, plant.x_min, plant.x_max, self._goal(), plant.x_scale),
             inputs=_gauges(plant.inputs, u, plant.u_min, plant.u_max, plant.u_e, plant.u_scale),
             measured_rate=_rate(self._tick_times, now),
             solve_ms=_percentiles(self._solve_ms),
@@ -343,6 +363,14 @@ class Monitor:
             bad_messages=self.bad.total + sum(self._bad_elsewhere.values()),
             events=tuple(self._events),
         )
+
+    def _goal(self) -> np.ndarray:
+        """Where the states should come to rest, (d,)."""
+        goal, states = self.plant.x_e.copy(), self.plant.states
+        for name, value in self._seen.reference.items():
+            if name in states:
+                goal[states.index(name)] = value
+        return goal
 
     def _row(self, name: str, now: float) -> ProcessRow:
         health, at = self._health.get(name, (None, now))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -14,7 +14,7 @@ from run_log.reporting.summary import ADDS_NOTHING
 from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
-FIGURES = 8
+FIGURES = 9
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
@@ -81,7 +81,10 @@ def line(now: Snapshot) -> str:
     )
     if now.set_margin is not None:
         parts.append(_sets(now)[0])
+    if now.reference:
+        parts.append(f"set-point {_set_point(now)}")
     parts.append(now.mode + (f", slack {now.slack:.1e}" if now.slack else ""))
+    parts += now.sensor_faults.values()
     if now.phase:
         parts.append(f"waiting for {now.phase}")
     troubled = [f"{p.name} {p.status}" for p in now.processes if p.status not in ("running", "ready")]
@@ -95,6 +98,18 @@ def _sets(now: Snapshot) -> tuple[str, str]:
     if now.set_margin < 0.0:
         return f"OUTSIDE the sets by {-now.set_margin:.2g}", "bold red"
     return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
+
+
+def _set_point(now: Snapshot) -> str:
+    """Where outputs should be, how far off they are, and whether the plant can rest there."""
+    if not now.reference:
+        return "the equilibrium"
+    at = {gauge.name: gauge.value for gauge in now.states}
+    parts = []
+    for name, r in now.reference.items():
+        x = at.get(name)
+        parts.append(f"{name} {r:.4g}" + ("" if x is None else f", off by {abs(x - r):.2g}"))
+    return f"{'; '.join(parts)}, {now.target_status}"
 
 
 def _panel(title: str, body: RenderableType) -> Panel:
@@ -135,9 +150,15 @@ def _gauges(now: Snapshot, width: int) -> Table:
             f"{gauge.low:.4g}",
             _bar(gauge, cells) if cells >= 8 else "",
             f"{gauge.high:.4g}",
-            f"off by {gauge.value - gauge.target:+.4f}" if roomy and gauge.value is not None else "",
+            _beside(gauge, now.sensor_faults) if roomy else "",
         )
     return table
+
+
+def _beside(gauge: Gauge, faults: Mapping[str, str]) -> Text:
+    if gauge.name in faults:
+        return Text("not believed", "bold red")
+    return Text("" if gauge.value is None else f"off by {gauge.value - gauge.target:+.4f}")
 
 
 def _number(gauge: Gauge) -> str:
@@ -206,6 +227,7 @@ def _loop(now: Snapshot) -> Table:
             ("mode", Text.assemble(mode, "   ", _counted(now.fallback, "fallback"))),
             ("slack", Text.assemble(slack, "   ", _counted(now.soft, "soft ticks"))),
             ("sets", Text.assemble(_sets(now), "   ", _counted(now.outside, "ticks outside", "bold red"))),
+            ("set-point", Text(_set_point(now), "dim" if not now.reference else "default")),
             ("plant", source.get(now.source, now.source or "-")),
         ]
     )

@@ -26,21 +26,26 @@ class ReferenceSolver:
         )
         v = ca.MX.sym("v", m, n)
         e = ca.MX.sym("e", int(rows.penalty.soft.sum()) if problem.soft else 0)
+        before = ca.MX.sym("before", m)
         a, b, q, r, p = (ca.DM(matrix) for matrix in (model.A, model.B, model.Q, model.R, model.P))
         parts = problem.oracle.split(theta)
         s, nominal, cost = x, x[:d], ca.MX(0)
-        values_v, values_z = [], []
+        u_before, values_v, values_z = before, [], []
         for i in range(n):
             vi, z = v[:, i], s[:d]
             ui = vi + ca.DM(model.K) @ (z - nominal)
             cost += 0.5 * (ca.bilin(q, z, z) + ca.bilin(r, ui, ui))
+            cost += 0.5 * ca.bilin(ca.DM(model.S), ui - u_before, ui - u_before)
+            u_before = ui
             after = a @ z + b @ ui + problem.oracle.value(ca.vertcat(s, ui), parts)
             s = follow_symbols(s, ui, after)
             nominal = a @ nominal + b @ vi
             values_v.append(ca.DM(rows.input_rows) @ vi)
             values_z.append(ca.DM(rows.state_rows) @ nominal)
         cost += 0.5 * ca.bilin(p, s[:d], s[:d])
-        values = ca.vertcat(*values_v, *values_z, ca.DM(rows.terminal_rows) @ nominal)
+        limited = np.flatnonzero(np.isfinite(problem.input_steps)).tolist()
+        changes = [(v[:, i] - v[:, i - 1])[limited] for i in range(1, n) if limited]
+        values = ca.vertcat(*values_v, *changes, *values_z, ca.DM(rows.terminal_rows) @ nominal)
         count = rows.count_inputs
         slack = (
             ca.DM(rows.penalty.scale[count:]) * e if problem.soft else ca.DM.zeros(values.shape[0] - count)
@@ -66,12 +71,17 @@ class ReferenceSolver:
         }
         decision = ca.vertcat(ca.vec(v), e)
         self._solver = ca.nlpsol(
-            "r", "ipopt", {"x": decision, "f": cost, "g": g, "p": ca.vertcat(x, theta)}, options
+            "r", "ipopt", {"x": decision, "f": cost, "g": g, "p": ca.vertcat(x, theta, before)}, options
         )
         self._lbx = np.concatenate([np.full(m * n, -np.inf), np.zeros(e.shape[0])])
 
     def solve(
-        self, x: np.ndarray, oracle_parameters: np.ndarray, warm_start: np.ndarray, within: float = np.inf
+        self,
+        x: np.ndarray,
+        oracle_parameters: np.ndarray,
+        warm_start: np.ndarray,
+        within: float = np.inf,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         """As `lbmpc.solver.gauss_newton.Solver.solve`; `within` keeps every input that close to the warm start.
 
@@ -84,9 +94,12 @@ class ReferenceSolver:
             guess[i] = model.K @ state + c
             state = model.A @ state + model.B @ guess[i]
         guess = np.concatenate([np.ravel(guess), np.full(len(self._lbx) - n * m, 1e-3)])
+        before = np.zeros(m) if previous is None else previous
+        self._rows.bound_first(None, before)
+        self._lower[:m], self._upper[:m] = self._rows.first
         result = self._solver(
             x0=guess,
-            p=np.concatenate([x, oracle_parameters]),
+            p=np.concatenate([x, oracle_parameters, before]),
             lbg=self._lower,
             ubg=self._upper,
             lbx=self._lbx,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,17 +24,21 @@ NOWHERE = np.zeros(5)
 Y = 1
 
 
+Find = Callable[[np.ndarray, np.ndarray], SteadyState]
+
+
 def selector(
     oracle: Oracle, outputs: tuple[int, ...] = (Y,), r: tuple[float, ...] = (0.0,), model: Model = MODEL
-) -> TargetSelector:
-    return TargetSelector(build_problem(model, oracle, 10), outputs, r)
+) -> Find:
+    selects = TargetSelector(build_problem(model, oracle, 10))
+    return partial(selects.find, outputs=outputs, r=np.array(r))
 
 
-def found(finder: TargetSelector, theta: np.ndarray, searches: int = 3) -> SteadyState:
+def found(finder: Find, theta: np.ndarray, searches: int = 3) -> SteadyState:
     """As tick after tick finds it."""
-    target = finder.find(theta, NOWHERE)
+    target = finder(theta, NOWHERE)
     for _ in range(searches - 1):
-        target = finder.find(theta, target.xu)
+        target = finder(theta, target.xu)
     return target
 
 
@@ -152,14 +158,14 @@ def test_numbers_that_cannot_be_used_lead_to_the_equilibrium_and_do_no_harm(
     oracle = ORACLES[name]
     finder, good = selector(oracle, outputs, (0.05,) * len(outputs)), theta_of(oracle, 0)
     before = found(finder, good)
-    wild = finder.find(np.full_like(good, number), before.xu)
+    wild = finder(np.full_like(good, number), before.xu)
     assert np.isfinite(wild.xu).all()
     assert (np.abs(wild.xu) <= SCALE * 1.5).all()
     if not np.isfinite(number):
         assert wild.status == "no rest"
         np.testing.assert_array_equal(wild.xu, NOWHERE)
-    again = finder.find(good, wild.xu)
-    again = finder.find(good, again.xu)
+    again = finder(good, wild.xu)
+    again = finder(good, again.xu)
     np.testing.assert_allclose(again.xu, before.xu, atol=1e-7)
 
 
@@ -175,8 +181,8 @@ def test_the_same_numbers_give_the_same_bits() -> None:
     oracle = ORACLES["dnn"]
     finders = [selector(oracle, (Y,), (y,)) for y in (0.05, 0.05)]
     theta = theta_of(oracle, 2)
-    finders[0].find(theta_of(oracle, 1), NOWHERE)
-    assert finders[0].find(theta, NOWHERE).xu.tobytes() == finders[1].find(theta, NOWHERE).xu.tobytes()
+    finders[0](theta_of(oracle, 1), NOWHERE)
+    assert finders[0](theta, NOWHERE).xu.tobytes() == finders[1](theta, NOWHERE).xu.tobytes()
 
 
 def test_a_model_without_h_rests_at_the_equilibrium() -> None:
@@ -184,3 +190,13 @@ def test_a_model_without_h_rests_at_the_equilibrium() -> None:
         target = found(selector(LinearOracle(4, 1), outputs, r), np.zeros(0))
         assert (target.status, target.distance) == ("reached", 0.0)
         np.testing.assert_allclose(target.xu, 0.0, atol=1e-12)
+
+
+def test_one_selector_serves_one_reference_after_another() -> None:
+    """Bit for bit as one that knows no other: nothing is left of the last one."""
+    oracle = ORACLES["dnn"]
+    theta, selects = theta_of(oracle, 2), TargetSelector(build_problem(MODEL, oracle, 10))
+    for outputs, r in (((Y,), (0.05,)), ((0,), (-0.1,)), ((), ()), ((0, Y), (0.0, 0.1)), ((Y,), (0.05,))):
+        target = selects.find(theta, NOWHERE, outputs, np.array(r))
+        assert target.xu.tobytes() == selector(oracle, outputs, r)(theta, NOWHERE).xu.tobytes()
+        assert (target.outputs, target.r.tolist()) == (outputs, list(r))

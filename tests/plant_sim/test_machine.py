@@ -70,6 +70,16 @@ def test_what_is_no_measurement_is_none(
     assert len(caplog.records) == 1
 
 
+def test_with_an_estimator_some_states_may_have_no_number() -> None:
+    def read(x: list[float]) -> np.ndarray | None:
+        return Guarded(lambda: np.array(x), lambda u: None, 2, 10.0, False, gaps=True).read(0.0)
+
+    nan = float("nan")
+    np.testing.assert_array_equal(read([1.0, nan]), [1.0, nan])
+    assert read([nan, nan]) is None
+    assert read([float("inf"), nan]) is None
+
+
 def test_an_input_that_could_not_be_written_is_not_known_to_act() -> None:
     one = guarded(write=raising(TimeoutError("bus")))
     assert one.write(np.zeros(1), 0.0) is None

@@ -8,6 +8,7 @@ import pytest
 from lbmpc.plants import get_plant
 from node_runtime.config.loading import load
 from plant_sim.sensors import Sensors
+from plant_sim.shield import measurement
 
 PLANT = get_plant("moore_greitzer")
 X = np.array([0.513, 1.61, 1.2, 0.7])
@@ -75,3 +76,17 @@ def test_a_stuck_sensor_shows_what_it_showed_then() -> None:
 def test_so_many_samples_are_lost(share: float) -> None:
     lost = np.isnan(series(sensors(f"dropouts={share}"), 4000)[:, 0]).mean()
     assert abs(lost - share) < 0.03
+
+
+def test_of_a_dead_sensor_no_number_comes_and_none_travels() -> None:
+    one = sensors("dead={y=0.1}")
+    before, after = one.measure(X, 7.0), one.measure(X, 7.25)
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before, X)
+    np.testing.assert_array_equal(np.isnan(after), [False, True, False, False])
+    told = measurement(PLANT, after)
+    assert told["missing"] == ["y"]
+    assert np.isfinite(told["x"]).all()
+    np.testing.assert_array_equal(np.delete(told["x"], 1), np.delete(X, 1))
+    assert measurement(PLANT, before) == {"x": X.tolist()}

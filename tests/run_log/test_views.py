@@ -13,7 +13,7 @@ from lbmpc.plants import get_plant
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from run_log.writing.views import LACKING, views
+from run_log.writing.views import LACKING_VECTORS, views
 
 RECORDED = Path(__file__).with_name("views.jsonl")
 """A line for each of `messages`: topic, the JSON text of its view, the text of its schema."""
@@ -25,7 +25,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
     who = {"run_id": "c-1", "seq": 7}
     x, u, K = [0.5, 1.25, -3e-9, 20.0], [1.5], m.Array.of(np.arange(12.0).reshape(3, 4))
     state = m.PlantState(**who, t=1e22, x=x, applied=u, source="command", command_seq=6)
-    held = m.PlantState(**who, t=0.0, x=x, applied=None, source="hold", command_seq=-1)
+    held = m.PlantState(**who, t=0.0, x=x, applied=None, source="hold", command_seq=-1, missing=["y"])
     weights = m.HiddenWeights(
         run_id="t-1", seq=3, for_run="c-1", trained_on=5, base_sha256="ab", samples=40, loss_before=0.1,
         loss_after=1e-9, network_sha256="cd", sha256="ef", layers=[K, m.Array.of(np.ones((5, 2)), "<f4")],
@@ -39,10 +39,11 @@ def messages() -> list[tuple[Topic, m.Message]]:
         input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
         weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x,
+        sensor_faults={"y": "stuck; what it measures is estimated from the others"},
     )  # fmt: skip
     absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
     absent |= {"target_status": "none", "target_distance": None}
-    absent |= {name: [] for name in LACKING}
+    absent |= {name: [] for name in LACKING_VECTORS} | {"sensor_faults": {}, "reference": {}}
     replaced = msgspec.structs.replace
     return [
         (topics.PLANT_STATE, state),

@@ -222,10 +222,12 @@ def _input_table(known: Known) -> Table:
 
     from tandem.model_tables import plain
 
-    names = ("half-width", "u_e", "u_min", "u_max", "safe input")
+    limited = bool(np.isfinite(known.input_rates).any())
+    names = ("half-width", "u_e", "u_min", "u_max", "safe input", *("most a second",) * limited)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, name in enumerate(known.inputs):
         values, scale = (known.u_e[i], known.u_min[i], known.u_max[i], known.safe_input[i]), known.u_scale[i]
+        values += (known.input_rates[i],) * limited
         shown.add_row(name, _with_unit(known, name, scale), *(_rounded(value, scale) for value in values))
     return shown
 

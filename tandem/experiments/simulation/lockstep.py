@@ -26,6 +26,7 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
 from plant_sim.sensors import Sensors
+from plant_sim.shield import measurement
 from plant_sim.simulator import PlantSim
 from protocol import messages as m
 from protocol import topics
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int], None]
 NO_FAULTS = Faults()
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
+COMMANDER = "commander-simulated"
 
 
 @dataclass(frozen=True)
@@ -53,14 +55,20 @@ class Outcome:
     """How many of them were followed to their end."""
 
 
-def simulate(config: Config, steps: int, progress: Progress | None = None, episodes: int = 1) -> Run:
+def simulate(
+    config: Config,
+    steps: int,
+    progress: Progress | None = None,
+    episodes: int = 1,
+    set_points: m.Reference | None = None,
+) -> Run:
     """`follow`, without faults, of a plant that is not lost.
 
     Raises:
         ConfigError: the configuration admits no controller.
         PlantError: the true plant left every state from which its equations can be followed.
     """
-    outcome = follow(config, steps, progress=progress, episodes=episodes)
+    outcome = follow(config, steps, progress=progress, episodes=episodes, set_points=set_points)
     if outcome.lost is not None:
         raise PlantError(outcome.lost)
     return outcome.run
@@ -72,6 +80,7 @@ def follow(
     faults: Faults = NO_FAULTS,
     progress: Progress | None = None,
     episodes: int = 1,
+    set_points: m.Reference | None = None,
 ) -> Outcome:
     """Run `steps` periods from x0, `episodes` times.
 
@@ -81,12 +90,13 @@ def follow(
         faults: what goes wrong; its times count from the first episode on.
         progress: told the number of finished steps, of all episodes.
         episodes: how often the plant is started.
+        set_points: where the plant shall go from the beginning of each episode on; None: as configured.
 
     Raises:
         ConfigError: the configuration admits no controller, or the faults do not fit the plant.
     """
     with one_blas_thread():
-        return drive(LockStep(config, faults), steps, progress, episodes)
+        return drive(LockStep(config, faults, set_points=set_points), steps, progress, episodes)
 
 
 def drive(loop: LockStep, steps: int, progress: Progress | None = None, episodes: int = 1) -> Outcome:
@@ -127,13 +137,22 @@ class LockStep:
         config: the resolved configuration.
         faults: what goes wrong.
         given: objects that stand for the plant of the configuration and for its truth.
+        set_points: as of `follow`.
 
     Raises:
         ConfigError: the configuration admits no controller, or the faults do not fit the plant.
     """
 
-    def __init__(self, config: Config, faults: Faults = NO_FAULTS, given: GivenPlant | None = None):
+    def __init__(
+        self,
+        config: Config,
+        faults: Faults = NO_FAULTS,
+        given: GivenPlant | None = None,
+        set_points: m.Reference | None = None,
+    ):
         self.config, self.faults = config, faults
+        self._set_points = self._asked = set_points
+        self._said = 0
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER, given=given)
         truth = None if given is None else given.truth
@@ -208,6 +227,20 @@ class LockStep:
         self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
+        self._asked = self._set_points or self._asked
+
+    def ask(self, reference: m.Reference) -> None:
+        """Where the plant shall go from the next period on."""
+        self._asked = reference
+
+    def _asking(self, seq: int) -> m.Reference | msgspec.UnsetType:
+        """What the tick latches; each time somebody else asks, so that nothing is taken for a repetition."""
+        if self._asked is None:
+            return msgspec.UNSET
+        said = msgspec.structs.replace(self._asked, run_id=f"{COMMANDER}-{self._said}", seq=0)
+        self._asked, self._said = None, self._said + 1
+        self._note(topics.REFERENCE, said, seq)
+        return said
 
     def _end(self) -> list[tuple[Topic, m.Message, int]]:
         """Where the last command has led the plant; of one that moves elsewhere that is not known."""
@@ -255,6 +288,7 @@ class LockStep:
             state=state,
             weights=weights,
             truth=dict(truth),
+            reference=self._asking(seq),
         )
         stepped = time.perf_counter()
         outputs = self.core.step(tick)
@@ -313,7 +347,7 @@ class LockStep:
     def _measured(self, true: m.PlantState) -> m.PlantState | None:
         """The sample as its controller gets it; None where it is lost."""
         x = self.sensors.measure(np.array(true.x), true.t)
-        return None if x is None else msgspec.structs.replace(true, x=x.tolist())
+        return None if x is None else msgspec.structs.replace(true, **measurement(self.core.plant, x))
 
     def _note(self, topic: Topic, message: m.Message, seq: int) -> None:
         self.log.append(self._noted(topic, message, seq))

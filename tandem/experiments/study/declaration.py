@@ -43,7 +43,7 @@ class Runs(Section, frozen=True, kw_only=True):
     """What a case runs. Its group and the experiment may say it for all of theirs: the nearest that says it counts."""
 
     config: str | None = None
-    """What to start from: a shipped configuration by its name, or a file."""
+    """What to start from: a shipped configuration by its name, or a file, beside the experiment's or from here."""
     set: dict[str, Any] = msgspec.field(default_factory=dict)
     """Changes of the configuration, as a table like it: a case's over its group's, a group's over the experiment's."""
     seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count | None = None
@@ -186,12 +186,17 @@ def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str, fol
     for change in (*(level.set for level in levels), *(_below(key, value) for key, value in varied.items())):
         changes = _merged(changes, change)
     try:
-        file = None if name is None else config_file(name)
+        file = None if name is None else _file(name, folder)
         tree = {} if file is None else load_tree(file)
     except ConfigError as error:
         raise ConfigError(f"{where}: config: {error}") from error
     origins = dict.fromkeys(_keys(changes), where)
     return from_tree(_merged(tree, changes), where, origins, file and file.parent, folder)
+
+
+def _file(name: str, folder: Path) -> Path:
+    beside = folder / name
+    return beside if beside.is_file() else config_file(name)
 
 
 def _resolve(

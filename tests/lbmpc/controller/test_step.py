@@ -14,6 +14,7 @@ from lbmpc.oracles import DnnOracle
 from lbmpc.oracles.base import HiddenSet, Verdict
 from lbmpc.plants.linear_motion import discretise
 from lbmpc.problem import build_problem
+from lbmpc.references import Reference
 from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
@@ -25,6 +26,7 @@ MODEL = compressor()
 ORACLE = DnnOracle(describe(MODEL, [8, 8]))
 PROBLEM = build_problem(MODEL, ORACLE, 15, "first_step")
 CONTROLLER = Controller(PROBLEM, Solver(PROBLEM))
+TO_Y = Reference((1,), np.zeros(1), np.array([[0.05]]))
 X = np.array([0.05, 0.05, 0.0, 0.0])
 X_NEXT = np.array([0.052, 0.049, 0.01, 0.1])
 
@@ -120,6 +122,7 @@ class Failing:
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         self.good -= 1
         if self.good >= 0:
@@ -213,7 +216,7 @@ def test_the_feedback_is_clipped_to_U() -> None:
 
 def test_the_feedback_holds_the_target() -> None:
     """K pulls the nominal model towards it: at the target the input is its own, and beside it K's on top."""
-    controller = Controller(PROBLEM, Failing(0), targets=TargetSelector(PROBLEM, [1], [0.05]))
+    controller = Controller(PROBLEM, Failing(0), targets=TargetSelector(PROBLEM), reference=TO_Y)
     state = controller.initial_state(0)
     _, probe = controller.step(state, seen(X, 0, None))
     assert probe.target is not None

@@ -191,6 +191,25 @@ def test_of_a_plant_that_runs_away_nothing_is_known_after_a_while(gap: int, coun
     assert np.isfinite(estimate.variance).all()
 
 
+def test_a_measurement_that_is_not_trusted_counts_nothing_but_has_an_innovation() -> None:
+    kalman, motion = estimator(), Motion(9, 0.1 * SCALE, H)
+    memory, _, _, _ = followed(kalman, motion, 100)
+    trusted = np.array([True, False, True, True])
+    motion.go()
+    seen = motion.sample()
+    lies = seen._replace(y=seen.y + np.array([0.0, 0.4, 0.0, 0.0]))
+    after, estimate = kalman.update(memory, lies, trusted)
+    without, _ = estimator(np.array([0, 2, 3])).update(memory, seen)
+    for name in after:
+        np.testing.assert_array_equal(after[name], without[name])
+    assert estimate.innovation[1] > 8 * np.sqrt(estimate.innovation_variance[1])
+    assert np.abs(estimate.innovation[0]) < 5 * np.sqrt(estimate.innovation_variance[0])
+    # And where none is trusted, the sample is as good as missing.
+    nothing, _ = kalman.update(memory, lies, np.zeros(4, dtype=bool))
+    missed = kalman.missed(kalman.commanded(kalman.commanded(memory, motion.u), motion.u), 0.0)
+    np.testing.assert_allclose(nothing["x"], missed["x"], rtol=1e-12)
+
+
 def chain() -> Model:
     """Position and speed of a mass, and a heater that has nothing to do with it."""
     a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -331,6 +331,7 @@ class Failing:
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
         first: Box | None = None,
+        previous: np.ndarray | None = None,
     ) -> Solution:
         self.good -= 1
         found = self.real.solve(x, theta, warm, xr, ur, first=first)
@@ -343,9 +344,12 @@ class Failing:
         warm: np.ndarray,
         xr: np.ndarray | None = None,
         ur: np.ndarray | None = None,
+        previous: np.ndarray | None = None,
     ) -> None: ...
 
-    def feedback(self, x: np.ndarray, first: Box | None = None) -> Solution:
+    def feedback(
+        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
+    ) -> Solution:
         raise AssertionError("not in this mode")
 
 

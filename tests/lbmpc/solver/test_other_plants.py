@@ -61,12 +61,13 @@ def random_case(seed: int) -> tuple[Model, DnnOracle, np.ndarray, np.random.Gene
     return model, oracle, oracle.theta(state), rng
 
 
-def test_hundreds_of_random_problems_networks_and_warm_starts() -> None:
-    judged = same_minimum = constrained = 0
-    for seed in range(130):
+def test_dozens_of_random_problems_networks_and_warm_starts() -> None:
+    total = judged = same_minimum = constrained = 0
+    for seed in range(45):
         case = random_case(seed)
         if case is None:
             continue
+        total += 1
         model, oracle, theta, rng = case
         n = int(rng.integers(1, 9))
         problem = build_problem(model, oracle, n, "first_step")
@@ -89,8 +90,10 @@ def test_hundreds_of_random_problems_networks_and_warm_starts() -> None:
         # Another minimum of a nonconvex problem? Then ours must be one too, as IPOPT finds when it stays near.
         near = reference.solve(x, theta, ours.c, within=0.01)
         np.testing.assert_allclose(ours.v[0], near.v[0], atol=1e-5, err_msg=f"seed {seed}")
-    assert judged >= 85
-    assert constrained >= 35
+    # What IPOPT cannot solve is passed over; that must be the exception.
+    assert total >= 40
+    assert judged >= 0.9 * total
+    assert constrained >= 15
     assert same_minimum >= 0.97 * judged
 
 
@@ -106,23 +109,6 @@ def test_gauss_newton_steps_that_overshoot_are_shortened(seed: int) -> None:
     solution = solver.solve(x, theta, rng.normal(size=(n, model.m)) * 3)
     assert solution.status in (Status.CONVERGED, Status.INFEASIBLE)
     assert solution.iterations < 10
-
-
-def test_ipopt_agrees_often_enough_to_be_a_judge() -> None:
-    """The test above passes over what IPOPT cannot solve; that must be the exception."""
-    converged = total = 0
-    for seed in range(25):
-        case = random_case(seed)
-        if case is None:
-            continue
-        model, oracle, theta, rng = case
-        problem = build_problem(model, oracle, 5, "first_step")
-        x = rng.uniform(model.plant.x_min, model.plant.x_max)
-        theirs = ReferenceSolver(problem).solve(x, theta, np.zeros((5, model.m)))
-        converged += theirs.status is Status.CONVERGED
-        total += 1
-    assert total >= 15
-    assert converged >= 0.9 * total
 
 
 def closed_loop(name: str, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -12,6 +12,7 @@ from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study.plan import Job, rows
 from tandem.experiments.study.runner import wanted
 from tests.helpers.experiments import SHIPPED, SMALL, cases
+from tests.helpers.paths import ROOT
 
 
 @pytest.mark.parametrize(
@@ -135,6 +136,21 @@ def test_the_shipped_experiment_is_valid_whole_and_quick() -> None:
     # What draws nothing is the same for every seed.
     assert seeds["compressor: oracle = linear"] == [0]
     assert any(len(case.x0s) == 25 for case in whole)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        SHIPPED.with_name("sensors.toml"),
+        ROOT / "examples" / "tanks" / "sensors.toml",
+        ROOT / "examples" / "quadrotor" / "sensors.toml",
+    ],
+    ids=lambda path: path.parent.name,
+)
+def test_the_experiments_with_sensors_are_valid_and_all_have_an_estimator(path: Path) -> None:
+    found = cases(path)
+    assert {case.config.estimator.kind for case in found} == {"kalman"}
+    assert len({case.config.controller.oracle for case in found}) == 4
 
 
 def test_cases_with_names_alike_have_a_log_each(tmp_path: Path) -> None:

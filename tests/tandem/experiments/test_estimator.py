@@ -126,3 +126,38 @@ def test_learning_costs_little_more_than_the_nominal_model_where_noise_exceeds_h
     assert J("adaptation.law=kalman") < 1.05 * linear
     # What it was without any of it.
     assert J("estimator.kind=none") > 3.0 * linear
+
+
+@pytest.fixture(scope="module")
+def misled() -> Run:
+    faults = ["plant.sensors.stuck={y=0.5}", "plant.sensors.dead={rdot=1.0}"]
+    return simulate(config("adaptation.law=kalman", *faults), 60)
+
+
+def test_a_stuck_and_a_dead_sensor_are_named_in_the_log_and_not_learned_from(misled: Run) -> None:
+    named = [set(result.sensor_faults) for result in misled.results]
+    assert not any(named[:10])
+    assert "y" in named[30]
+    assert "rdot" in named[23]
+    assert named[-1] == {"y", "rdot"}
+    lost = [tick.state for tick in misled.ticks if tick.t > 0.99]
+    assert all(state is not None and state.missing == ["rdot"] for state in lost)
+    # Of a stuck y the label would be what the model says it should have moved.
+    labels = np.array([sample.h for sample in misled.samples if sample.seq > 12])[:, 1]
+    assert np.abs(labels).max() < 0.02 * PLANT.x_scale[1]
+    assert np.abs(true(misled)[:, 1] - PLANT.x_e[1]).max() < PLANT.x_scale[1]
+    assert all(np.isfinite(sample.variance).all() for sample in misled.samples)
+
+
+def test_it_replays_and_is_told_in_the_summary(misled: Run) -> None:
+    assert replay(misled, from_tick=30).equal
+    told = summarise(misled).sensor_faults
+    assert [text[:14] for text in sorted(told)] == ["sensor rdot is", "sensor y is st"]
+    assert simulate(config("controller.oracle=linear"), 5).results[-1].sensor_faults == {}
+
+
+def test_without_an_estimator_a_sample_with_a_gap_is_no_sample() -> None:
+    run = follow(
+        config("estimator.kind=none", "plant.sensors.dead={y=0.1}", "controller.oracle=linear"), 6
+    ).run
+    assert [result.mode for result in run.results][2:] == ["shifted_plan"] * 4

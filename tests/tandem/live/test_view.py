@@ -100,6 +100,25 @@ def result(
     )
 
 
+def test_a_sensor_that_is_not_believed_is_said_once_and_shown(monitor: Monitor) -> None:
+    stuck = {"y": "stuck; what it measures is estimated from the others"}
+    for k, faults in ((50, stuck), (51, stuck), (52, {})):
+        answer = msgspec.structs.replace(result(k), sensor_faults=faults)
+        monitor.feed(delivery(topics.RESULT, answer, START + 0.05 * k))
+        if k == 51:
+            assert "sensor y is stuck since 2.5 s; what it measures is estimated" in view.line(
+                monitor.snapshot(START + 2.6)
+            )
+            console = Console(file=io.StringIO(), width=120, height=40)
+            console.print(view.render(monitor.snapshot(START + 2.6), 120, 40))
+            assert "not believed" in console.file.getvalue()  # type: ignore[attr-defined]
+    said = [event.text for event in monitor.snapshot(START + 2.7).events if "sensor" in event.text]
+    assert said == [
+        "tick 50: sensor y is stuck since 2.5 s; what it measures is estimated from the others",
+        "tick 52: sensor y is believed again",
+    ]
+
+
 def health(process: str, counters: dict[str, int], note: str = "") -> m.Health:
     return m.Health(run_id=process, seq=0, process=process, status="running", counters=counters, note=note)
 

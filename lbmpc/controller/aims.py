@@ -1,0 +1,115 @@
+"""Where a plan leads: the target of the reference now, and those of its knots within the horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from lbmpc.model import Model
+from lbmpc.references import Change, Reference, between, changed, preview
+from lbmpc.targets import SteadyState, TargetSelector
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Of one plan; all None: the equilibrium."""
+
+    target: SteadyState | None = None
+    """Of the reference now."""
+    xr: np.ndarray | None = None
+    """(1, d) where nothing changes within the horizon, else (N + 1, d)."""
+    ur: np.ndarray | None = None
+    """(1, m) or (N, m)"""
+
+    @property
+    def references(self) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """For a solver."""
+        return self.xr, self.ur
+
+    @property
+    def xu(self) -> np.ndarray:
+        """x and u of the target now, (d + m,); (0,) without one."""
+        return np.zeros(0) if self.target is None else self.target.xu
+
+
+class Aims:
+    """Finds them.
+
+    Args:
+        model: the nominal one.
+        horizon: N.
+        targets: finds the target of one reference; None: every plan leads to the equilibrium.
+        configured: the reference where nobody gave another; None: the equilibrium.
+    """
+
+    def __init__(
+        self, model: Model, horizon: int, targets: TargetSelector | None, configured: Reference | None
+    ):
+        self.targets, self._configured = targets, configured
+        self._model, self._horizon = model, horizon
+        outputs = () if configured is None else configured.outputs
+        self._own = outputs or tuple(model.plant.performance)
+
+    @property
+    def nothing_yet(self) -> np.ndarray:
+        """A target before there is one, (d + m,); (0,) where plans lead to the equilibrium."""
+        size = 0 if self._configured is None else self._model.d + self._model.m
+        return np.zeros(size)
+
+    def latched(
+        self,
+        present: Reference | None,
+        change: Change | None,
+        skipped: int,
+        x: np.ndarray,
+        target: np.ndarray,
+    ) -> Reference | None:
+        """The reference of this tick; None: the configured one.
+
+        Args:
+            present: of the tick before, one period later.
+            change: what is asked for; None: nothing.
+            skipped: periods without a tick since then.
+            x: where the plant is, (d,).
+            target: the last target, (d + m,), or (0,).
+        """
+        if present is not None and skipped:
+            present = present.advanced(skipped)
+        if change is None or self.targets is None:
+            return present
+        aim = target[: self._model.d] if target.size else np.zeros(self._model.d)
+        return changed(present or self._configured, change, self._model.period, x, aim, self._own)
+
+    def find(
+        self, reference: Reference | None, theta: np.ndarray, last: np.ndarray, ahead: float, new: bool = True
+    ) -> Aim:
+        """Where a plan leads that begins `ahead` seconds after now.
+
+        Args:
+            reference: in force; None: the configured one.
+            theta: the oracle's parameters.
+            last: the last target, (d + m,), or (0,), where the search begins.
+            ahead: seconds.
+            new: False: `last` is the target of now already.
+        """
+        asked = reference or self._configured
+        if asked is None or self.targets is None:
+            return Aim()
+        d, size = self._model.d, self._model.d + self._model.m
+        seen = preview(asked, ahead, self._model.period, self._horizon)
+        begin = last if last.size else np.zeros(size)
+        first = (
+            self.targets.find(theta, begin, asked.outputs, seen.values[0]) if new or not last.size else None
+        )
+        targets = [begin if first is None else first.xu]
+        for before, r in pairwise(seen.values):
+            same = (r == before).all()
+            targets.append(
+                targets[-1] if same else self.targets.find(theta, targets[-1], asked.outputs, r).xu
+            )
+        if len(targets) == 1:
+            return Aim(first, targets[0][None, :d], targets[0][None, d:])
+        over = between(seen.positions, np.array(targets), np.arange(self._horizon + 1.0))
+        return Aim(first, over[:, :d], over[:-1, d:])

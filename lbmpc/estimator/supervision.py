@@ -1,0 +1,212 @@
+"""Which measurements count: sensors that are stuck, dead or off, found by their readings and their innovations.
+
+**Stuck.** A reading with noise in it does not repeat. One that does says nothing new, and is not used: the filter then
+predicts the state from the others. The sensor is named once the prediction has left it by three deviations of the
+noise. A sensor may be quantised, which its smallest step so far tells, and then repeats honestly: its repeated readings
+count where the prediction knows less than they do, and it is named only where the filter is sure as well.
+
+**Dead.** No number comes of it, or one that stands still: 0 is a stuck reading like another.
+
+**Off.** A bias that comes at once is an innovation out of all proportion that stays what it is, in one sensor alone. A
+disturbance of the plant goes on growing, and what really jumped shows in the other sensors soon: then the reading is
+right. What counts as out of proportion follows the innovations of the last 20 samples, so that a model that is wrong,
+or noise that was told too small, is no fault. A bias that grows slowly is a disturbance to everybody.
+
+A sensor that is not believed has an innovation all the same, and is believed again when that was small for a second.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
+from lbmpc.estimator.kalman import LEAST, KalmanEstimator, unobservable
+from lbmpc.model import Model
+
+WORDS = ("", "stuck", "dead", "off")
+NONE, STUCK, DEAD, OFF = range(4)
+
+REPEATS = 4
+"""Readings after the first that are all the same, before a sensor may be named stuck."""
+ABSENT = 3
+"""Samples in a row without a number of it, before a sensor is named dead."""
+MOVED = 3.0
+"""Deviations: of the noise, by which the state must have moved; of an innovation, for a quantised sensor."""
+FINE = 0.25
+"""Of the deviation of the noise: a sensor that showed a smaller step does not repeat honestly."""
+KNOWS_LESS = 9.0
+"""Variance of a prediction, in that of the noise, from which on an honestly repeated reading says more."""
+LEAP = 8.0
+"""Deviations of the innovations as they were lately: one that is larger is not used at once."""
+LATELY = 20
+"""Samples that `LEAP` looks back."""
+STAYS = 4.0
+"""Deviations of the difference of two readings: an innovation that changes by more is no bias, but a motion."""
+READINGS = 8
+"""How many of them are kept, to find the smallest step of a sensor."""
+LASTS = 10
+"""Samples for which a leap stays what it is, before a sensor is named off."""
+AGREES = 4.0
+"""Deviations of an innovation, at most, of a sensor that may be believed again."""
+WELL, WELL_SAMPLES = 1.0, 8
+"""Seconds, and samples at least, for which it must agree."""
+ALIVE = 5
+"""So many times as long, and one that was stuck or dead is believed if it only moves: the estimate may be wrong."""
+
+# Rows of the counts in the memory.
+REPEATED, GONE, LEAPT, AGREED, MOVING, FAULT = range(6)
+
+
+class SupervisedEstimator(Estimator):
+    """An estimator that is told which measurements count.
+
+    Args:
+        inner: what estimates.
+        model: the nominal model.
+        measured: indices of the states that are measured.
+        noise: standard deviation of what is measured, (d,), in units of the states.
+    """
+
+    def __init__(self, inner: KalmanEstimator, model: Model, measured: np.ndarray, noise: np.ndarray):
+        self._inner, self.sees_all, self._model = inner, inner.sees_all, model
+        self._noise = np.maximum(noise, LEAST * model.plant.x_scale)
+        self._measured = np.zeros(len(noise), dtype=bool)
+        self._measured[measured] = True
+        self._well = max(WELL_SAMPLES, round(WELL / model.period))
+        self._unseen = cache(self._words_of_unseen)
+
+    def initial_state(self) -> EstimatorState:
+        nothing = np.zeros(len(self._noise))
+        return {
+            **self._inner.initial_state(),
+            "readings": np.zeros((READINGS, len(nothing))),
+            "step": nothing,
+            "lately": np.ones_like(nothing),
+            "leap": nothing,
+            "counts": np.zeros((6, len(nothing)), dtype=np.int64),
+        }
+
+    def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
+        return {**state, **self._inner.missed(state, delay)}
+
+    def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
+        return self._inner.commanded(state, u)
+
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        return self._inner.deviation(state)
+
+    def tells(self, y: np.ndarray) -> bool:
+        return bool(np.isfinite(y[self._measured]).any())
+
+    def faults(self, state: EstimatorState) -> dict[str, str]:
+        fault = state["counts"][FAULT]
+        if not fault.any():
+            return {}
+        unseen = self._unseen(tuple(np.flatnonzero(self._measured & (fault == 0)).tolist()))
+        return {self._model.plant.states[i]: f"{WORDS[fault[i]]}; {unseen}" for i in np.flatnonzero(fault)}
+
+    def update(
+        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
+    ) -> tuple[EstimatorState, Estimate]:
+        counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
+        # Of a plant that was held, or started again, nobody knows that it moved.
+        same = numbers & (seen.y == state["readings"][0]) & (seen.applied is not None)
+        step, fine = self._steps(state["readings"], state["step"], seen.y, numbers & ~same)
+        if (same == numbers).all():
+            # A plant that rests, or a frozen line: a repetition alone proves nothing.
+            fine[:] = False
+        usable = numbers & (counts[FAULT] == 0)
+        if trusted is not None:
+            usable &= trusted
+
+        tried = usable & ~(same & fine)
+        memory, estimate = self._inner.update(state, seen, tried)
+        known = np.isfinite(estimate.innovation) & numbers
+        away = np.where(known, np.abs(estimate.innovation), 0.0)
+        variance = np.where(known, estimate.innovation_variance, np.inf)
+        leapt, leap = self._leaps(state, estimate.innovation, away, variance, usable & ~same)
+        vague = variance > (1.0 + KNOWS_LESS) * self._noise**2
+        used = tried & ~leapt & (~same | vague)
+        if (used != tried).any():
+            memory, estimate = self._inner.update(state, seen, used)
+
+        sure = fine | ((away > MOVED * np.sqrt(variance)) & (away > step))
+        agrees = known & (away <= AGREES * np.sqrt(variance))
+        counted = np.stack(
+            [
+                np.where(same, counts[REPEATED] + 1, 0),
+                np.where(numbers | ~self._measured, 0, counts[GONE] + 1),
+                np.where(leapt, counts[LEAPT] + 1, 0),
+                np.where(agrees, counts[AGREED] + ~same, 0),
+                np.where(numbers & ~(same & fine), counts[MOVING] + ~same, 0),
+                counts[FAULT],
+            ]
+        )
+        share = np.minimum(away**2 / variance, LEAP**2 * state["lately"])
+        lately = state["lately"] + np.where(used, share - state["lately"], 0.0) / LATELY
+        return {
+            **memory,
+            "readings": _with_reading(state["readings"], seen.y, numbers & ~same),
+            "step": step,
+            "lately": np.maximum(1.0, lately),
+            "leap": leap,
+            "counts": self._judged(counted, (away > MOVED * self._noise) & sure),
+        }, estimate
+
+    def _judged(self, counts: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """The counts with what is wrong by now; moved: whose states have left their readings, (d,)."""
+        before = counts[FAULT]
+        well = counts[AGREED] >= self._well
+        well |= (before != OFF) & (counts[MOVING] >= ALIVE * self._well)
+        fault = np.where(well, NONE, before)
+        fault[(fault == NONE) & (counts[LEAPT] >= LASTS)] = OFF
+        fault[(fault != DEAD) & (counts[REPEATED] >= REPEATS) & moved] = STUCK
+        fault[counts[GONE] >= ABSENT] = DEAD
+        new = (fault != before) & (fault != NONE)
+        judged = counts.copy()
+        judged[[AGREED, MOVING]] = np.where(new, 0, counts[[AGREED, MOVING]])
+        judged[FAULT] = fault
+        return judged
+
+    def _steps(
+        self, readings: np.ndarray, smallest: np.ndarray, y: np.ndarray, changed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The smallest step of each sensor so far, (d,), 0 before the first, and whether it is a fine one."""
+        steps = np.where((readings != 0.0) & (readings != y) & changed, np.abs(readings - y), np.inf)
+        step = np.minimum(np.where(smallest > 0.0, smallest, np.inf), steps.min(axis=0))
+        return np.where(np.isfinite(step), step, 0.0), step < FINE * self._noise
+
+    def _leaps(
+        self,
+        state: EstimatorState,
+        innovation: np.ndarray,
+        away: np.ndarray,
+        variance: np.ndarray,
+        usable: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which readings are not to be used for what they leapt, (d,), and from what innovation on, (d,)."""
+        leaps, lately = state["counts"][LEAPT], state["lately"]
+        leapt = usable & (away > np.where(leaps > 0, AGREES, LEAP) * np.sqrt(variance * lately))
+        change = np.abs(innovation - state["leap"])
+        leapt &= (leaps == 0) | (change <= STAYS * self._noise * np.sqrt(2.0 * lately))
+        if leapt.sum() > 1:
+            # Of two at once neither is a sensor's. In the first sample nobody knows whether they go on.
+            leapt &= leaps == 0
+        return leapt, np.where(leapt & (leaps == 0), innovation, state["leap"])
+
+    def _words_of_unseen(self, believed: tuple[int, ...]) -> str:
+        """What becomes of the states whose sensors are not among those, in words."""
+        if not believed:
+            return "nothing is measured any more"
+        unseen = unobservable(self._model, np.array(believed))
+        if not unseen:
+            return "what it measures is estimated from the others"
+        names = ", ".join(self._model.plant.states[i] for i in unseen)
+        return f"nothing that is measured tells of {names} any more"
+
+
+def _with_reading(readings: np.ndarray, y: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """The last different readings of each sensor, (READINGS, d), the newest first."""
+    return np.where(new, np.vstack([y, readings[:-1]]), readings)

@@ -1,0 +1,196 @@
+"""Where the outputs should be: piecewise linear in time, given while the loop runs, forgotten when its lease is over.
+
+Pure, like everything in a step: time is counted in periods, so that a replay finds every value again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+FOR_EVER = -1
+"""Of a lease: none."""
+LONGEST = 2**53
+"""Periods that are counted at most: a number of 64 bits with a sign, and a float, hold them."""
+PREVIEWED = 5
+"""Knots of a horizon at most: each may take a search for its target."""
+ChangeKind = Literal["set", "hold", "configured"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Outputs and where they should be, deviations; p outputs, k knots."""
+
+    outputs: tuple[int, ...]
+    """Indices of the states that are outputs."""
+    times: np.ndarray
+    """(k,) seconds since it was given, in rising order; two that are equal are a step."""
+    values: np.ndarray
+    """(k, p), linear in between; before the first knot and after the last one they stay."""
+    passed: int = 0
+    """Periods since it was given."""
+    left: int = FOR_EVER
+    """Periods until it is forgotten."""
+    held: bool = False
+    """Whether the plant is held where it was."""
+    source: int = 0
+    """Of who gave it: to say it again renews the lease, and nothing else."""
+
+    def at(self, seconds: float) -> np.ndarray:
+        """(p,) so many seconds after it was given."""
+        return between(self.times, self.values, np.array([seconds]))[0]
+
+    def advanced(self, periods: int) -> Reference | None:
+        """So many periods later; None: its lease is over."""
+        if self.left != FOR_EVER and self.left <= periods:
+            return None
+        left = self.left if self.left == FOR_EVER else self.left - periods
+        return replace(self, passed=min(self.passed + periods, LONGEST), left=left)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "outputs": np.array(self.outputs, dtype=np.int64),
+            "times": self.times,
+            "values": self.values,
+            "count": np.array([self.passed, self.left, self.held, self.source], dtype=np.int64),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], d: int) -> Reference:
+        """Of a plant with d states.
+
+        Raises:
+            ValueError: an array is missing or there are more, or they fit no reference; the text names the array.
+        """
+        expected = {"outputs": 1, "times": 1, "values": 2, "count": 1}
+        for name in sorted(expected.keys() | arrays.keys()):
+            if name not in arrays or arrays[name].ndim != expected.get(name):
+                raise ValueError(name)
+        outputs, times, values, count = (arrays[name] for name in expected)
+        if outputs.dtype != np.int64 or len({*outputs.tolist()} & {*range(d)}) != len(outputs):
+            raise ValueError("outputs")
+        if times.dtype != np.float64 or not len(times) or not (np.diff(times) >= 0).all():
+            raise ValueError("times")
+        if values.dtype != np.float64 or values.shape != (len(times), len(outputs)):
+            raise ValueError("values")
+        if count.dtype != np.int64 or count.shape != (4,) or count[0] < 0 or count[1] < FOR_EVER:
+            raise ValueError("count")
+        passed, left, held, source = count.tolist()
+        return cls((*outputs.tolist(),), times, values, min(passed, LONGEST), left, bool(held), source)
+
+    def repeats(self, change: Change) -> bool:
+        """Whether that is what was asked for, said again."""
+        if change.source != self.source or self.held != (change.kind == "hold"):
+            return False
+        if self.held:
+            return True
+        times, values = change.points
+        k = len(times)
+        return (
+            change.outputs == self.outputs
+            and len(self.times) == k + (times[0] > 0.0)
+            and np.array_equal(self.times[-k:], times)
+            and np.array_equal(self.values[-k:], values)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What somebody asks for. `configured` needs nothing else."""
+
+    kind: ChangeKind
+    """hold: to where the plant is now."""
+    outputs: tuple[int, ...] = ()
+    times: np.ndarray | None = None
+    """(k,) as of a `Reference`, from now on, none negative."""
+    values: np.ndarray | None = None
+    """(k, p)"""
+    lease: int = FOR_EVER
+    """Periods."""
+    source: int = 0
+    """Of who asks."""
+
+    @property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times and values, of `set`."""
+        assert self.times is not None
+        assert self.values is not None
+        return self.times, self.values
+
+
+class Preview(NamedTuple):
+    """What a horizon of n steps sees of a reference."""
+
+    positions: np.ndarray
+    """(k,) steps from its beginning, 0 to n in rising order; (1,) where nothing changes."""
+    values: np.ndarray
+    """(k, p)"""
+
+
+def changed(
+    present: Reference | None,
+    change: Change,
+    period: float,
+    x: np.ndarray,
+    aim: np.ndarray,
+    own: tuple[int, ...],
+) -> Reference | None:
+    """The reference from now on; None: the configured one.
+
+    Args:
+        present: the one in force, the configured one included.
+        change: what is asked for. Its first knot later than now, it goes there from where the present reference is.
+        period: seconds.
+        x: where the plant is, (d,), deviations.
+        aim: where the present plan leads, (d,): where an output begins that has no reference yet.
+        own: the outputs that are held where the plant is.
+    """
+    if change.kind == "configured":
+        return None
+    if present is not None and present.repeats(change):
+        return replace(present, left=change.lease)
+    if change.kind == "hold":
+        return Reference(own, np.zeros(1), x[None, list(own)], 0, change.lease, True, change.source)
+    times, values = change.points
+    if times[0] > 0.0:
+        begin = aim.copy()
+        if present is not None:
+            begin[list(present.outputs)] = present.at(present.passed * period)
+        times = np.concatenate([[0.0], times])
+        values = np.vstack([begin[list(change.outputs)], values])
+    return Reference(change.outputs, times, values, 0, change.lease, False, change.source)
+
+
+def preview(reference: Reference, ahead: float, period: float, n: int) -> Preview:
+    """What the horizon sees that begins `ahead` seconds from now.
+
+    Of more knots than `PREVIEWED` the first ones and the end are left.
+    """
+    begin = reference.passed * period + ahead
+    end = begin + n * period
+    inside = (reference.times > begin) & (reference.times < end)
+    if not inside.any() and begin >= reference.times[-1]:
+        return Preview(np.zeros(1), reference.values[-1:])
+    first = between(reference.times, reference.values, np.array([begin]))
+    last = between(reference.times, reference.values, np.array([end]), "left")
+    seconds = np.concatenate([[begin], reference.times[inside][: PREVIEWED - 2], [end]])
+    values = np.vstack([first, reference.values[inside][: PREVIEWED - 2], last])
+    if (values == values[0]).all():
+        return Preview(np.zeros(1), values[:1])
+    return Preview((seconds - begin) / period, values)
+
+
+def between(
+    times: np.ndarray, values: np.ndarray, at: np.ndarray, side: Literal["left", "right"] = "right"
+) -> np.ndarray:
+    """(a, p): the piecewise linear function of knots times (k,), values (k, p), at (a,).
+
+    At a step it is what follows it, or what comes before it, on the left.
+    """
+    after = np.searchsorted(times, at, side=side)
+    first, last = np.maximum(after - 1, 0), np.minimum(after, len(times) - 1)
+    length = times[last] - times[first]
+    share = np.where(length > 0.0, (at - times[first]) / np.where(length > 0.0, length, 1.0), 0.0)
+    return np.asarray(values[first] + share[:, None] * (values[last] - values[first]))

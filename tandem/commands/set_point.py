@@ -1,0 +1,131 @@
+"""`tandem set-point`: where a running plant shall go. It asks the controller, and says what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from tandem import terminal
+from tandem.commands.base import Configured
+from tandem.terminal import Refused
+
+if TYPE_CHECKING:
+    from node_runtime.config.sections import Config
+    from protocol import messages as m
+
+AGAIN_S = 0.25
+"""Seconds from one asking to the next."""
+MOST_PERIODS = 3.0
+"""Of a slow loop, until it says what it made of a tick."""
+LONGEST = 1e6
+LONGEST_LEASE = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetPoint(Configured):
+    """Tell a running controller where outputs shall be. With certificates it needs the commander's."""
+
+    values: Annotated[Positional[list[str]], arg(metavar="NAME=VALUE...")] = field(default_factory=list)
+    """States and where they shall be, in the plant's own units: y=1.8."""
+    over: Annotated[float, arg(metavar="S")] = 0.0
+    """Seconds in which a straight line leads there."""
+    lease: Annotated[
+        float | None, arg(name="for", metavar="S", help_behavior_hint="(default: until another is given)")
+    ] = None
+    """Seconds after which the configured reference is back."""
+    file: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """A sequence instead: a CSV file with the columns time (seconds from now on) and states."""
+    configured: bool = False
+    """Back to what the configuration says."""
+    seconds: Annotated[float, arg(metavar="S")] = 3.0
+    """How long to wait for the controller's answer."""
+
+    def run(self) -> int:
+        config, plant = self.resolve_with_plant()
+        terminal.limited("--seconds", self.seconds, 0.1, 86_400.0)
+        terminal.limited("--over", self.over, 0.0, LONGEST)
+        if self.lease is not None:
+            terminal.limited("--for", self.lease, config.period, LONGEST_LEASE)
+        from tandem import set_points
+
+        asked = self._asked()
+        where = str(self.file) if self.file is not None else " ".join(self.values)
+        set_points.require_fit(asked, plant, config.period, where)
+        results = ask(config, asked, self.seconds)
+        if not results:
+            text = f"no answer from a controller of {config.name} within {self.seconds:g} s"
+            terminal.complain(f"{text}: is it running, and does another commander speak?", self.json)
+            return 1
+        verdict, _, why = results[0].reference_verdict.partition(": ")
+        if verdict != "taken":
+            terminal.complain(f"the controller refused it: {why}", self.json)
+            return 1
+        self.say(words(results[-1]))
+        self.emit(answer(results[-1]))
+        return 0
+
+    def _asked(self) -> m.Reference:
+        from protocol import messages as m
+        from tandem import set_points
+
+        if (bool(self.values), self.file is not None, self.configured).count(True) != 1:
+            raise Refused("one of NAME=VALUE, --file and --configured is needed")
+        if self.configured:
+            return m.Reference(run_id=set_points.UNSAID, seq=0, kind="configured")
+        if self.file is not None:
+            return set_points.from_file(self.file, self.lease)
+        return set_points.set_point(set_points.from_words(self.values), self.over, self.lease)
+
+
+def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickResult]:
+    """What the controller made of it: the result of the tick that latched it, and of the next; none: no answer.
+
+    A tick that was prepared in the time before it still aims where it aimed then.
+
+    Raises:
+        Refused: no router answers.
+        ConfigError: no link, and why.
+    """
+    from protocol import messages, topics
+    from tandem.commander import commanding
+
+    with commanding(config, topics.RESULT) as commander:
+        results: list[messages.TickResult] = []
+
+        def done(heard: messages.Message) -> bool:
+            if isinstance(heard, messages.TickResult) and (
+                results or heard.reference_from == commander.run_id
+            ):
+                results.append(heard)
+            return len(results) > 1
+
+        every = max(AGAIN_S, MOST_PERIODS * config.period)
+        commander.keep_saying(topics.REFERENCE, reference, every, max(seconds, every), done)
+        return results
+
+
+def answer(result: m.TickResult) -> dict[str, object]:
+    """What `--json` prints."""
+    return {
+        "tick": result.seq,
+        "reference": result.reference,
+        "target_status": result.target_status,
+        "target_distance": result.target_distance,
+    }
+
+
+def words(result: m.TickResult) -> str:
+    """For a person."""
+    now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
+    if not now:
+        return f"taken in tick {result.seq}: plans lead to the equilibrium again"
+    rest = {
+        "reached": "a rest of what has been learned",
+        "nearest": f"out of reach: the nearest rest is off by {100.0 * (result.target_distance or 0.0):.3g} % of a "
+        "half-width",
+        "no rest": "no rest was found inside X and U",
+    }
+    return f"taken in tick {result.seq}: {now} now, {rest.get(result.target_status, result.target_status)}"

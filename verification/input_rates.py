@@ -1,0 +1,131 @@
+"""Whether a rate limit of the input holds whoever commands: `python -m verification.input_rates`.
+
+In each seed the compressor begins elsewhere, commands come up to a fifth of a period early or late, and the controller
+falls silent again and again, for up to twice its horizon: the plan, the backup policy and the safe input act. Every
+input that is written is kept, with its time.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from controller_node.core import ControllerCore
+from lbmpc.plants import Truth, get_plant
+from node_runtime.config.loading import load, override
+from node_runtime.config.sections import Config
+from plant_sim.shield import Shield
+from plant_sim.simulator import Motion
+from protocol import messages as m
+
+SETTINGS = ["controller.horizon=20", "trainer.enabled=false", "network.hidden=[8,8]"]
+LATE = 0.2
+"""Share of a period by which a command is early or late at most, about its usual time."""
+SILENT = 0.08
+"""Of all ticks those at which a silence begins."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Of one seed. Shares are of rate x period, of 1 at most where the limit holds."""
+
+    steps: float
+    """Largest difference of two inputs that acted within one period."""
+    samples: float
+    """Largest difference of `applied` from sample to sample: means over a period."""
+    sources: dict[str, int]
+    """Samples by what acted before them."""
+
+
+class Recording(Motion):
+    """A simulated plant that remembers what is written to it."""
+
+    def __init__(self, *args: object, **options: object):
+        super().__init__(*args, **options)  # type: ignore[arg-type]
+        self.written: list[tuple[float, float]] = []
+
+    def write(self, u: np.ndarray, due: float) -> float:
+        self.written.append((due, float(u[0])))
+        return super().write(u, due)
+
+
+def follow(config: Config, seed: int, ticks: int) -> Found:
+    """One seed, `ticks` long."""
+    rng, plant, period = np.random.default_rng(seed), get_plant("moore_greitzer"), config.period
+    core = ControllerCore(override(config, [f"seed={seed}"]), "controller")
+    x0 = plant.x_e + rng.uniform(-0.4, 0.4, 4) * plant.x_scale * [1.0, 1.0, 0.2, 0.01]
+    motion = Recording(Truth(plant), x0, period)
+    shield = Shield(core.plant, period, config.plant.plan_patience, "plant", held=True)
+    applied, sources, silent, usual = [], dict[str, int](), 0, 0.3 * period
+    first = float(core.plant.safe_input[0])
+    for k in range(ticks):
+        t = k * period
+        shield.advance(t, motion)
+        state = shield.sample(t, motion.read(t))
+        shield.renew(t, np.array(state.x), motion)
+        sources[state.source] = sources.get(state.source, 0) + 1
+        if state.applied is not None:
+            applied.append(state.applied[0])
+        outputs = core.step(_tick(k, t, state))
+        silent = silent - 1 if silent else int(rng.integers(1, 40)) * int(rng.random() < SILENT)
+        if silent:
+            continue
+        shield.command(outputs.command, t + usual + rng.uniform(-LATE, LATE) * period)
+        if rng.random() < 0.5 and (backup := core.backup(outputs.command)) is not None:
+            shield.backup(backup)
+    rate = float(core.plant.input_rates[0])
+    steps = _largest([(-np.inf, first), *motion.written], rate, period)
+    samples = float(np.abs(np.diff(applied)).max()) / (rate * period)
+    return Found(steps, samples, sources)
+
+
+def _tick(seq: int, t: float, state: m.PlantState) -> m.Tick:
+    return m.Tick(
+        run_id="controller",
+        seq=seq,
+        slot=seq,
+        t=t,
+        skipped=0,
+        lateness=0.0,
+        late=False,
+        state_verdict="fresh",
+        state=state,
+        weights=None,
+    )
+
+
+def _largest(written: list[tuple[float, float]], rate: float, period: float) -> float:
+    times, inputs = np.array(written).T
+    # An input ends where the next one begins.
+    apart = times[None, :] - times[1:, None]
+    within = (apart >= 0.0) & (apart < (1.0 - 1e-6) * period)
+    return float(np.abs(inputs[None, :] - inputs[:-1, None])[within].max()) / (rate * period)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Whether a rate limit of the input holds, through jitter and silence of the controller."""
+
+    seeds: int = 20
+    ticks: int = 200
+    rate: Annotated[float, tyro.conf.arg(help="input_rate_max of u, per second.")] = 0.4
+
+
+def main(chosen: Arguments) -> int:
+    config = load("compressor", [*SETTINGS, f"plant.input_rate_max.u={chosen.rate}"])
+    found = [follow(config, seed, chosen.ticks) for seed in range(chosen.seeds)]
+    print("seed | written | applied | samples by source")
+    for seed, one in enumerate(found):
+        by_source = ", ".join(f"{count} {source}" for source, count in sorted(one.sources.items()))
+        print(f"{seed:4d} | {one.steps:7.4f} | {one.samples:7.4f} | {by_source}")
+    held = all(max(one.steps, one.samples) <= 1.0 + 1e-5 for one in found)
+    print("the limit holds" if held else "THE LIMIT IS BROKEN")
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Arguments, prog="python -m verification.input_rates")))
