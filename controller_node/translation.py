@@ -160,9 +160,9 @@ class Translation:
             weights_rolled_back=result.rolled_back,
             sensor_faults=result.sensor_faults,
             **self._target(result.target),
+            **self._judged(tick),
             **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
             deviation=result.deviation.tolist(),
-            **self._judged(tick),
         )
 
     def _judged(self, tick: m.Tick) -> dict[str, Any]:

@@ -246,12 +246,6 @@ class TickResult(Message, frozen=True):
     target_u: list[float] = []
     target_distance: float | None = None
     """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
-    weight: list[float] = []
-    """What of the network counts in the prediction of each state, 0 to 1; empty where nothing weighs it."""
-    constant_weight: list[float] = []
-    """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
-    deviation: list[float] = []
-    """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
     sensor_faults: dict[str, str] = msgspec.field(default_factory=dict)
     """Sensors that are not believed, by the names of their states: what is wrong, and what is known of these states."""
     reference: dict[str, float] = {}
@@ -260,6 +254,12 @@ class TickResult(Message, frozen=True):
     """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
     reference_from: str = ""
     """run_id of who sent that; empty without one."""
+    weight: list[float] = []
+    """What of the network counts in the prediction of each state, 0 to 1; empty where nothing weighs it."""
+    constant_weight: list[float] = []
+    """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
+    deviation: list[float] = []
+    """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

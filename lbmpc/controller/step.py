@@ -192,10 +192,13 @@ class Controller:
             line,
             None if reference is None else reference.advanced(1),
         )
-        faults = self.estimator.faults(estimator)
-        known = self.oracle.weights(oracle), self.estimator.deviation(estimator)
+        known = (
+            self.oracle.weights(oracle),
+            self.estimator.deviation(estimator),
+            self.estimator.faults(estimator),
+        )
         return memory, StepResult(
-            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known, faults
+            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known
         )
 
     def _without_absurd(self, seen: Observation) -> Observation:

@@ -64,10 +64,6 @@ class Estimator(ABC):
         """The memory before the first sample."""
         return {}
 
-    def deviation(self, state: EstimatorState) -> np.ndarray:
-        """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
-        return np.zeros(0)
-
     def tells(self, y: np.ndarray) -> bool:
         """Whether a sample, (d,), NaN where there is no number, says anything."""
         return bool(np.isfinite(y).all())
@@ -75,6 +71,10 @@ class Estimator(ABC):
     def faults(self, state: EstimatorState) -> dict[str, str]:
         """Which sensors are not believed, by the names of their states, and in words what is wrong."""
         return {}
+
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
+        return np.zeros(0)
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
         """The memory after a period without a sample, with so many seconds from one to its command."""

@@ -115,11 +115,6 @@ def summarise(run: Run) -> Summary:
     )
 
 
-def _weight(run: Run, states: tuple[str, ...], found: list[list[float]]) -> dict[str, float] | None:
-    last = [one for one in found[-max(1, round(run.config.rate)) :] if len(one) == len(states)]
-    return dict(zip(states, np.mean(last, axis=0).tolist(), strict=True)) if last else None
-
-
 def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResult]) -> list[str]:
     when = {(tick.run_id, tick.seq): tick.t for tick in ticks}
     told: list[str] = []
@@ -131,6 +126,11 @@ def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResul
         for name, fault in result.sensor_faults.items():
             now.setdefault(name, m.words_of_fault(name, fault, t))
     return [*told, *now.values()]
+
+
+def _weight(run: Run, states: tuple[str, ...], found: list[list[float]]) -> dict[str, float] | None:
+    last = [one for one in found[-max(1, round(run.config.rate)) :] if len(one) == len(states)]
+    return dict(zip(states, np.mean(last, axis=0).tolist(), strict=True)) if last else None
 
 
 def _spread(values: list[float]) -> Spread | None:

@@ -30,11 +30,11 @@ class Traces:
     """(n, d) its estimate."""
     error: np.ndarray
     """(n,) |h_hat - h|."""
+    reference: np.ndarray
+    """(n, d) where each state should be, NaN for what is no output, plant units."""
     weight: np.ndarray
     constant_weight: np.ndarray
     """(n, d) what counted of the network, and of a constant beside it."""
-    reference: np.ndarray
-    """(n, d) where each state should be, NaN for what is no output, plant units."""
     fallback: np.ndarray
     """(n,) whether the input did not come from the solver."""
     version: np.ndarray
@@ -78,9 +78,9 @@ def traces(run: Run) -> Traces:
         h=vectors([r.h for r in results], plant.d),
         h_hat=vectors([r.h_hat for r in results], plant.d),
         error=np.array([np.nan if r.prediction_error is None else r.prediction_error for r in results]),
+        reference=np.array([[r.reference.get(name, np.nan) for name in plant.states] for r in results]),
         weight=vectors([r.weight for r in results], plant.d),
         constant_weight=vectors([r.constant_weight for r in results], plant.d),
-        reference=np.array([[r.reference.get(name, np.nan) for name in plant.states] for r in results]),
         fallback=np.array([r.mode != "solver" for r in results]),
         version=np.array([r.hidden_version for r in results]),
         adopted=np.array([r.weights_outcome == "adopted" for r in results]),

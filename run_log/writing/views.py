@@ -27,8 +27,8 @@ NAMED_AFTER = dict.fromkeys(
     "states",
 ) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
 """Of each vector, the plant's attribute that has the names of its entries."""
-LACKING_VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation")
-LACKING = (*LACKING_VECTORS, "sensor_faults", "reference")
+VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation")
+LACKING = (*VECTORS, "sensor_faults", "reference")
 """What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
@@ -53,8 +53,8 @@ def _of_result(result: m.TickResult) -> Json:
     piece = None if result.set_margin is None else result.set_piece
     aimed = None if result.target_status == "none" else result.target_status
     lacking = {name: getattr(result, name) or None for name in LACKING}
-    verdict = None if result.reference_verdict == "none" else result.reference_verdict
-    return {**lacking, "set_piece": piece, "target_status": aimed, "reference_verdict": verdict}
+    asked = None if result.reference_verdict == "none" else result.reference_verdict
+    return {**lacking, "set_piece": piece, "target_status": aimed, "reference_verdict": asked}
 
 
 def _of_samples(samples: m.Samples) -> Json:
@@ -100,7 +100,7 @@ SHOWN: dict[type[m.Message], Shown] = {
         "sensor_faults reference reference_verdict weight constant_weight deviation",
         _of_result,
         {
-            **dict.fromkeys(LACKING_VECTORS, Vector | None),
+            **dict.fromkeys(VECTORS, Vector | None),
             "set_piece": int | None,
             "target_status": m.TargetStatus | None,
             "sensor_faults": dict[str, str] | None,

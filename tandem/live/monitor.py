@@ -240,13 +240,13 @@ class Monitor:
         seen.slack_row = result.slack_row
         seen.soft += soft
         self._take_margin(result, now)
-        if result.weight:
-            self._take_weight(max(result.weight + result.constant_weight), tick, now)
         self._take_faults(result, now)
         seen.reference, seen.target_status = result.reference, result.target_status
         if result.reference_verdict != "none":
             taken = result.reference_verdict == "taken"
             self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
+        if result.weight:
+            self._take_weight(max(result.weight + result.constant_weight), tick, now)
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1
@@ -261,16 +261,6 @@ class Monitor:
             self._errors.append((now, result.prediction_error))
             self._follow_trend(now)
 
-    def _take_weight(self, weight: float, tick: str, now: float) -> None:
-        seen = self._seen
-        seen.counts = weight
-        if weight >= ADDS or self._counted is None:
-            self._counted = now
-        nothing = now - self._counted > self._patience
-        if nothing != seen.adds_nothing:
-            seen.adds_nothing = nothing
-            self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning counts again'}", now)
-
     def _take_faults(self, result: m.TickResult, now: float) -> None:
         before, began = self._seen.sensor_faults, self.first_command
         since = 0.0 if began is None else now - began
@@ -280,6 +270,16 @@ class Monitor:
         for name in before.keys() - told.keys():
             self.say(f"tick {result.seq}: sensor {name} is believed again", now, "good")
         self._seen.sensor_faults = {name: before.get(name, text) for name, text in told.items()}
+
+    def _take_weight(self, weight: float, tick: str, now: float) -> None:
+        seen = self._seen
+        seen.counts = weight
+        if weight >= ADDS or self._counted is None:
+            self._counted = now
+        nothing = now - self._counted > self._patience
+        if nothing != seen.adds_nothing:
+            seen.adds_nothing = nothing
+            self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning counts again'}", now)
 
     def _take_margin(self, result: m.TickResult, now: float) -> None:
         margin = result.set_margin

@@ -13,7 +13,7 @@ from lbmpc.plants import get_plant
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from run_log.writing.views import LACKING_VECTORS, views
+from run_log.writing.views import LACKING, views
 
 RECORDED = Path(__file__).with_name("views.jsonl")
 """A line for each of `messages`: topic, the JSON text of its view, the text of its schema."""
@@ -38,12 +38,12 @@ def messages() -> list[tuple[Topic, m.Message]]:
         h_hat=x, prediction_error=1e-3, oracle_norms=x, hidden_version=3, hidden_sha256="ef", tick_crc32=9,
         input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
-        weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x,
         sensor_faults={"y": "stuck; what it measures is estimated from the others"},
+        weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x,
     )  # fmt: skip
     absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
     absent |= {"target_status": "none", "target_distance": None}
-    absent |= {name: [] for name in LACKING_VECTORS} | {"sensor_faults": {}, "reference": {}}
+    absent |= {name: type(getattr(result, name))() for name in LACKING}
     replaced = msgspec.structs.replace
     return [
         (topics.PLANT_STATE, state),

@@ -119,7 +119,7 @@ def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):
 
 
 def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
-    with launched(tmp_path) as run:
+    with launched(tmp_path, *small()) as run:
         run.hears("the first command")
         started = run.pids()
         assert len(started) == 5

@@ -181,7 +181,7 @@ def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
     key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
     assert isinstance(key, EllipticCurvePrivateKey)
     issuer = credentials.load_certificate(authority / "certificate.pem")
-    certificate_authority.issue(folder / "trainer", "trainer.jet1", key, issuer, 3.0 / 86400.0, [])
+    certificate_authority.issue(folder / "trainer", "trainer.jet1", key, issuer, 6.0 / 86400.0, [])
     with ExitStack() as stack:
         stack.enter_context(routing(only))
         plant = stack.enter_context(Controller(only, "controller-1"))
