@@ -302,9 +302,11 @@ def build_estimator(config: Config, model: Model) -> Estimator | None:
     process = plant.W * config.period if given is None else given
     if settings.process is not None:
         process = in_half_widths(settings.process, plant) * plant.x_scale * config.period
-    noise = in_half_widths(settings.noise, plant) * plant.x_scale
-    kalman = KalmanEstimator(model, measured, noise, process, settings.correlation)
-    return SupervisedEstimator(kalman, model, measured, noise)
+    told = settings.noise
+    noise = None if told == "innovations" else in_half_widths(told, plant) * plant.x_scale
+    correlation = model.time_scale if settings.correlation is None else settings.correlation
+    kalman = KalmanEstimator(model, measured, noise, process, correlation)
+    return SupervisedEstimator(kalman, model, measured)
 
 
 def configured_reference(config: Config, plant: Description) -> Reference | None:

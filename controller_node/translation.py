@@ -163,6 +163,7 @@ class Translation:
             **self._judged(tick),
             **dict(zip(("weight", "constant_weight"), result.weights.tolist(), strict=False)),
             deviation=result.deviation.tolist(),
+            noise=result.noise.tolist(),
         )
 
     def _judged(self, tick: m.Tick) -> dict[str, Any]:

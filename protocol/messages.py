@@ -260,6 +260,9 @@ class TickResult(Message, frozen=True):
     """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
     deviation: list[float] = []
     """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
+    noise: list[float] = []
+    """Standard deviation of what is measured of each state as the estimator found it, its own units, 0 of those that
+    are not measured; empty where it was told."""
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

@@ -27,6 +27,8 @@ A_PERIOD = 4
 """Inputs that are remembered of a period; of more, the older become their mean. A late command makes two."""
 SAME = 1e-9
 """Of a period: two moments that are so near are one."""
+LAST = 2**63 - 1
+"""Number of a sample, as 64 bits with a sign hold it."""
 REPORTED = 1e-3
 """Of a period: what is missing of it at most where a sample tells of all of it."""
 
@@ -92,7 +94,7 @@ class InputLine:
         commanded, written = line["commanded"], _rows(line["written"])
         if seen.x is None:
             written += self._guessed(written[-1].u, commanded, delay)
-            sequence += 1
+            sequence = min(sequence + 1, LAST)
         else:
             periods = seen.sequence - sequence
             most = self._span / self._period
@@ -145,12 +147,16 @@ class InputLine:
 
     def _last(self, written: list[_Written], seconds: float, pad: bool = True) -> list[_Written]:
         """The last so many seconds; where there are fewer, its first input acted before."""
-        excess = _seconds(written) - seconds
-        if excess > self._hair:
-            return _split(written, excess, self._hair)[1]
-        if pad and excess < -self._hair:
-            return [_Written(-excess, written[0].u, False), *written]
-        return written
+        kept, left = [], seconds
+        for one in reversed(written):
+            if left < self._hair:
+                break
+            kept.append(one if one.seconds <= left + self._hair else one._replace(seconds=left))
+            left -= kept[-1].seconds
+        kept.reverse()
+        if pad and left >= self._hair:
+            kept.insert(0, _Written(left, written[0].u, False))
+        return kept
 
 
 def acting(seen: Observation) -> np.ndarray | None:

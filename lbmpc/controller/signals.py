@@ -80,6 +80,8 @@ class StepResult:
     """Standard deviation of the state that is known, (d,); (0,) where a sample is the state."""
     sensor_faults: dict[str, str] = field(default_factory=dict)
     """Which sensors are not believed, by the names of their states, and in words what is wrong."""
+    noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Standard deviation of what is measured as the estimator found it, (d,); (0,) where it had not to."""
 
     @property
     def new_network(self) -> bool:

@@ -196,6 +196,7 @@ class Controller:
             self.oracle.weights(oracle),
             self.estimator.deviation(estimator),
             self.estimator.faults(estimator),
+            self.estimator.found_noise(estimator),
         )
         return memory, StepResult(
             plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known

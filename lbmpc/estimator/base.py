@@ -64,6 +64,11 @@ class Estimator(ABC):
         """The memory before the first sample."""
         return {}
 
+    def found_noise(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of what is measured, (d,), in units of the states, 0 of others; (0,) where nobody had to
+        find it."""
+        return np.zeros(0)
+
     def tells(self, y: np.ndarray) -> bool:
         """Whether a sample, (d,), NaN where there is no number, says anything."""
         return bool(np.isfinite(y).all())

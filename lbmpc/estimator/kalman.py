@@ -22,13 +22,16 @@ import numpy as np
 from scipy.linalg import schur
 
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
+from lbmpc.estimator.noise import NoiseFinder
 from lbmpc.model import Model
 from lbmpc.plants.linear_motion import Pieces, balanced
 
 LEAST = 1e-6
 """Half-widths: a standard deviation below this counts as this."""
-UNKNOWN = 1.0
-"""Half-widths: standard deviation of a state that nobody measures, before the first sample."""
+UNKNOWN = 3.0**-0.5
+"""Half-widths: standard deviation of a state that nobody measures, before the first sample: it may be anywhere in X."""
+GUESS = 0.01
+"""Half-widths: standard deviation of what is measured, where nobody told and the innovations do not say yet."""
 LONGEST_GAP = 100
 """Periods, from one sample to the next, after which nothing is known any more."""
 LOST = 1e3
@@ -46,20 +49,27 @@ class KalmanEstimator(Estimator):
     Args:
         model: the nominal model.
         measured: indices of the states that are measured.
-        noise: standard deviation of what is measured, (d,), in units of the states.
+        noise: standard deviation of what is measured, (d,), in units of the states; None: it is found from innovations.
         process: that of h, (d,).
         correlation: seconds in which h becomes another, by a factor of e.
     """
 
     def __init__(
-        self, model: Model, measured: np.ndarray, noise: np.ndarray, process: np.ndarray, correlation: float
+        self,
+        model: Model,
+        measured: np.ndarray,
+        noise: np.ndarray | None,
+        process: np.ndarray,
+        correlation: float,
     ):
         d = model.d
         self._model, self._measured = model, measured
         self.sees_all = len(measured) == d
         units = self._units = balanced(model.plant)[:d]
-        least = LEAST * model.plant.x_scale
-        self._R = (np.maximum(noise, least) / units) ** 2
+        least = self._least = LEAST * model.plant.x_scale
+        told = GUESS * model.plant.x_scale if noise is None else noise
+        self._told = np.zeros(d)
+        self._told[measured] = np.maximum(told, least)[measured]
         sigma = np.maximum(process, least * model.period) / units
         rho = self._kept = float(np.exp(-model.period / correlation))
         self._F = np.block(
@@ -74,16 +84,29 @@ class KalmanEstimator(Estimator):
         self._any_input[:d, :d] = inputs @ inputs.T
         # Of an unmeasured state: how many labels in a row say the same.
         self._repeats = (1.0 + rho) / (1.0 - rho)
+        guess = (self._told / units)[measured] ** 2
+        self._finder = (
+            NoiseFinder(self._F, self._Q, self._unknown, guess, measured) if noise is None else None
+        )
 
     def initial_state(self) -> EstimatorState:
         d = self._model.d
+        finder = {} if self._finder is None else {"noise": self._told, **self._finder.initial_state()}
         return {
+            **finder,
             "x": np.zeros(d),
             "disturbance": np.zeros(d),
             "covariance": self._unknown,
             "sample": np.array([0, -1], dtype=np.int64),
             "inputs": np.zeros((2, self._model.m)),
         }
+
+    def noise(self, state: EstimatorState) -> np.ndarray:
+        """Standard deviation of what is measured, told or found, (d,), in units of the states; 0 of others."""
+        return state.get("noise", self._told)
+
+    def found_noise(self, state: EstimatorState) -> np.ndarray:
+        return state.get("noise", super().found_noise(state))
 
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
@@ -98,7 +121,27 @@ class KalmanEstimator(Estimator):
             after, estimate = self._unlabelled(state, seen, measured)
         else:
             after, estimate = self._followed(state, seen, measured, u, periods)
-        return {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}, estimate
+        after = {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}
+        if self._finder is not None:
+            follows = periods == 1 and np.isfinite(estimate.variance).all()
+            usable = u if follows and len(measured) == len(self._measured) else None
+            after = self._with_noise(self._finder, after, seen, usable)
+        return after, estimate
+
+    def _with_noise(
+        self, finder: NoiseFinder, after: EstimatorState, seen: Measured, u: np.ndarray | None
+    ) -> EstimatorState:
+        """What a sample says of the noise; u: None: it is not the next one, or not all that is measured counts."""
+        d, measured, units = self._model.d, self._measured, self._units
+        if u is None:
+            return finder.begun(after, self._scaled(after))
+        moved = np.concatenate([self._nominal(np.zeros(d), u, seen.pieces) / units, np.zeros(d)])
+        after, R = finder.followed(after, moved, (seen.y / units)[measured])
+        if R is None:
+            return after
+        noise = after["noise"].copy()
+        noise[measured] = np.maximum(np.sqrt(R) * units[measured], self._least[measured])
+        return {**after, "noise": noise}
 
     def deviation(self, state: EstimatorState) -> np.ndarray:
         return self._units * np.sqrt(np.diag(state["covariance"])[: self._model.d])
@@ -111,17 +154,24 @@ class KalmanEstimator(Estimator):
         pieces = ((delay, first), (self._model.period - delay, then)) if delay > 0.0 else ()
         after = self._predicted(state, self._nominal(state["x"], then, pieces))
         if self._is_lost(after):
-            return {**self.initial_state(), "inputs": state["inputs"]}
+            return {**self._afresh(state), "sample": self.initial_state()["sample"]}
+        if self._finder is not None:
+            after = self._finder.begun(after, self._scaled(after))
         return {**after, "sample": np.array([source, sequence + 1], dtype=np.int64)}
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}
 
+    def _afresh(self, state: EstimatorState) -> EstimatorState:
+        """Nothing known of the state: of inputs on their way, and of sensors, all as it was."""
+        nothing = np.zeros(self._model.d)
+        return {**state, "x": nothing, "disturbance": nothing.copy(), "covariance": self._unknown}
+
     def _begun(
         self, state: EstimatorState, seen: Measured, measured: np.ndarray
     ) -> tuple[EstimatorState, Estimate]:
         """After a sample of which nothing is known that came before."""
-        begun = {**self.initial_state(), "inputs": state["inputs"]}
+        begun = self._afresh(state)
         begun["x"][measured] = seen.y[measured]
         after, estimate = self._unlabelled(begun, seen, measured)
         nothing = np.full(self._model.d, np.nan)
@@ -158,7 +208,7 @@ class KalmanEstimator(Estimator):
         reached[measured] = seen.y[measured]
         variance = np.diag(after["covariance"])[d:] * self._repeats
         A = self._F[measured, :d]
-        variance[measured] = self._R[measured] + ((A @ before) * A).sum(axis=1)
+        variance[measured] = self._R(state)[measured] + ((A @ before) * A).sum(axis=1)
         innovation = self._innovation(predicted, seen.y)
         return after, Estimate(after["x"], reached, variance * self._units**2, *innovation)
 
@@ -167,9 +217,17 @@ class KalmanEstimator(Estimator):
         d, measured = self._model.d, self._measured
         innovation, variance = np.full(d, np.nan), np.full(d, np.nan)
         innovation[measured] = y[measured] - predicted["x"][measured]
-        spread = np.diag(predicted["covariance"])[:d] + self._R
+        spread = np.diag(predicted["covariance"])[:d] + self._R(predicted)
         variance[measured] = (spread * self._units**2)[measured]
         return innovation, variance
+
+    def _scaled(self, state: EstimatorState) -> np.ndarray:
+        """State and disturbance, (2d,), in the filter's units."""
+        return np.concatenate([state["x"] / self._units, state["disturbance"] / self._units])
+
+    def _R(self, state: EstimatorState) -> np.ndarray:
+        """Variance of what is measured, (d,), in the filter's units."""
+        return (self.noise(state) / self._units) ** 2
 
     def _nominal(self, x: np.ndarray, u: np.ndarray, pieces: Pieces) -> np.ndarray:
         """Where the nominal model leads within a period, (d,)."""
@@ -185,7 +243,7 @@ class KalmanEstimator(Estimator):
         }
 
     def _corrected(self, state: EstimatorState, y: np.ndarray, measured: np.ndarray) -> EstimatorState:
-        d, P, R = self._model.d, state["covariance"], self._R[measured]
+        d, P, R = self._model.d, state["covariance"], self._R(state)[measured]
         S = P[np.ix_(measured, measured)] + np.diag(R)
         gain = np.linalg.solve(S, P[measured]).T
         moved = gain @ ((y - state["x"])[measured] / self._units[measured])

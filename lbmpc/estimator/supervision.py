@@ -22,7 +22,7 @@ from functools import cache
 import numpy as np
 
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
-from lbmpc.estimator.kalman import LEAST, KalmanEstimator, unobservable
+from lbmpc.estimator.kalman import KalmanEstimator, unobservable
 from lbmpc.model import Model
 
 WORDS = ("", "stuck", "dead", "off")
@@ -66,19 +66,17 @@ class SupervisedEstimator(Estimator):
         inner: what estimates.
         model: the nominal model.
         measured: indices of the states that are measured.
-        noise: standard deviation of what is measured, (d,), in units of the states.
     """
 
-    def __init__(self, inner: KalmanEstimator, model: Model, measured: np.ndarray, noise: np.ndarray):
+    def __init__(self, inner: KalmanEstimator, model: Model, measured: np.ndarray):
         self._inner, self.sees_all, self._model = inner, inner.sees_all, model
-        self._noise = np.maximum(noise, LEAST * model.plant.x_scale)
-        self._measured = np.zeros(len(noise), dtype=bool)
+        self._measured = np.zeros(model.d, dtype=bool)
         self._measured[measured] = True
         self._well = max(WELL_SAMPLES, round(WELL / model.period))
         self._unseen = cache(self._words_of_unseen)
 
     def initial_state(self) -> EstimatorState:
-        nothing = np.zeros(len(self._noise))
+        nothing = np.zeros(self._model.d)
         return {
             **self._inner.initial_state(),
             "readings": np.zeros((READINGS, len(nothing))),
@@ -100,6 +98,12 @@ class SupervisedEstimator(Estimator):
     def tells(self, y: np.ndarray) -> bool:
         return bool(np.isfinite(y[self._measured]).any())
 
+    def found_noise(self, state: EstimatorState) -> np.ndarray:
+        return self._inner.found_noise(state)
+
+    def deviation(self, state: EstimatorState) -> np.ndarray:
+        return self._inner.deviation(state)
+
     def faults(self, state: EstimatorState) -> dict[str, str]:
         fault = state["counts"][FAULT]
         if not fault.any():
@@ -111,9 +115,11 @@ class SupervisedEstimator(Estimator):
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
         counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
+        noise = self._inner.noise(state)
         # Of a plant that was held, or started again, nobody knows that it moved.
         same = numbers & (seen.y == state["readings"][0]) & (seen.applied is not None)
-        step, fine = self._steps(state["readings"], state["step"], seen.y, numbers & ~same)
+        step = self._steps(state["readings"], state["step"], seen.y, numbers & ~same)
+        fine = step < FINE * noise
         if (same == numbers).all():
             # A plant that rests, or a frozen line: a repetition alone proves nothing.
             fine[:] = False
@@ -127,7 +133,7 @@ class SupervisedEstimator(Estimator):
         away = np.where(known, np.abs(estimate.innovation), 0.0)
         variance = np.where(known, estimate.innovation_variance, np.inf)
         leapt, leap = self._leaps(state, estimate.innovation, away, variance, usable & ~same)
-        vague = variance > (1.0 + KNOWS_LESS) * self._noise**2
+        vague = variance > (1.0 + KNOWS_LESS) * noise**2
         used = tried & ~leapt & (~same | vague)
         if (used != tried).any():
             memory, estimate = self._inner.update(state, seen, used)
@@ -152,7 +158,7 @@ class SupervisedEstimator(Estimator):
             "step": step,
             "lately": np.maximum(1.0, lately),
             "leap": leap,
-            "counts": self._judged(counted, (away > MOVED * self._noise) & sure),
+            "counts": self._judged(counted, (away > MOVED * noise) & sure),
         }, estimate
 
     def _judged(self, counts: np.ndarray, moved: np.ndarray) -> np.ndarray:
@@ -172,11 +178,11 @@ class SupervisedEstimator(Estimator):
 
     def _steps(
         self, readings: np.ndarray, smallest: np.ndarray, y: np.ndarray, changed: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The smallest step of each sensor so far, (d,), 0 before the first, and whether it is a fine one."""
+    ) -> np.ndarray:
+        """The smallest step of each sensor so far, (d,), 0 before the first."""
         steps = np.where((readings != 0.0) & (readings != y) & changed, np.abs(readings - y), np.inf)
         step = np.minimum(np.where(smallest > 0.0, smallest, np.inf), steps.min(axis=0))
-        return np.where(np.isfinite(step), step, 0.0), step < FINE * self._noise
+        return np.where(np.isfinite(step), step, 0.0)
 
     def _leaps(
         self,
@@ -190,7 +196,7 @@ class SupervisedEstimator(Estimator):
         leaps, lately = state["counts"][LEAPT], state["lately"]
         leapt = usable & (away > np.where(leaps > 0, AGREES, LEAP) * np.sqrt(variance * lately))
         change = np.abs(innovation - state["leap"])
-        leapt &= (leaps == 0) | (change <= STAYS * self._noise * np.sqrt(2.0 * lately))
+        leapt &= (leaps == 0) | (change <= STAYS * self._inner.noise(state) * np.sqrt(2.0 * lately))
         if leapt.sum() > 1:
             # Of two at once neither is a sensor's. In the first sample nobody knows whether they go on.
             leapt &= leaps == 0

@@ -15,7 +15,15 @@ from network_model.operations import BOUNDED
 from network_model.registry import get_architecture
 from node_runtime.config import strict
 from node_runtime.config.reference import absolute, is_reference
-from node_runtime.config.sections import LONGEST_HORIZON, LONGEST_PERIOD, Config, NetworkConfig, Section
+from node_runtime.config.sections import (
+    DEAD_TIME,
+    LONGEST_HORIZON,
+    LONGEST_PERIOD,
+    MOST_DEAD_PERIODS,
+    Config,
+    NetworkConfig,
+    Section,
+)
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, Fail
 from protocol.codec import first_non_finite
@@ -99,6 +107,12 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
             "controller.input_delay_ms",
             f"controller.input_delay_ms = {delay:g} is more than half a period, {500.0 * config.period:g} ms at "
             f"rate = {config.rate:g} Hz: so late a command cannot be predicted for",
+        )
+    truth, most = config.plant.truth, MOST_DEAD_PERIODS * config.period
+    if isinstance(truth, dict) and not 0.0 <= (seconds := truth.get(DEAD_TIME, 0.0)) <= most * (1.0 + 1e-9):
+        fail(
+            "plant.truth",
+            f"plant.truth.{DEAD_TIME} = {seconds:g}: seconds, from 0 to {most:g}, {MOST_DEAD_PERIODS} periods",
         )
     if config.trainer.min_samples > config.trainer.capacity:
         fail(

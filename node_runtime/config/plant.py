@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from node_runtime.config.reference import is_reference, load, sha256_of
-from node_runtime.config.sections import Config, ReferenceConfig, Shares
+from node_runtime.config.sections import DEAD_TIME, Config, ReferenceConfig, Shares
 from node_runtime.config.strict import ConfigError, did_you_mean
 
 
@@ -67,10 +67,6 @@ class Motion(Protocol):
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray: ...
 
 
-DEAD_TIME = "dead_time"
-"""In `plant.truth`, beside the parameters of the equations."""
-MOST_DEAD_PERIODS = 50
-"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 P = TypeVar("P", bound=Plant)
 Find = Callable[[Any, Callable[[P], P]], P]
 """`lbmpc.plants.get_plant`: of a name or a plant, and what is changed before it is looked at, the plant. It raises
@@ -143,21 +139,13 @@ def true_plant_of(
 def true_dead_time(config: Config, known: Described, true: object) -> float:
     """Seconds: what `plant.truth` says, or what it names has; where neither does it is as known.
 
-    Args:
-        known, true: of `plant_of` and `true_plant_of`.
-
-    Raises:
-        ConfigError: `plant.truth.dead_time` is none, or longer than what a simulation remembers.
+    known, true: of `plant_of` and `true_plant_of`.
     """
     truth = config.plant.truth
-    if not isinstance(truth, dict) or DEAD_TIME not in truth:
-        return getattr(true, DEAD_TIME, 0.0) or known.dead_time
-    seconds, most = truth[DEAD_TIME], MOST_DEAD_PERIODS * config.period
-    if not 0.0 <= seconds <= most * (1.0 + 1e-9):
-        raise ConfigError(
-            f"plant.truth.dead_time = {seconds:g}: seconds, from 0 to {most:g}, {MOST_DEAD_PERIODS} periods"
-        )
-    return seconds
+    if isinstance(truth, dict) and DEAD_TIME in truth:
+        return truth[DEAD_TIME]
+    own: float = getattr(true, DEAD_TIME, 0.0)
+    return own or known.dead_time
 
 
 def load_plant(reference: str) -> Any:

@@ -26,6 +26,10 @@ LONGEST_PERIOD = 1e6
 Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
 """Two of them differ by so little that rounding leaves a covariance positive."""
 LONGEST_HORIZON = 1000
+DEAD_TIME = "dead_time"
+"""In `plant.truth`, beside the parameters of the equations."""
+MOST_DEAD_PERIODS = 50
+"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
 """What may be part of a key on the bus."""
@@ -168,12 +172,13 @@ class EstimatorConfig(Section, frozen=True):
     """"none": a sample is the state; "kalman": a filter of the nominal model and a disturbance of each state."""
     measured: list[str] | None = None
     """States that a sample measures; of the others its numbers count nothing. None: all."""
-    noise: Shares = 0.01
-    """Standard deviation of what is measured, in half-widths."""
+    noise: Shares | Literal["innovations"] = 0.01
+    """Standard deviation of what is measured, in half-widths; "innovations": found in the first 100 samples."""
     process: Shares | None = None
     """Standard deviation of h, in half-widths per second of period; None: `controller.W`, or else the plant's own."""
-    correlation: Seconds = 1.0
-    """Seconds in which h becomes another along the motion, by a factor of e."""
+    correlation: Seconds | None = None
+    """Seconds in which h becomes another along the motion, by a factor of e; None: the plant's time scale, that of its
+    slowest mode under K."""
 
 
 class ReferenceConfig(Section, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import casadi as ca
+import msgspec
 import numpy as np
 
 from lbmpc.plants import Description, Plant, PlantError, Truth
@@ -50,6 +51,34 @@ def excess(motion: Trajectory, plant: Description, truth: object) -> float | Non
                     return None
         found = max(found, _beyond(passed, plant))
     return found if found > SAME else 0.0
+
+
+def behind(motion: Trajectory, dead_time: float) -> Trajectory:
+    """With what acted on a plant a dead time after it was written; where that is not known there is nothing.
+
+    motion: of one episode; `dead_time` in seconds.
+    """
+    if not dead_time:
+        return motion
+    unknown: list[tuple[float, tuple[float, ...] | None]] = [(dead_time, None)]
+    written, acted = unknown.copy(), [motion.pieces[0]]
+    for pieces in motion.pieces[1:]:
+        if not pieces:
+            written = unknown.copy()
+        written += pieces
+        now: list[tuple[float, tuple[float, ...] | None]] = []
+        left = sum(seconds for seconds, _u in pieces)
+        hair = SAME * left
+        while left > hair:
+            seconds, u = written.pop(0)
+            if seconds > left + hair:
+                written.insert(0, (seconds - left, u))
+                seconds = left
+            now.append((seconds, u))
+            left -= seconds
+        known = tuple((seconds, u) for seconds, u in now if u is not None)
+        acted.append(known if len(known) == len(now) else ())
+    return msgspec.structs.replace(motion, pieces=tuple(acted))
 
 
 def _beyond(x: np.ndarray, plant: Description) -> float:

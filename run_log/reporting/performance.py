@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 
 from lbmpc.plants import Description
+from node_runtime.config.plant import true_dead_time
 from node_runtime.config.sections import Config
-from run_log.reporting.between_samples import excess
+from run_log.reporting.between_samples import behind, excess
 from run_log.reporting.motion import Trajectory
 
 TOLERANCE = 1e-6
@@ -88,7 +89,7 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
-        excess_between_samples=excess(motion, plant, truth),
+        excess_between_samples=excess(behind(motion, true_dead_time(config, plant, truth)), plant, truth),
         offset=_offset(motion, dx, plant, config),
     )
 

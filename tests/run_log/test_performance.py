@@ -11,7 +11,9 @@ import pytest
 
 from lbmpc.plants.equations import Plant
 from node_runtime.config.loading import override
+from node_runtime.config.plant import true_dead_time
 from node_runtime.config.sections import Config
+from run_log.reporting.between_samples import behind
 from run_log.reporting.motion import Trajectory
 from run_log.reporting.performance import Performance, performance
 
@@ -116,6 +118,21 @@ def test_the_inputs_of_a_period_act_in_turn() -> None:
     turns = (((TURN / 2, (0.3,)), (TURN / 2, (-0.3,))), ((TURN / 2, (0.0,)),))
     given = motion([[0.0, 0.0], [-1.2, 0.0], [1.2, 0.0]], pieces=turns)
     assert figures(given).excess_between_samples == pytest.approx((1.2 - 0.5) / 0.5, abs=1e-7)
+
+
+def test_behind_a_dead_time_the_inputs_from_before_act() -> None:
+    # As above, a quarter of a turn later; what acts before that is not known.
+    turns = (((TURN / 2, (0.3,)), (TURN / 2, (-0.3,))), ((TURN / 2, (0.0,)), (TURN / 2, (0.1,))))
+    late = override(Config(), [f"rate={1 / TURN}", f"plant.truth.dead_time={TURN / 4}"])
+    given = motion([[0.9, 0.9], [0.3, -0.3], [0.0, 0.0]], pieces=turns)
+    acted = behind(given, true_dead_time(late, OSCILLATOR, OSCILLATOR)).pieces
+    assert acted[:2] == ((), ())
+    shares = [(round(seconds / TURN, 12), u) for seconds, (u,) in acted[2]]
+    assert shares == [(0.25, -0.3), (0.5, 0.0), (0.25, 0.1)]
+    # Where a sample is missing the line begins afresh.
+    lossy = motion([[0.0, 0.0]] * 5, pieces=(turns[0], (), turns[0], turns[1]))
+    assert [bool(one) for one in behind(lossy, TURN / 4).pieces] == [False, False, False, False, True]
+    assert behind(given, 0.0) is given
 
 
 def test_where_the_truth_is_not_known_nothing_is_said() -> None:

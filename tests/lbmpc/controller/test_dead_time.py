@@ -201,6 +201,24 @@ def test_more_inputs_than_are_remembered_become_a_mean() -> None:
     assert memory["written"].shape == LINE.initial_state()["written"].shape
 
 
+def test_nothing_that_a_sample_may_hold_breaks_the_line() -> None:
+    rng, memory, known = np.random.default_rng(3), LINE.initial_state(), 0
+    for _ in range(400):
+        number = int(rng.choice([0, 1, 2**63 - 1, int(memory["sample"][1]) + int(rng.integers(-4, 5))]))
+        pieces = tuple(
+            (float(rng.choice([0.0, 1e-12, 0.3 * T, T, 1e300])), rng.uniform(-1.0, 1.0, 1))
+            for _ in range(rng.integers(0, 30))
+        )
+        applied = None if rng.random() < 0.3 else np.zeros(1)
+        seen = Observation(np.zeros(3), applied, 1, min(max(number, 0), 2**63 - 1), None, pieces)
+        memory, acted = LINE.advance(memory, MISSING if rng.random() < 0.3 else seen, 0.2 * T)
+        assert memory["written"].shape == LINE.initial_state()["written"].shape
+        assert sum(memory["written"][:, 0]) == pytest.approx(2.5 * T)
+        assert sum(seconds for seconds, _u in acted.ahead) == pytest.approx(1.5 * T)
+        known += acted.known
+    assert known
+
+
 # -- in a step -------------------------------------------------------------------------------------------------
 
 

@@ -25,7 +25,7 @@ Sense = Callable[[int, np.ndarray], np.ndarray]
 
 def supervised(noise: np.ndarray = NOISE, measured: tuple[int, ...] = (0, 1, 2, 3)) -> SupervisedEstimator:
     indices = np.array(measured)
-    return SupervisedEstimator(KalmanEstimator(MODEL, indices, noise, PROCESS, 1.0), MODEL, indices, noise)
+    return SupervisedEstimator(KalmanEstimator(MODEL, indices, noise, PROCESS, 1.0), MODEL, indices)
 
 
 class Ran:

@@ -107,6 +107,30 @@ def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) ->
     np.testing.assert_array_equal(again.memory.state.estimator["x"], core.memory.state.estimator["x"])
 
 
+def test_noise_that_is_found_is_in_every_tick_in_keyframes_and_in_checkpoints() -> None:
+    settings = config("estimator.noise=innovations", "controller.oracle=linear", "plant.sensors.noise=0.002")
+    run = follow(settings, 120).run
+    first, last = np.array(run.results[5].noise), np.array(run.results[-1].noise)
+    np.testing.assert_allclose(first, 0.01 * PLANT.x_scale)
+    np.testing.assert_allclose(last / PLANT.x_scale, 0.002, rtol=0.5)
+    assert replay(run).equal
+    # In the middle of finding.
+    assert replay(run, from_tick=45).equal
+    core = ControllerCore(settings, "controller-a")
+    core.memory.restore(run.keyframes[3])
+    again = ControllerCore(settings, "controller-b")
+    again.memory.go_on(core.memory.lasting(), "controller-a")
+    for memory in (core.memory, again.memory):
+        assert memory.state.estimator["finder.counts"][1] > 40
+    for tick in run.ticks[61:70]:
+        core.step(tick)
+        again.step(tick)
+    for name, array in core.memory.state.estimator.items():
+        np.testing.assert_array_equal(again.memory.state.estimator[name], array)
+    told = simulate(config("controller.oracle=linear"), 5)
+    assert told.results[-1].noise == []
+
+
 def test_half_of_the_states_measured_and_a_wrong_start_is_survived() -> None:
     settings = ["controller.oracle=linear", 'estimator.measured=["z", "y"]']
     begun = [0.4, 1.6, 1.1547 + 0.3, 5.0]
