@@ -92,9 +92,6 @@ class SupervisedEstimator(Estimator):
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return self._inner.commanded(state, u)
 
-    def deviation(self, state: EstimatorState) -> np.ndarray:
-        return self._inner.deviation(state)
-
     def tells(self, y: np.ndarray) -> bool:
         return bool(np.isfinite(y[self._measured]).any())
 
