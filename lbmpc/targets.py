@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from typing import Literal
 
 import casadi as ca
@@ -144,7 +145,7 @@ class TargetSelector:
         inputs["wanted"][chosen, 0] = wanted
         for _ in range(STEPS):
             w, moved, outside = self._step(w)
-            if not np.isfinite(moved):
+            if not isfinite(moved):
                 break
             if moved < ARRIVED:
                 rests = outside <= INSIDE

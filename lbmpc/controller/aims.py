@@ -120,17 +120,18 @@ class Aims:
     ) -> np.ndarray:
         """x and u over the horizon, (N + 1, d + m), from the rests of its knots, (d + m,) each.
 
-        From knot to knot they are no rests: a plant that is there moves on with the reference.
+        From knot to knot they are no rests: a plant that is there moves on with the reference. How far that is from the
+        rests is found at the first of two knots.
         """
         assert self.targets is not None
         positions: list[float] = []
         points: list[np.ndarray] = []
-        for (begin, a, r), (end, b, s) in pairwise(zip(seen.positions, rests, seen.values, strict=True)):
+        for (begin, a, r), (end, b, _s) in pairwise(zip(seen.positions, rests, seen.values, strict=True)):
             if end - begin < STEP:
                 continue
             v = (b - a)[: self._model.d] / (end - begin)
             positions += [begin, end]
-            for rest, there in ((a, r), (b, s)):
-                moving = self.targets.find(theta, rest, outputs, there, v) if v.any() else None
-                points.append(rest if moving is None or moving.status == "no rest" else moving.xu)
+            if v.any() and (moving := self.targets.find(theta, a, outputs, r, v)).status != "no rest":
+                a, b = moving.xu, b + moving.xu - a
+            points += [a, b]
         return between(np.array(positions), np.array(points), np.arange(self._horizon + 1.0))

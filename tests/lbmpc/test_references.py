@@ -23,10 +23,7 @@ def go(times: list[float], values: list[float], **more: int) -> Change:
 )
 def test_it_is_linear_between_its_points_and_a_step_where_two_are_at_one_time(t: float, r: float) -> None:
     assert RAMP.at(t) == pytest.approx([r])
-
-
-def test_before_a_step_it_is_what_was() -> None:
-    assert between(RAMP.times, RAMP.values, np.array([1.0]), "left")[0] == [1.0]
+    assert between(RAMP.times, RAMP.values, np.array([t]))[0] == pytest.approx([r])
 
 
 def test_a_horizon_sees_the_points_within_it_and_where_it_is_at_its_ends() -> None:

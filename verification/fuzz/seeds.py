@@ -60,6 +60,7 @@ def seeds() -> dict[str, list[bytes]]:
         said(topics.REFERENCE, reference)
     for kind in ("hold", "configured"):
         said(topics.REFERENCE, m.Reference(run_id="commander-1", seq=2, kind=kind, lease=1.0))
+    said(topics.OVERRIDE, m.Override(run_id="commander-1", seq=0, mode="manual", u=[1.2]))
     said(topics.KEYFRAME, core.memory.keyframe(-1))
     for step in range(STEPS):
         state = plant.sample(step * settings.period)
