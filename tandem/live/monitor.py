@@ -147,6 +147,8 @@ class Monitor:
         self._health: dict[str, tuple[m.Health, float]] = {}
         """By process: the newest, and when it came."""
         self._ended: set[str] = set()
+        self._asked_by = ""
+        """Who said last where to go: who says it again renews a lease."""
         self._tick_times: deque[float] = deque(maxlen=RECENT_TICKS)
         self._solve_ms: deque[float] = deque(maxlen=RECENT_TICKS)
         self._tick_ms: deque[float] = deque(maxlen=RECENT_TICKS)
@@ -254,9 +256,11 @@ class Monitor:
         self._take_margin(result, now)
         self._take_faults(result, now)
         seen.reference, seen.target_status = result.reference, result.target_status
-        if result.reference_verdict != "none":
-            taken = result.reference_verdict == "taken"
+        taken = result.reference_verdict == "taken"
+        again = taken and result.reference_from == self._asked_by
+        if result.reference_verdict != "none" and not again:
             self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
+        self._asked_by = result.reference_from or self._asked_by
         if result.weight:
             self._take_weight(max(result.weight + result.constant_weight), tick, now)
         seen.weights_version = result.hidden_version
