@@ -16,6 +16,7 @@ LONGEST = 2**53
 """Periods that are counted at most: a number of 64 bits with a sign, and a float, hold them."""
 PREVIEWED = 5
 """Knots of a horizon at most: each may take a search for its target."""
+AT_ONCE = np.zeros(1)
 ChangeKind = Literal["set", "hold", "configured"]
 
 
@@ -40,7 +41,7 @@ class Reference:
 
     def at(self, seconds: float) -> np.ndarray:
         """(p,) so many seconds after it was given."""
-        return between(self.times, self.values, np.array([seconds]))[0]
+        return _at(self.times, self.values, seconds, int(self.times.searchsorted(seconds, "right")))
 
     def advanced(self, periods: int) -> Reference | None:
         """So many periods later; None: its lease is over."""
@@ -170,27 +171,30 @@ def preview(reference: Reference, ahead: float, period: float, n: int) -> Previe
     """
     begin = reference.passed * period + ahead
     end = begin + n * period
-    inside = (reference.times > begin) & (reference.times < end)
-    if not inside.any() and begin >= reference.times[-1]:
-        return Preview(np.zeros(1), reference.values[-1:])
-    first = between(reference.times, reference.values, np.array([begin]))
-    last = between(reference.times, reference.values, np.array([end]), "left")
-    seconds = np.concatenate([[begin], reference.times[inside][: PREVIEWED - 2], [end]])
-    values = np.vstack([first, reference.values[inside][: PREVIEWED - 2], last])
-    if (values == values[0]).all():
-        return Preview(np.zeros(1), values[:1])
-    return Preview((seconds - begin) / period, values)
+    times, values = reference.times, reference.values
+    if begin >= times[-1]:
+        return Preview(AT_ONCE, values[-1:])
+    after, until = int(times.searchsorted(begin, "right")), int(times.searchsorted(end, "left"))
+    few = slice(after, min(until, after + PREVIEWED - 2))
+    seen = [_at(times, values, begin, after), *values[few], _at(times, values, end, until)]
+    if all((r == seen[0]).all() for r in seen[1:]):
+        return Preview(AT_ONCE, seen[0][None])
+    positions = [0.0, *((times[few] - begin) / period).tolist(), float(n)]
+    return Preview(np.array(positions), np.array(seen))
 
 
-def between(
-    times: np.ndarray, values: np.ndarray, at: np.ndarray, side: Literal["left", "right"] = "right"
-) -> np.ndarray:
-    """(a, p): the piecewise linear function of knots times (k,), values (k, p), at (a,).
+def _at(times: np.ndarray, values: np.ndarray, t: float, after: int) -> np.ndarray:
+    """(p,) at t, which is between the knots after - 1 and after."""
+    if not 0 < after < len(times):
+        return values[0] if after == 0 else values[-1]
+    share = (t - times[after - 1]) / (times[after] - times[after - 1])
+    return np.asarray(values[after - 1] + share * (values[after] - values[after - 1]))
 
-    At a step it is what follows it, or what comes before it, on the left.
-    """
-    after = np.searchsorted(times, at, side=side)
+
+def between(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(a, p): the piecewise linear function of knots times (k,), values (k, p), at (a,); at a step what follows it."""
+    after = times.searchsorted(at, "right")
     first, last = np.maximum(after - 1, 0), np.minimum(after, len(times) - 1)
     length = times[last] - times[first]
-    share = np.where(length > 0.0, (at - times[first]) / np.where(length > 0.0, length, 1.0), 0.0)
+    share = (at - times[first]) / np.where(length > 0.0, length, 1.0)
     return np.asarray(values[first] + share[:, None] * (values[last] - values[first]))

@@ -1,12 +1,13 @@
 """The rest that a plan aims at: the target selector of offset-free MPC, with what was learned.
 
     min over x, u   |C x - r|^2 + SECOND (|x|_Q^2 + |u|_R^2)
-    subject to      (A - I) x + B u + h_hat(x, u) = 0,   x in Z,   u in V
+    subject to      (A - I) x + B u + h_hat(x, u) = v,   x in Z,   u in V
 
 in deviation coordinates, everything in half-widths. Q and R are those of the cost, Z and V the tightened X and U of the
 problem. So the outputs C x come first: they meet r where the learned model has such a rest, and are as near as they can
 be where it has none. Of all rests that do as well the target costs least about the equilibrium, and without outputs it
-costs least of all rests (Muske and Rawlings 1993; Pannocchia and Rawlings 2003).
+costs least of all rests (Muske and Rawlings 1993; Pannocchia and Rawlings 2003). v is 0, but on the way of a reference
+that moves: there it is how far the rest moves in a period, so that a plant at the target moves on with it.
 
 A few Newton steps from the last target solve it, always as many at most, and never by the clock. Each is an equality
 constrained least-squares problem; where its solution is outside the rows, a QP with as many variables as inputs.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from typing import Literal
 
 import casadi as ca
@@ -102,18 +104,24 @@ class TargetSelector:
         problem, size = self._problem, len(self._scale)
         w, theta = ca.MX.sym("w", size), ca.MX.sym("theta", problem.oracle.parameters)
         weights, wanted = ca.MX.sym("weights", size), ca.MX.sym("wanted", size)
-        free, rests, wrong = newton_step(problem, self._scale, weights, wanted, w, theta)
+        v = ca.MX.sym("v", problem.model.d)
+        free, rests, wrong = newton_step(problem, self._scale, weights, wanted, w, theta, v)
         moved = ca.mmax(ca.fabs(free - w))
         values = ca.DM(self._rows) @ free
         outside = ca.mmax(ca.fmax(self._lower - values, values - self._upper) / self._penalty.scale)
         inside = ca.fmin(ca.fmax(free, self._low), self._high)
         said = ca.vertcat(wrong, moved, outside)
         found = {"free": free, "inside": inside, "rests": ca.densify(rests), "said": said}
-        inputs = {"w": w, "theta": theta, "weights": weights, "wanted": wanted}
+        inputs = {"w": w, "theta": theta, "weights": weights, "wanted": wanted, "v": v}
         return ca.Function("newton", [*inputs.values()], [*found.values()], [*inputs], list(found))
 
     def find(
-        self, theta: np.ndarray, start: np.ndarray, outputs: tuple[int, ...], r: np.ndarray
+        self,
+        theta: np.ndarray,
+        start: np.ndarray,
+        outputs: tuple[int, ...],
+        r: np.ndarray,
+        v: np.ndarray | float = 0.0,
     ) -> SteadyState:
         """The target under the oracle's parameters theta.
 
@@ -124,6 +132,7 @@ class TargetSelector:
             start: x and u of the last target, (d + m,).
             outputs: indices of the states that are outputs, p; more than there are inputs meet their r in part.
             r: where they should be, (p,), deviations.
+            v: how far x moves there in a period, (d,).
         """
         w, rests = start / self._scale, False
         chosen = list(outputs)
@@ -131,11 +140,12 @@ class TargetSelector:
         inputs = self._newton.inputs
         inputs["theta"][:, 0] = theta
         self._weigh(outputs)
+        inputs["v"][:, 0] = v
         inputs["wanted"][:, 0] = 0.0
         inputs["wanted"][chosen, 0] = wanted
         for _ in range(STEPS):
             w, moved, outside = self._step(w)
-            if not np.isfinite(moved):
+            if not isfinite(moved):
                 break
             if moved < ARRIVED:
                 rests = outside <= INSIDE
@@ -185,7 +195,13 @@ class TargetSelector:
 
 
 def newton_step(
-    problem: Problem, scale: np.ndarray, weights: ca.MX, wanted: ca.MX, w: ca.MX, theta: ca.MX
+    problem: Problem,
+    scale: np.ndarray,
+    weights: ca.MX,
+    wanted: ca.MX,
+    w: ca.MX,
+    theta: ca.MX,
+    v: ca.MX,
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """One Newton step from w, (d + m,), in units of `scale`, (d + m,).
 
@@ -196,7 +212,7 @@ def newton_step(
     model, d = problem.model, problem.model.d
     linear = ca.DM(np.hstack([model.A - np.eye(d), model.B]))
     h, slopes = _h_at_rest(problem.oracle, w * scale, theta)
-    motion = (linear @ (w * scale) + h) / scale[:d]
+    motion = (linear @ (w * scale) + h - v) / scale[:d]
     rests = (linear + slopes) * (scale / scale[:d, None])
     matrix = ca.vertcat(ca.horzcat(ca.diag(weights), rests.T), ca.horzcat(rests, ca.DM.zeros(d, d)))
     matrix, right = ca.densify(matrix), ca.densify(ca.vertcat(wanted, rests @ w - motion))

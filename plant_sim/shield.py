@@ -165,7 +165,7 @@ class Shield:
         self._written = False
 
     def rest(self) -> np.ndarray | None:
-        """The input, (m,), to leave a machine with, at once; None: one that stood still before its first command needs none."""
+        """The input, (m,), to leave a machine with, at once; None: one that could stand still needs none."""
         return None if self._held else within(self.plant, self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:

@@ -8,8 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 from lbmpc.model import Model
-from lbmpc.references import Change, Reference, between, changed, preview
+from lbmpc.references import Change, Preview, Reference, between, changed, preview
 from lbmpc.targets import SteadyState, TargetSelector
+
+STEP = 0.1
+"""Periods: what is shorter is a step, and no motion that a plan could follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +106,32 @@ class Aims:
         first = (
             self.targets.find(theta, begin, asked.outputs, seen.values[0]) if new or not last.size else None
         )
-        targets = [begin if first is None else first.xu]
+        rests = [begin if first is None else first.xu]
         for before, r in pairwise(seen.values):
             same = (r == before).all()
-            targets.append(
-                targets[-1] if same else self.targets.find(theta, targets[-1], asked.outputs, r).xu
-            )
-        if len(targets) == 1:
-            return Aim(first, targets[0][None, :d], targets[0][None, d:])
-        over = between(seen.positions, np.array(targets), np.arange(self._horizon + 1.0))
+            rests.append(rests[-1] if same else self.targets.find(theta, rests[-1], asked.outputs, r).xu)
+        if len(rests) == 1:
+            return Aim(first, rests[0][None, :d], rests[0][None, d:])
+        over = self._along(asked.outputs, seen, rests, theta)
         return Aim(first, over[:, :d], over[:-1, d:])
+
+    def _along(
+        self, outputs: tuple[int, ...], seen: Preview, rests: list[np.ndarray], theta: np.ndarray
+    ) -> np.ndarray:
+        """x and u over the horizon, (N + 1, d + m), from the rests of its knots, (d + m,) each.
+
+        From knot to knot they are no rests: a plant that is there moves on with the reference. How far that is from the
+        rests is found at the first of two knots.
+        """
+        assert self.targets is not None
+        positions: list[float] = []
+        points: list[np.ndarray] = []
+        for (begin, a, r), (end, b, _s) in pairwise(zip(seen.positions, rests, seen.values, strict=True)):
+            if end - begin < STEP:
+                continue
+            v = (b - a)[: self._model.d] / (end - begin)
+            positions += [begin, end]
+            if v.any() and (moving := self.targets.find(theta, a, outputs, r, v)).status != "no rest":
+                a, b = moving.xu, b + moving.xu - a
+            points += [a, b]
+        return between(np.array(positions), np.array(points), np.arange(self._horizon + 1.0))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import msgspec
@@ -19,8 +20,11 @@ from node_runtime.realtime.scheduling import one_blas_thread
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
+from tandem.commander import commanding
+from tandem.set_points import set_point
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
 
+FLOOD = 300
 SETTINGS = ("controller.horizon=20", "controller.keyframe_every=20", "network.hidden=[8, 8]")
 
 
@@ -74,6 +78,21 @@ def tick_with_weights(message: m.Message) -> bool:
     return isinstance(message, m.Tick) and message.weights is not None
 
 
+def command(config: Config) -> None:
+    """A set-point, one that is outside X, and a thousand a second for a while."""
+    with commanding(config, topics.RESULT) as commander:
+        asked = [set_point({"y": y}) for y in (1.7, 5.0)]
+        for one in asked:
+            assert commander.keep_saying(topics.REFERENCE, one, 0.2, HANG_S, answers(commander.run_id))
+        for _ in range(FLOOD):
+            commander.say(topics.REFERENCE, asked[0])
+            time.sleep(1e-3)
+
+
+def answers(to: str) -> Callable[[m.Message], bool]:
+    return lambda message: isinstance(message, m.TickResult) and message.reference_from == to
+
+
 @pytest.fixture(scope="module")
 def run() -> Iterator[Run]:
     config = live_config(*SETTINGS)
@@ -97,6 +116,7 @@ def run() -> Iterator[Run]:
             ear.until(lambda message: isinstance(message, m.Samples) and message.seq >= 15)
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 3))
             ear.until(tick_with_weights)
+            command(config)
             wait_for(lambda: sum(tick.state_verdict == "fresh" for tick in ear.of(topics.TICK)) >= 40)
             snapshot = snapshot_of(trainer)
             answer = trainer.ask(topics.OUTBOX_QUERY, {"since": "-1"}, HANG_S)
@@ -179,6 +199,22 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     assert run.counters["bad trainer/hidden_weights: refused"] == 1
     assert run.said.count("for another run") == 1
     assert run.snapshot.hidden_version == 3
+
+
+@pytest.mark.live
+def test_a_commander_is_answered_and_a_flood_of_references_is_one_a_tick(run: Run) -> None:
+    verdicts = [r.reference_verdict for r in run.of(topics.RESULT) if r.reference_verdict != "none"]
+    assert verdicts[0] == "taken"
+    assert any(verdict.startswith("refused: y = 5 is outside X") for verdict in verdicts)
+    assert verdicts[-1] == "taken"
+    assert run.of(topics.RESULT)[-1].reference == pytest.approx({"y": 1.7})
+    lost = [
+        run.counters.get(name, 0)
+        for name in ("overflow operator/reference", "bad operator/reference: superseded")
+    ]
+    assert sum(lost) > FLOOD // 2
+    assert run.counters["bad operator/reference: refused"] == len([v for v in verdicts if v != "taken"])
+    assert run.counters["references taken"] == verdicts.count("taken")
 
 
 @pytest.mark.live

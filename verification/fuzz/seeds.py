@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import msgspec
+from msgspec import UNSET
+
 from controller_node.core import ControllerCore
 from controller_node.outbox import Outbox
 from lbmpc.plants import get_plant, true_motion
@@ -23,6 +26,10 @@ SETTINGS = [
 ]
 STEPS = 6
 
+_REFERENCE = m.Reference(
+    run_id="commander-1", seq=0, outputs=["y", "z"], times=[0.0, 0.1, 0.1, 4.0],
+    values=[[1.65, 0.5], [1.7, 0.5], [1.75, 0.52], [1.7, 0.5]],
+)  # fmt: skip
 ANSWERS = (HIDDEN_ANSWER, SAMPLES_ANSWER)
 
 
@@ -45,6 +52,15 @@ def seeds() -> dict[str, list[bytes]]:
     def said(topic: Topic, message: m.Message) -> None:
         out[topic.name].append(codec.encode(message))
 
+    asked = {
+        1: _REFERENCE,
+        3: msgspec.structs.replace(_REFERENCE, seq=1, times=[0.2], values=[[1.7, 0.5]], lease=3.0),
+    }
+    for reference in asked.values():
+        said(topics.REFERENCE, reference)
+    for kind in ("hold", "configured"):
+        said(topics.REFERENCE, m.Reference(run_id="commander-1", seq=2, kind=kind, lease=1.0))
+    said(topics.OVERRIDE, m.Override(run_id="commander-1", seq=0, mode="manual", u=[1.2]))
     said(topics.KEYFRAME, core.memory.keyframe(-1))
     for step in range(STEPS):
         state = plant.sample(step * settings.period)
@@ -60,6 +76,7 @@ def seeds() -> dict[str, list[bytes]]:
             state_verdict="fresh",
             state=state,
             weights=weights,
+            reference=asked.get(step, UNSET),
         )
         outputs = core.step(tick)
         # Acting a little after the sample, so that there are pieces in the next state.

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from controller_node.asked import verdict_on
 from controller_node.build import build_model, build_plant
 from controller_node.certified_sets import CertifiedSets, Found
 from controller_node.codegen.compiler import SEAL, is_sealed, sealed
@@ -84,6 +85,7 @@ def targets(seed: int, folder: Path) -> list[Target]:
     settings = config()
     core = ControllerCore(settings, "controller-1")
     add("hidden weights: adoption", _adopting(core), payloads[topics.HIDDEN_WEIGHTS.name], 0.5)
+    add("reference: what a plan makes of it", _aiming(core), payloads[topics.REFERENCE.name], 0.2)
     add("keyframe: restored", _restoring(core), payloads[topics.KEYFRAME.name], 0.2)
     add(
         "outbox: a question", _asking(), [b"run=controller-1;since=3;last=10", b"since=-1"], 0.5, textual=True
@@ -155,6 +157,34 @@ def _adopting(core: ControllerCore) -> Read:
         assert seen.hidden is not None
         _, verdict = core.controller.oracle.adopt(before.oracle, seen.hidden)
         return ACCEPTED[0] if verdict.outcome == "adopted" else _kind(verdict.reason)
+
+    return read
+
+
+def _aiming(core: ControllerCore) -> Read:
+    """From the bus to where the plan leads, in this tick and after its lease."""
+    before, aims = core.memory.state, core.controller.aims
+    theta = core.controller.oracle.theta(before.oracle)
+    tick = codec.decode(topics.TICK, seeds()[topics.TICK.name][0])
+    assert isinstance(tick, m.Tick)
+
+    def read(payload: bytes) -> str:
+        try:
+            reference = codec.decode(topics.REFERENCE, payload)
+        except BadMessage as error:
+            return error.reason
+        assert isinstance(reference, m.Reference)
+        asked = msgspec.structs.replace(tick, reference=reference)
+        verdict = verdict_on(reference, core.plant, core.config.period)
+        seen = core.translation.observation(asked)
+        assert seen.x is not None
+        now = aims.latched(before.reference, seen.reference, 0, seen.x, before.target)
+        for _ in range(2):
+            aim = aims.find(now, theta, before.target, 0.0)
+            for array in (aim.xu, aim.xr, aim.ur):
+                assert array is None or np.isfinite(array).all()
+            now = None if now is None else now.advanced(1 if now.left < 0 else now.left)
+        return ACCEPTED[0] if verdict == "taken" else _kind(verdict)
 
     return read
 

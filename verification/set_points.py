@@ -1,0 +1,116 @@
+"""How set-points are followed where the model is wrong: `python -m verification.set_points`.
+
+Lock-step runs of the compressor with a slope of 1.4 in the place of its model's 1.5. How far y is from its set-point
+five seconds after each step; how far on a ramp, with a preview and without; and what a step costs.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import tyro
+
+from node_runtime.config.loading import load
+from node_runtime.config.sections import Config
+from node_runtime.config.shipped import config_file
+from tandem.experiments.simulation.lockstep import LockStep
+from tandem.loop import Loop
+from tandem.set_points import set_point, trajectory
+
+HALF = 0.5
+"""Half-width of y."""
+STEPS = (1.65, 1.7, 1.6, 1.68, 1.75, 1.65, 1.7)
+EACH, AFTER = 6.0, 5.0
+"""Seconds of each step, and when it is looked at."""
+RAMP = ([0.0, 4.0, 8.0, 10.0], [1.65, 1.65, 1.75, 1.75])
+WARM = 40
+"""Ticks that are not timed."""
+
+
+@dataclass(frozen=True)
+class SetPoints:
+    """What is measured."""
+
+    oracles: list[str] = field(default_factory=lambda: ["linear", "constant", "dnn", "perfect"])
+    set: list[str] = field(default_factory=list)
+    """Other settings, SECTION.KEY=VALUE."""
+
+
+def main(chosen: SetPoints) -> int:
+    """Prints the tables."""
+    _say("", "| |y - r| in % of the half-width | " + " | ".join(f"to {y:g}" for y in STEPS) + " |")
+    for oracle in chosen.oracles:
+        _say(
+            f"| `{oracle}` |",
+            " | ".join(f"{100 * off:.3f}" for off in _steps(_config(oracle, chosen))) + " |",
+        )
+    for oracle in chosen.oracles:
+        before, now = (_ramp(_config(oracle, chosen), previewed) for previewed in (False, True))
+        _say(f"| `{oracle}`, ramp |", f"{100 * before:.2f} | {100 * now:.2f} | {now / before:.2f} |")
+    for oracle in chosen.oracles:
+        costs = _costs(_config(oracle, chosen, "compressor"))
+        _say(f"| `{oracle}`, cost of a step |", " | ".join(f"{one:.2f}" for one in costs) + " |")
+    return 0
+
+
+def _config(oracle: str, chosen: SetPoints, name: str = "compressor-cheap") -> Config:
+    start = ["plant.truth.slope=1.4", "plant.x0=[0.4, 1.6, 1.1547, 0.0]"]
+    return load(config_file(name), [*start, f"controller.oracle={oracle}", *chosen.set])
+
+
+def _steps(config: Config) -> Iterator[float]:
+    """|y - r| so many seconds after each, of the half-width; each is asked for when it begins."""
+    loop = Loop(config=config)
+    for y in STEPS:
+        loop.set_point({"y": y})
+        states = [loop.step().x for _ in range(round(EACH * config.rate))]
+        yield abs(states[round(AFTER * config.rate)][1] - y) / HALF
+
+
+def _ramp(config: Config, previewed: bool) -> float:
+    """Mean |y - r| on the ramp, of the half-width. Not previewed: in each period the value of now is asked for."""
+    loop, (times, values) = LockStep(config), RAMP
+    off = []
+    for step in range(round(times[2] * config.rate)):
+        t = step * config.period
+        r = float(np.interp(t, times, values))
+        if not previewed:
+            loop.ask(set_point({"y": r}))
+        elif step == 0:
+            loop.ask(trajectory(times, {"y": values}))
+        state, _outputs = loop.step()
+        if t >= times[1]:
+            off.append(abs(state.x[1] - r) / HALF)
+    return float(np.mean(off))
+
+
+def _costs(config: Config) -> list[float]:
+    """Processor time of a step with a set-point, on a ramp and with a corner ahead, of that of one without."""
+    asked = [None, set_point({"y": 1.7}), trajectory([0.0, 1e3], {"y": [1.62, 1.82]}), None]
+    corner = trajectory([0.0, 0.4, 1.0], {"y": [1.65, 1.65, 1.67]})
+    loops = [LockStep(config) for _ in asked]
+    for loop, first in zip(loops, asked, strict=True):
+        if first is not None:
+            loop.ask(first)
+    spent = np.zeros((WARM + 80, len(loops)))
+    for step in spent:
+        loops[-1].ask(corner)
+        for i, loop in enumerate(loops):
+            before = time.process_time()
+            loop.step()
+            step[i] = time.process_time() - before
+    middle = np.median(spent[WARM:], axis=0)
+    return (middle[1:] / middle[0]).tolist()
+
+
+def _say(name: str, text: str) -> None:
+    sys.stdout.write(f"{name} {text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(SetPoints)))
