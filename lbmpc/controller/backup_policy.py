@@ -13,8 +13,8 @@ is followed with feedback,
 
     u_i = v_i + K (x_i - z_i),
 
-which takes no more than the plant's own sensors; the plant keeps u to its range and its rate. K is stiffer than the model's: what the plan does not know must not
-add up. Nothing of this is certified: h_hat is what was learned so far.
+which takes no more than the plant's own sensors; the plant keeps u to its range and its rate. K is stiffer than the
+model's: what the plan does not know must not add up. Nothing of this is certified: h_hat is what was learned so far.
 
 The margin is room for what h_hat does not know, and where the way to x^r leads along a bound it can cost the way
 itself. So where the plan touches its margin and does not lead back, |z_N - x^r|_P >= 0.9 |z_0 - x^r|_P, the problem is

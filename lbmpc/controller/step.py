@@ -338,7 +338,7 @@ class Controller:
         return self._solver.feedback(s, first, previous)
 
     def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
-        """What acts before v_0, (m,): the plant says so, or else it is what was commanded; None: nothing depends on it."""
+        """What was written before v_0, (m,): as the plant says, or as commanded; None: nothing depends on it."""
         if not self.problem.looks_back:
             return None
         acts = acting(written)

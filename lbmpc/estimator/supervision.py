@@ -2,8 +2,8 @@
 
 **Stuck.** A reading with noise in it does not repeat. One that does says nothing new, and is not used: the filter then
 predicts the state from the others. The sensor is named once the prediction has left it by three deviations of the
-noise. A sensor may be quantised, which its smallest step so far tells, and then repeats honestly: its repeated readings
-count where the prediction knows less than they do, and it is named only where the filter is sure as well.
+noise. A sensor may be quantised, which the steps between its readings tell, and then repeats honestly: its repeated
+readings count where the prediction knows less than they do, and it is named only where the filter is sure as well.
 
 **Dead.** No number comes of it, or one that stands still: 0 is a stuck reading like another.
 
@@ -35,7 +35,9 @@ ABSENT = 3
 MOVED = 3.0
 """Deviations: of the noise, by which the state must have moved; of an innovation, for a quantised sensor."""
 FINE = 0.25
-"""Of the deviation of the noise: a sensor that showed a smaller step does not repeat honestly."""
+"""Of the deviation of the noise: a sensor with a smaller step does not repeat honestly."""
+ROUNDING, TINY = 1e-6, 1e-300
+"""Of the noise's deviation: what is no step. And what is no divisor."""
 KNOWS_LESS = 9.0
 """Variance of a prediction, in that of the noise, from which on an honestly repeated reading says more."""
 LEAP = 8.0
@@ -44,8 +46,6 @@ LATELY = 20
 """Samples that `LEAP` looks back."""
 STAYS = 4.0
 """Deviations of the difference of two readings: an innovation that changes by more is no bias, but a motion."""
-READINGS = 8
-"""How many of them are kept, to find the smallest step of a sensor."""
 LASTS = 10
 """Samples for which a leap stays what it is, before a sensor is named off."""
 AGREES = 4.0
@@ -79,7 +79,7 @@ class SupervisedEstimator(Estimator):
         nothing = np.zeros(self._model.d)
         return {
             **self._inner.initial_state(),
-            "readings": np.zeros((READINGS, len(nothing))),
+            "reading": nothing,
             "step": nothing,
             "lately": np.ones_like(nothing),
             "leap": nothing,
@@ -114,9 +114,8 @@ class SupervisedEstimator(Estimator):
         counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
         noise = self._inner.noise(state)
         # Of a plant that was held, or started again, nobody knows that it moved.
-        same = numbers & (seen.y == state["readings"][0]) & (seen.applied is not None)
-        step = self._steps(state["readings"], state["step"], seen.y, numbers & ~same)
-        fine = step < FINE * noise
+        same = numbers & (seen.y == state["reading"]) & (seen.applied is not None)
+        step, fine = self._steps(state["reading"], state["step"], seen.y, numbers & ~same, noise)
         if (same == numbers).all():
             # A plant that rests, or a frozen line: a repetition alone proves nothing.
             fine[:] = False
@@ -147,11 +146,13 @@ class SupervisedEstimator(Estimator):
                 counts[FAULT],
             ]
         )
-        share = np.minimum(away**2 / variance, LEAP**2 * state["lately"])
-        lately = state["lately"] + np.where(used, share - state["lately"], 0.0) / LATELY
+        before, share = state["lately"], away**2 / variance
+        lately = before + np.where(used, np.minimum(share, LEAP**2 * before) - before, 0.0) / LATELY
+        # What leapt and is believed now is followed, however long that takes.
+        lately = np.where(used & (counts[LEAPT] > 0), np.maximum(lately, share), lately)
         return {
             **memory,
-            "readings": _with_reading(state["readings"], seen.y, numbers & ~same),
+            "reading": np.where(numbers, seen.y, state["reading"]),
             "step": step,
             "lately": np.maximum(1.0, lately),
             "leap": leap,
@@ -174,12 +175,17 @@ class SupervisedEstimator(Estimator):
         return judged
 
     def _steps(
-        self, readings: np.ndarray, smallest: np.ndarray, y: np.ndarray, changed: np.ndarray
-    ) -> np.ndarray:
-        """The smallest step of each sensor so far, (d,), 0 before the first."""
-        steps = np.where((readings != 0.0) & (readings != y) & changed, np.abs(readings - y), np.inf)
-        step = np.minimum(np.where(smallest > 0.0, smallest, np.inf), steps.min(axis=0))
-        return np.where(np.isfinite(step), step, 0.0)
+        self, reading: np.ndarray, step: np.ndarray, y: np.ndarray, changed: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The step of each sensor, (d,), 0 before the first, and whether it is a fine one.
+
+        It is what all changes so far are multiples of, by one division of Euclid's with each.
+        """
+        change = np.abs(y - reading)
+        left = np.where(step > 0.0, np.abs(change - np.rint(change / np.maximum(step, TINY)) * step), change)
+        finer = changed & (reading != 0.0) & (left > ROUNDING * noise)
+        step = np.where(finer, left, step)
+        return step, (step > 0.0) & (step < FINE * noise)
 
     def _leaps(
         self,
@@ -208,8 +214,3 @@ class SupervisedEstimator(Estimator):
             return "what it measures is estimated from the others"
         names = ", ".join(self._model.plant.states[i] for i in unseen)
         return f"nothing that is measured tells of {names} any more"
-
-
-def _with_reading(readings: np.ndarray, y: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """The last different readings of each sensor, (READINGS, d), the newest first."""
-    return np.where(new, np.vstack([y, readings[:-1]]), readings)

@@ -50,13 +50,14 @@ def build_nominal(problem: Problem) -> ca.Function:
 def build_start(problem: Problem) -> ca.Function:
     """(x, c, lower, upper) -> v: inputs K zbar_i + c_i, (m, n), brought inside their bounds one after the other.
 
-    `lower` and `upper`, (m,), are those of v_0; where inputs may step, they are left to whoever clips v. A plan from before, put in this way, stays near its own trajectory from a state that it did not expect.
+    `lower` and `upper`, (m,), are those of v_0; where inputs may step, they are left to whoever clips v. A plan from
+    before, put in this way, stays near its own trajectory from a state that it did not expect.
     """
     model, n = problem.model, problem.horizon
     a, b, gain = ca.DM(model.A), ca.DM(model.B), ca.DM(model.K)
     x, c = ca.MX.sym("x", model.d), ca.MX.sym("c", model.m, n)
     lower, upper, steps = ca.MX.sym("lower", model.m), ca.MX.sym("upper", model.m), problem.input_steps
-    state, inputs = x, []
+    state, inputs = x, list[ca.MX]()
     for entry, bounds in zip(ca.horzsplit(c), problem.inputs, strict=True):
         low, high = bounds.lower, bounds.upper
         if np.isfinite(steps).any():

@@ -41,7 +41,8 @@ Constrained = Literal["nominal", "learned"]
 def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
     """(x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
 
-    Inputs: x (D,), which is s_0 and, where it counts, u_{-1}, iterate v (m, n), theta, references xr (d, n + 1) and ur (m, n).
+    Inputs: x (D,), which is s_0 and, where it counts, u_{-1}, iterate v (m, n), theta, references xr (d, n + 1) and ur
+    (m, n).
     Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m,
     n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along
     the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).

@@ -86,6 +86,10 @@ class Bench:
             )
         )
 
+    def act_until(self, t: float) -> None:
+        """All that is due by then, each at its own time."""
+        self.shield.advance(t, self)
+
     def act(self, t: float) -> None:
         if self.shield.due <= t:
             self.shield.act(t, self)

@@ -39,10 +39,9 @@ class Evidence:
     """On the constant, (d,), units of h."""
 
     def nothing(self) -> OracleState:
-        """Before the first label."""
+        """Before the first label the constant is anything within the output scale: it begins as the labels' mean."""
         d = len(self.output_scale)
-        prior = self.filter.prior_variance * self.output_scale**2
-        return {"evidence": np.zeros((2, 2, d)), "constant": np.stack([np.zeros(d), prior])}
+        return {"evidence": np.zeros((2, 2, d)), "constant": np.stack([np.zeros(d), self.output_scale**2])}
 
     def with_label(
         self, state: OracleState, h: np.ndarray, network: np.ndarray, variance: Variance

@@ -144,6 +144,18 @@ def test_a_disturbance_as_sudden_is_not_a_fault() -> None:
     np.testing.assert_allclose(np.array(ran.errors)[60:], np.array(alone.errors)[60:], atol=0.02)
 
 
+def test_a_plant_that_was_pushed_shows_in_several_sensors_and_is_believed() -> None:
+    push = 0.3 * SCALE * np.array([1.0, 1.0, 0.0, 0.0])
+    assert not Ran(good, 80, h=lambda k: push if k == 40 else np.zeros(4)).named
+
+
+def test_a_few_samples_tell_whether_a_sensor_is_quantised() -> None:
+    step = 0.01 * SCALE
+    rough = Ran(lambda k, y: np.rint(y / step) * step, 12, noise=3.0 * NOISE).memory
+    np.testing.assert_allclose(rough["step"], step, rtol=1e-9)
+    assert (Ran(good, 12).memory["step"] < 0.25 * NOISE).all()
+
+
 @pytest.mark.parametrize("told", [0.1, 1.0])
 def test_noise_alone_is_no_fault_also_where_it_is_larger_than_told(told: float) -> None:
     for seed in range(3):

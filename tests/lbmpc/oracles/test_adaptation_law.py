@@ -174,6 +174,26 @@ def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
     assert (constant[:3] < 0.2).all()
     assert constant[3] > 0.4
     assert abs(np.mean(constants[-200:], axis=0)[3] - 0.005) < 0.001
+    state |= evidence.with_label(state, np.full(4, 1e6), np.zeros(4), variance)
+    np.testing.assert_allclose(state["constant"][0], 0.1)
+
+
+def test_of_noise_free_labels_the_constant_is_the_rest_at_once() -> None:
+    evidence = Evidence(FILTER, np.full(2, 0.05), np.full(2, 0.1))
+    state = evidence.nothing()
+    for _ in range(3):
+        state |= evidence.with_label(state, np.array([0.03, -0.02]), np.zeros(2), 1e-14)
+    np.testing.assert_allclose(weights(state), [[0.0, 0.0], [1.0, 1.0]], atol=0.02)
+    np.testing.assert_allclose(state["constant"][0], [0.03, -0.02], rtol=0.01)
+
+
+def test_what_the_network_predicts_is_not_the_constants_too() -> None:
+    evidence = Evidence(FILTER, np.full(2, 0.05), np.full(2, 0.1))
+    state, h = evidence.nothing(), np.array([0.03, -0.02])
+    for _ in range(100):
+        state |= evidence.with_label(state, h, h, 1e-6)
+    network, constant = weights(state)
+    np.testing.assert_allclose(network * h + constant * state["constant"][0], h, rtol=0.05)
 
 
 def test_the_prediction_and_its_parameters_have_that_weight_and_training_has_the_whole_K() -> None:

@@ -6,9 +6,13 @@ import math
 import re
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 
+from lbmpc.plants import Known, PlantDefinitionError, get_plant
 from node_runtime.config.loading import from_json, from_tree, load, override, to_json, to_toml
+from node_runtime.config.plant import plant_of, spelt_out
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
@@ -89,3 +93,44 @@ def test_bounds_there_and_back(tmp_path: Path):
 def test_mistakes(given: str, text: str):
     with pytest.raises(ConfigError, match=re.escape(text)):
         override(Config(), [given])
+
+
+def test_rates_of_inputs_there_and_back(tmp_path: Path):
+    config = load(None, ["plant.input_rate_max={u=5.0}", "controller.S=[0.5]"])
+    found = plant_of(config, get_plant)
+    assert found.input_rates.tolist() == [5.0]
+    file = tmp_path / "rates.toml"
+    file.write_text(to_toml(config))
+    assert load(file) == config
+    # In a log: the plant as it is known, and a configuration that says all of it.
+    known = found.known()
+    assert Known.from_builtins(msgspec.json.decode(msgspec.json.encode(known.to_builtins()))).u_rate_max == [
+        5.0
+    ]
+    assert spelt_out(load(None), found).plant.input_rate_max == {"u": 5.0}
+    assert "u_rate_max" not in get_plant("moore_greitzer").known().to_builtins()
+    # A part of the inputs may have one.
+    two = Known.from_matrices(
+        np.zeros((1, 1)) - 1.0, np.ones((1, 2)), W=[0.0], scale={"x1": 1.0, "u1": 1.0, "u2": 1.0}
+    )
+    assert two.changed({}, input_rate_max={"u2": 3.0}).input_rates.tolist() == [np.inf, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("plant.input_rate_max.v=5.0", "has no input 'v'"),
+        ("plant.input_rate_max.u=0.0", "plant.input_rate_max"),
+        ("controller.S=[1.0, 1.0]", "controller.S has 2 entries"),
+        ("controller.S=[-1.0]", "controller.S"),
+    ],
+)
+def test_a_rate_that_is_none(setting: str, said: str):
+    with pytest.raises(ConfigError, match=said):
+        plant_of(load(None, [setting]), get_plant)
+
+
+def test_a_plant_whose_rate_is_none():
+    for rates in ([1.0, 2.0], [0.0], [float("nan")], "fast"):
+        with pytest.raises(PlantDefinitionError, match="u_rate_max"):
+            Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], u_rate_max=rates, scale={"x1": 1.0, "u1": 1.0})

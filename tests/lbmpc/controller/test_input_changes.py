@@ -1,0 +1,92 @@
+"""A step whose plan depends on what acts now: rate limits, a weight on changes, and what stands in for a solution."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lbmpc.controller.backup_policy import BackupPlanner
+from lbmpc.controller.fallback import empty_plan
+from lbmpc.controller.state import ControllerState
+from lbmpc.controller.step import Controller
+from lbmpc.oracles import ConstantOracle
+from lbmpc.problem import build_problem
+from lbmpc.solver.gauss_newton import Solver
+from tests.helpers.science import compressor
+from tests.lbmpc.controller.test_step import CONTROLLER, X, same_memory, seen
+
+RATE = 0.6
+FREE = compressor()
+STEP = RATE * FREE.period
+MODEL = dataclasses.replace(
+    FREE,
+    plant=dataclasses.replace(FREE.plant, u_rate_max=np.array([RATE])),
+    S=np.array([[0.2]]),
+)
+PROBLEM = build_problem(MODEL, ConstantOracle(4, 1, 0.5), 15, "first_step")
+FAR = np.array([-0.3, -0.35, 0.0, 0.0])
+
+
+def controller(real_time: bool = False) -> Controller:
+    return Controller(PROBLEM, Solver(PROBLEM), real_time=real_time)
+
+
+LIMITED = controller()
+
+
+def within(plan: np.ndarray, acts: float) -> bool:
+    return bool((np.abs(np.diff(plan[:, 0], prepend=acts)) <= STEP * (1 + 1e-9)).all())
+
+
+@pytest.mark.parametrize("real_time", [False, True])
+def test_a_plan_begins_where_the_input_is(real_time: bool) -> None:
+    one, two = controller(real_time), controller(real_time)
+    state = also = one.initial_state(0)
+    active = 0
+    for k, acts in enumerate((0.1, 0.12, -0.3, 0.4, 0.41)):
+        one.prepare(state)
+        x = FAR * 0.9**k
+        state, result = one.step(state, seen(x, k, acts))
+        assert result.mode == "solver"
+        assert within(result.plan, acts)
+        active += abs(abs(result.plan[0, 0] - acts) - STEP) < 1e-9
+        # A step that finds nothing prepared does the same, from a state that was frozen.
+        also, again = two.step(ControllerState.from_arrays(also.to_arrays()), seen(x, k, acts))
+        np.testing.assert_array_equal(result.plan, again.plan)
+        assert same_memory(state, also) is None
+    assert active >= 2
+
+
+def test_what_stands_in_for_a_solution_keeps_the_rate_too() -> None:
+    state, result = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
+    # No sample: the plan goes on from what was commanded.
+    lost, without = LIMITED.step(state, seen(None, 1, None))
+    assert without.mode == "shifted_plan"
+    assert within(without.plan, result.plan[0, 0])
+    # Something else acts than was planned, and there are no numbers to solve with.
+    broken = dataclasses.replace(state, oracle={**state.oracle, "h": np.full(4, np.nan)})
+    _, other = LIMITED.step(broken, seen(np.full(4, 1e5), 1, -0.5))
+    assert within(other.plan, -0.5)
+    nothing = dataclasses.replace(lost, plan=empty_plan(15, 1))
+    _, idle = LIMITED.step(nothing, seen(None, 2, None))
+    assert idle.mode == "feedback"
+    assert within(idle.plan, lost.commanded[0])
+    # Before anything acts, the actuator is where the safe input has it.
+    _, begun = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, None))
+    assert within(begun.plan, float(MODEL.plant.safe_input[0] - MODEL.plant.u_e[0]))
+
+
+def test_a_backup_plan_goes_on_from_the_command() -> None:
+    state, result = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
+    policy = LIMITED.backup(BackupPlanner(PROBLEM, 0.0075), state)
+    assert policy is not None
+    planned = policy.inputs + policy.states @ policy.gain.T
+    assert within(planned, result.plan[0, 0])
+
+
+def test_nothing_is_remembered_where_inputs_may_step() -> None:
+    state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
+    assert "commanded" not in state.to_arrays()
+    assert "commanded" in LIMITED.initial_state(0).to_arrays()

@@ -1,0 +1,99 @@
+"""The input's rate at a gateway: whoever acts, and whenever."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.plant_sim.test_shield import PERIOD, PLANT, Bench, U
+
+RATE = 2.0
+STEP = RATE * PERIOD
+LIMITED = {"u_rate_max": [RATE], "safe_gain": None}
+
+
+def largest_within_a_period(writes: list[tuple[float, float]]) -> float:
+    """Of any two inputs that acted within one period, the safe one before the first write among them."""
+    acted = [(-np.inf, U), *writes]
+    largest = 0.0
+    for i, (t, u) in enumerate(acted):
+        for (_began, older), (ended, _after) in pairwise(acted[: i + 1]):
+            if t - ended < (1.0 - 1e-6) * PERIOD:
+                largest = max(largest, abs(u - older))
+    return largest
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
+    """Commands early, late, in bursts and none at all; backup policies; a feedback as the safe input; failed writes."""
+    rng, bench = np.random.default_rng(seed), Bench(u_rate_max=[RATE])
+    applied, seq, silent = [], 0, 0
+    for k in range(80):
+        bench.x = PLANT.x_e + rng.uniform(-0.3, 0.3, 4) * PLANT.x_scale
+        bench.fails = seed % 3 == 0 and rng.random() < 0.1
+        state = bench.sampled(k)
+        applied.append(np.nan if state.applied is None else state.applied[0])
+        silent = silent - 1 if silent else int(rng.integers(1, 12)) * int(rng.random() < 0.15)
+        for at in np.sort(rng.uniform(k + 0.05, k + 0.95, 0 if silent else int(rng.integers(1, 4)))):
+            bench.act_until(at * PERIOD)
+            bench.command(k, at, float(rng.uniform(*PLANT.u_min, *PLANT.u_max)))
+            seq += 1
+        if not silent and rng.random() < 0.5:
+            bench.backup(k, rng.uniform(PLANT.u_min[0], PLANT.u_max[0], 5).tolist(), gain=0.5)
+        bench.act_until((k + 1) * PERIOD)
+    if seed % 3:
+        assert largest_within_a_period(bench.writes) <= STEP * (1 + 1e-5)
+        differences = np.abs(np.diff(applied))
+        assert np.nanmax(differences) <= STEP * (1 + 1e-5)
+        assert np.nanmax(differences) > 0.9 * STEP
+    assert all(PLANT.u_min[0] <= u <= PLANT.u_max[0] for _t, u in bench.writes)
+    assert {"command", "plan", "safe"} >= {bench.sampled(k).source for k in (80,)}
+
+
+def test_a_command_that_comes_early_waits_and_loses_nothing() -> None:
+    bench = Bench(**LIMITED)
+    bench.sample(0)
+    bench.command(0, 0.3, U + STEP)
+    bench.sample(1)
+    # A twentieth of a period too early: the input before the last is not yet a period old.
+    bench.command(1, 1.25, U + 2 * STEP)
+    assert bench.writes[-1] == (pytest.approx(1.25 * PERIOD), pytest.approx(U + STEP))
+    assert bench.shield.due == pytest.approx(1.3 * PERIOD)
+    bench.act_until(1.5 * PERIOD)
+    assert bench.writes[-1] == (pytest.approx(1.3 * PERIOD), pytest.approx(U + 2 * STEP))
+    # And a late one acts at once.
+    bench.sample(2)
+    bench.command(2, 2.6, U + 3 * STEP)
+    assert bench.writes[-1] == (pytest.approx(2.6 * PERIOD), pytest.approx(U + 3 * STEP))
+
+
+def test_the_way_to_the_safe_input_goes_on_period_by_period() -> None:
+    bench = Bench(**LIMITED)
+    for k in range(5):
+        bench.sample(k)
+        bench.command(k, k + 0.1, U + (k + 1) * STEP, plan=0)
+    assert bench.writes[-1][1] == pytest.approx(U + 5 * STEP)
+    applied = []
+    for k in range(5, 14):
+        bench.act_until(k * PERIOD)
+        applied.append(bench.sampled(k))
+    assert [state.source for state in applied[3:]] == ["safe"] * 6
+    assert bench.writes[-1][1] == pytest.approx(U)
+    falling = [state.applied[0] for state in applied if state.applied is not None]
+    assert np.abs(np.diff(falling)).max() <= STEP * (1 + 1e-6)
+    # Six periods after the patience it is there.
+    assert falling[-1] == pytest.approx(U)
+    assert falling[-3] == pytest.approx(U)
+
+
+def test_before_the_first_command_the_actuator_is_at_the_safe_input() -> None:
+    bench = Bench(**LIMITED)
+    bench.sample(0)
+    bench.command(0, 0.1, U + 0.7)
+    assert bench.writes[-1][1] == pytest.approx(U + STEP)
+    free = Bench(safe_gain=None)
+    free.sample(0)
+    free.command(0, 0.1, U + 0.7)
+    assert free.writes[-1][1] == U + 0.7
