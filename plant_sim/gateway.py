@@ -37,10 +37,12 @@ from node_runtime.provenance import run_info
 from node_runtime.realtime import clock
 from node_runtime.realtime.pacer import Grid, Pacer, Slot
 from node_runtime.realtime.scheduling import GarbageCollection, core_for, core_note, on_core, punctual
+from plant_sim.hand import NO_LONGER
 from plant_sim.machine import Guarded, Read, Write
 from plant_sim.shield import Shield
+from plant_sim.way_back import way_back_of
 from protocol import topics
-from protocol.messages import Backup, Command, InputSource, ProcessStatus
+from protocol.messages import Backup, Command, InputSource, Override, ProcessStatus
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +67,8 @@ class Gateway:
 
     At every sampling time the state is read and published. A command acts from its arrival; one that is foreign, stale
     or of another period is refused and counted. While none comes the backup policy acts, then the plan, then the safe
-    input (`plant_sim.shield`). Before the first command, and in the end, it is the safe input.
+    input (`plant_sim.shield`). Before the first command, and in the end, it is the safe input. Before all of them goes
+    what a person commands by hand, while the plant stays in X (`plant_sim.hand`).
 
     Args:
         known: what is known of the plant: its dimensions, bounds and safe input. None: what `config` names.
@@ -80,6 +83,7 @@ class Gateway:
     def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
         self.config = config if isinstance(config, Config) else load(config)
         self.known = plant_of(self.config, get_plant, known)
+        self._way_back = way_back_of(self.config, self.known)
         self._simulated = simulated
         self._serving: tuple[Shield, Guarded] | None = None
 
@@ -119,7 +123,8 @@ class Gateway:
         """
         config, run_id = self.config, new_run_id("plant")
         place = core_for(config, "plant", os.sched_getaffinity(0))
-        shield = Shield(self.known, config.period, config.plant.plan_patience, run_id, held=self._simulated)
+        patience = config.plant.plan_patience
+        shield = Shield(self.known, config.period, patience, run_id, self._simulated, self._way_back)
         gaps = config.estimator.kind != "none"
         machine = Guarded(read, write, self.known.d, config.period, self._simulated, gaps)
         self._serving = shield, machine
@@ -167,6 +172,7 @@ class _Loop:
         d, m = shield.plant.d, shield.plant.m
         self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=d, inputs=m, arrived=self._arrived)
         self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=d, inputs=m, arrived=self._arrived)
+        self._overrides: Inbox[Override] = Inbox(bus, topics.OVERRIDE, states=d, inputs=m)
         names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
         self._counts = dict.fromkeys(names, 0)
         self._source: InputSource = "hold"
@@ -194,6 +200,11 @@ class _Loop:
             return
         moving, trouble = self._shield.moving, self._machine.trouble()
         note = BEFORE_COMMANDS if self._source == "safe" and not moving else NOTES[self._source]
+        hand = self._shield.hand
+        if self._source == "manual":
+            note += f" ({hand.run_id})"
+        elif hand.ended:
+            note = "; ".join(filter(None, (note, f"{NO_LONGER}{hand.ended}")))
         status: ProcessStatus = "failed" if trouble else "running" if moving else "ready"
         self._health.set(status, "; ".join(filter(None, (trouble, note))))
 
@@ -251,3 +262,9 @@ class _Loop:
                 self._bus.bad.count(
                     topics.BACKUP.name, verdict, f"for command {backup.seq} of {backup.run_id}"
                 )
+        for said in self._overrides.take_all():
+            override = said.message
+            outcome = self._shield.override(override, said.arrived)
+            if outcome != "ok":
+                detail = f"{override.mode}, {override.seq} of {override.run_id}"
+                self._bus.bad.count(topics.OVERRIDE.name, outcome, detail)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -12,15 +13,20 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from lbmpc.plants import Description
+from plant_sim.hand import Hand, HandVerdict
 from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
 from plant_sim.rate_limit import RateLimit
-from protocol.messages import Backup, Command, InputSource, Piece, PlantState
+from plant_sim.way_back import WayBack
+from protocol.messages import Backup, Command, InputSource, Override, Piece, PlantState
 
 Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 JITTER = 0.1
 """Share of a period by which the time between two measurements may differ from it: the error of a label is that share
 of what the plant moves in a period."""
 
+
+HAIR = 1e-9
+"""Of a period: two moments that are so near are one."""
 
 MOST_ACTED = 1000
 """Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
@@ -50,16 +56,30 @@ class _Acting:
 class Shield:
     """What stands between the commands and a plant's input. Every time is an argument, in seconds.
 
-    In a loop `command` and `backup` take what arrives, `act` or `advance` lets it act, `sample` ends a period, `renew`
-    begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for a real one.
+    In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a
+    period, `renew` begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for
+    a real one.
     """
 
-    def __init__(self, plant: Description, period: float, patience: float, run_id: str, held: bool):
+    def __init__(
+        self,
+        plant: Description,
+        period: float,
+        patience: float,
+        run_id: str,
+        held: bool,
+        way_back: WayBack | None = None,
+    ):
         """patience: periods without a command before the plan goes on.
 
         held: the plant stands still until the first command that answers one of its samples; else the safe input acts.
+        way_back: whether an input by hand may act; None: none does.
         """
         self.plant = plant
+        self.hand = Hand(plant, way_back)
+        # What is on its way through the dead time, one a period.
+        dead = math.ceil(plant.dead_time / period - HAIR)
+        self._on_the_way = deque([plant.safe_input] * dead, maxlen=dead)
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
         # Before anything acts, the actuator is where it is without anybody.
@@ -85,7 +105,8 @@ class Shield:
     @property
     def due(self) -> float:
         """When `advance` has something to do next, if nothing else arrives; infinite where never."""
-        return min(self._until, self._pending[0].arrived) if self._pending else self._until
+        until = min(self._until, self.hand.until)
+        return min(until, self._pending[0].arrived) if self._pending else until
 
     # -- what is obeyed ----------------------------------------------------------------------------------
 
@@ -125,6 +146,13 @@ class Shield:
                 return "ok"
         return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
 
+    def override(self, override: Override, t: float) -> HandVerdict:
+        """Let a person's input act from the next sample on, before all others, or no more; it arrived at time t.
+
+        It must have the plant's dimensions. See `plant_sim.hand` for when it ends.
+        """
+        return self.hand.take(override, t)
+
     def jump(self) -> None:
         """From the next sample on the state is another one than the last inputs led to: a new origin, a fresh start.
 
@@ -153,9 +181,11 @@ class Shield:
         And what was not written for a period is written again: a machine's own watchdog may wait for it, and where the
         last write failed the next one may not.
         """
+        self.hand.look(x, self.acting, self._on_the_way)
         written, self._written = self._written, False
         acting = self._tape[-1]
-        if (self._held and self._orders is None) or (written and acting.source == "command"):
+        stands = self._held and self._orders is None and acting.source == "hold"
+        if (stands or (written and acting.source == "command")) and self.hand.input(t) is None:
             return
         drive = self._drive(t, lambda: x)
         same = acting.u is not None and np.array_equal(drive.u, acting.u)
@@ -164,11 +194,19 @@ class Shield:
         self._write(drive, t, machine)
         self._written = False
 
+    @property
+    def acting(self) -> np.ndarray:
+        """The input that acts, (m,); where nobody knows, what the actuator has without anybody."""
+        u = self._tape[-1].u
+        return within(self.plant, self.plant.safe_input) if u is None else u
+
     def rest(self) -> np.ndarray | None:
         """The input, (m,), to leave a machine with, at once; None: one that could stand still needs none."""
         return None if self._held else within(self.plant, self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
+        if (u := self.hand.input(t)) is not None:
+            return Drive(u, "manual", math.inf)
         orders = self._orders
         if orders is None:
             return safe_drive(self.plant, measure, math.inf)
@@ -221,6 +259,8 @@ class Shield:
             # Of older commands nothing is followed any more, but for the one before the last: see `_drive`.
             self._standby = {seq: one for seq, one in self._standby.items() if seq >= orders.seq - 1}
         self._t, self._measured = t, measured
+        if self._on_the_way.maxlen:
+            self._on_the_way.append(np.array(applied) if applied else self.acting)
         return PlantState(
             run_id=self._run_id,
             seq=self._seq,
@@ -236,6 +276,7 @@ class Shield:
         """Of what was before t only the input that acts is still true."""
         self._jumped, self._epoch, self._measured = False, self._seq, -math.inf
         self._pending, self._standby = [], {}
+        self.hand.end("the state is another one")
         if self._orders is not None:
             self._orders = self._before_jump = self._orders.without_plan()
         self._tape = [replace(self._tape[-1], since=t)]

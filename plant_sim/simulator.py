@@ -8,8 +8,10 @@ import math
 import numpy as np
 
 from lbmpc.plants import Description, PlantError, TrueMotion
+from plant_sim.hand import Hand, HandVerdict
 from plant_sim.shield import Shield, Verdict
-from protocol.messages import Backup, Command, PlantState
+from plant_sim.way_back import WayBack
+from protocol.messages import Backup, Command, Override, PlantState
 
 
 class Motion:
@@ -125,13 +127,16 @@ class PlantSim:
         plan_patience: float,
         run_id: str,
         dead_time: float = 0.0,
+        way_back: WayBack | None = None,
     ):
         """x0: (d,), plant units. plan_patience: periods without a command before the plan goes on.
 
         dead_time: seconds, of the truth, from a command's arrival until it acts. Until the first does, the safe input
             acts, without its gain.
+        way_back: whether an input by hand may act; None: none does.
         """
-        self._shield = Shield(plant, period, plan_patience, run_id, held=True)
+        self._way_back = way_back
+        self._shield = Shield(plant, period, plan_patience, run_id, True, way_back)
         self._motion = Motion(truth, x0, period, dead_time, plant.safe_input)
 
     def change(self, truth: TrueMotion) -> None:
@@ -146,10 +151,24 @@ class PlantSim:
         """See `Shield.backup`."""
         return self._shield.backup(backup)
 
+    def override(self, override: Override, t: float) -> HandVerdict:
+        """See `Shield.override`."""
+        return self._shield.override(override, t)
+
+    @property
+    def acting(self) -> np.ndarray:
+        """The input that acts, (m,)."""
+        return self._shield.acting
+
+    @property
+    def hand(self) -> Hand:
+        """Who drives it by hand, and why nobody does any more."""
+        return self._shield.hand
+
     def look(self, t: float) -> PlantState:
         """What `sample` would say at t; nothing changes. Raises as `sample` does."""
-        # Shared are the two that keep nothing.
-        shared = {id(one): one for one in (self._shield.plant, self._motion.truth)}
+        # Shared is what keeps nothing.
+        shared = {id(one): one for one in (self._shield.plant, self._motion.truth, self._way_back)}
         return copy.deepcopy(self, shared).sample(t)
 
     def sample(self, t: float) -> PlantState:

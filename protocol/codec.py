@@ -185,6 +185,8 @@ def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) ->
             for name, rows, length in (("gain", message.gain, d), ("inputs", message.inputs, m_inputs)):
                 for i, row in enumerate(rows):
                     expect(f"{name}[{i}]", row, length)
+        case m.Override():
+            expect("u", message.u, m_inputs if message.mode == "manual" else 0)
         case m.Samples():
             for sample in message.samples:
                 expect("x", sample.x, d)

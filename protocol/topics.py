@@ -37,6 +37,11 @@ class Topic:
     batched: bool = False
     """In a fast loop those who log and show it get many of its messages in one `Batch`; see `batched_at`."""
 
+    @property
+    def shared(self) -> bool:
+        """Whether several may write it at a time, and the newest word counts: nobody is shut out for another's sake."""
+        return self.writer == COMMANDER
+
     def every(self, period: float) -> int:
         """Ticks from one message to the next in a loop of this period, in seconds."""
         return max(1, math.ceil(1.0 / (period * self.max_hz) - 1e-9))

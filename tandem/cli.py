@@ -19,6 +19,7 @@ from tyro.conf import subcommand
 
 from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
+from tandem.commands.by_hand import Auto, Manual, Pause
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
 from tandem.commands.health import Health
@@ -47,6 +48,9 @@ AnyCommand = (
     | Annotated[Plant, subcommand("plant")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Health, subcommand("health")]
+    | Annotated[Manual, subcommand("manual")]
+    | Annotated[Pause, subcommand("pause")]
+    | Annotated[Auto, subcommand("auto")]
     | Annotated[SetPoint, subcommand("set-point")]
     | Annotated[Experiment, subcommand("experiment")]
     | Annotated[SetsCommand, subcommand("sets")]

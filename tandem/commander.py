@@ -48,6 +48,11 @@ class Commander:
         self._bus.publish(topic, msgspec.structs.replace(message, run_id=self.run_id, seq=self._seq))
         self._seq += 1
 
+    def say_again(self, topic: Topic, message: m.Message) -> None:
+        """Once more, by the number of what was said last: for who must not take it for another word."""
+        self._seq = max(0, self._seq - 1)
+        self.say(topic, message)
+
     def hear(self, seconds: float) -> m.Message | None:
         """The next of what it listens to; None: there was none for so long. What cannot be read is not heard."""
         assert self._mailbox is not None

@@ -134,6 +134,42 @@ class Loop:
             )
         return self._step(state).u
 
+    def manual(self, u: ArrayLike | Mapping[str, float]) -> None:
+        """From the next step on this input acts by hand, until `auto`; the controller goes on learning.
+
+        It is clipped to U. Where the plant would leave X its controller takes over before that, for good.
+
+        Args:
+            u: (m,), in the plant's own units; or some of the inputs, by name, and the others stay what they are.
+
+        Raises:
+            ValueError: not m finite numbers, or no input of that name.
+        """
+        plant = self.plant
+        if isinstance(u, Mapping):
+            given = self._lockstep.acting.copy()
+            for name, value in u.items():
+                if name not in plant.inputs:
+                    raise ValueError(f"{plant.name} has no input {name!r}; it has {', '.join(plant.inputs)}")
+                given[plant.inputs.index(name)] = value
+        else:
+            given = np.array(u, dtype=float)
+        if given.shape != (plant.m,) or not np.isfinite(given).all():
+            raise ValueError(
+                f"u = {np.array2string(given, threshold=20)} is no input of {plant.name}: {plant.m} finite numbers "
+                f"({', '.join(plant.inputs)})"
+            )
+        self._lockstep.manual(given)
+
+    def auto(self) -> None:
+        """From the next step on the controller's commands act again."""
+        self._lockstep.auto()
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether the input acts by hand, or will from the next step on."""
+        return self._lockstep.plant.hand.acts
+
     def set_point(self, values: Mapping[str, float], over: float = 0.0, lease: float | None = None) -> None:
         """Where outputs shall be, from the next period on: {"y": 1.8}.
 
@@ -201,7 +237,7 @@ class Loop:
         with one_blas_thread():
             state, outputs = self._lockstep.step(x)
         self._lost = None
-        return Step(state.t, np.array(state.x), np.array(outputs.command.u), outputs.result)
+        return Step(state.t, np.array(state.x), self._lockstep.acting, outputs.result)
 
 
 class Result:

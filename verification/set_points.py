@@ -42,7 +42,7 @@ class SetPoints:
 
 def main(chosen: SetPoints) -> int:
     """Prints the tables."""
-    _say("", "| |y - r| in % of the half-width | " + " | ".join(f"to {y:g}" for y in STEPS) + " |")
+    _say("| |", " | ".join(f"to {y:g}" for y in STEPS) + " |")
     for oracle in chosen.oracles:
         _say(
             f"| `{oracle}` |",

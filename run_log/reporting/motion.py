@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
 
 import msgspec
 import numpy as np
@@ -34,6 +34,8 @@ class Trajectory(msgspec.Struct, frozen=True):
     """(n,) what acted in that period; empty where it was not reported, or samples are missing before this one."""
     starts: tuple[int, ...] = (0,)
     """Where in these arrays the episodes begin."""
+    by_hand: tuple[tuple[float, float], ...] = ()
+    """(from, to) in seconds since the start: while a person drove it; not of a part."""
 
     def part(self, first: int, last: int) -> Trajectory:
         """The motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
@@ -93,7 +95,15 @@ def motion(episodes: list[list[PlantState]], plant: Description, period: float) 
     ]
     starts = (0, *accumulate(len(one) for one in episodes[:-1]))
     x = np.array([s.x for s in states])
-    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known), starts)
+    spans = _by_hand(states, t, period)
+    return Trajectory(np.array(step), np.array(t), x, np.array(applied), ((), *known), starts, spans)
+
+
+def _by_hand(states: list[PlantState], t: list[float], period: float) -> tuple[tuple[float, float], ...]:
+    """A sample says what acted before it."""
+    groups = groupby(zip(t, states, strict=True), key=lambda one: one[1].source == "manual")
+    driven = [[at for at, _state in group] for by_hand, group in groups if by_hand]
+    return tuple((times[0] - period, times[-1]) for times in driven)
 
 
 def _after_the_hold(states: list[PlantState]) -> list[PlantState]:

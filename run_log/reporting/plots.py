@@ -109,8 +109,16 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float,
     ax.plot([], [], " ", label=f"{inside}\nat samples")
 
 
+def _mark_by_hand(data: Traces, ax: Axes) -> None:
+    """Where a person drove the input."""
+    for i, (began, ended) in enumerate(data.motion.by_hand):
+        label = "by hand" if i == 0 else "_nolegend_"
+        ax.axvspan(began, ended, color=GREEN, alpha=0.12, linewidth=0, label=label)
+
+
 def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
+    _mark_by_hand(data, ax)
     x = motion.x[:, i]
     # A plant that starts again jumps, which is no motion.
     later = list(motion.starts[1:])
@@ -126,6 +134,7 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
 
 def _input(data: Traces, j: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
+    _mark_by_hand(data, ax)
     u, applied = data.u[:, j], motion.applied[:, j]
     ax.step(data.t, u, where="post", color=SKY, linewidth=3.0, label="commanded")
     # `applied` is reported at the end of the period over which it is the mean.

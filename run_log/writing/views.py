@@ -122,6 +122,7 @@ SHOWN: dict[type[m.Message], Shown] = {
         _of_hidden_weights,
         {"layer_norms": dict[str, float]},
     ),
+    m.Override: Shown("mode u lease", lambda override: {"u": override.u or None}, {"u": Vector | None}),
     m.CertifiedSets: Shown("kind sha256"),
     m.RunInfo: Shown("process versions seed units unix_time"),
     m.Health: Shown("process status counters note"),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tandem.certificate_authority import Issued
 
-ROLE = "router|plant|controller|trainer|recorder|operator"
+ROLE = "router|plant|controller|trainer|recorder|operator|commander"
 
 
 class Shows(Command):

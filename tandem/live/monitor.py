@@ -82,7 +82,7 @@ class Snapshot:
     states: tuple[Gauge, ...] = ()
     inputs: tuple[Gauge, ...] = ()
     source: str = ""
-    """What drives the plant: hold, command, plan, safe."""
+    """What drives the plant: hold, command, plan, safe, manual."""
     ticks: int = 0
     measured_rate: float | None = None
     late: int = 0
@@ -147,6 +147,8 @@ class Monitor:
         self._health: dict[str, tuple[m.Health, float]] = {}
         """By process: the newest, and when it came."""
         self._ended: set[str] = set()
+        self._asked_by = ""
+        """Who said last where to go: who says it again renews a lease."""
         self._tick_times: deque[float] = deque(maxlen=RECENT_TICKS)
         self._solve_ms: deque[float] = deque(maxlen=RECENT_TICKS)
         self._tick_ms: deque[float] = deque(maxlen=RECENT_TICKS)
@@ -187,7 +189,7 @@ class Monitor:
                 self.say(f"{error}; not obeyed", now, "bad")
             return
         follower = self._followers.setdefault(topic.name, Follower(self.config.bus.follow_silence))
-        verdict = follower.accept(message.run_id, message.seq, now)
+        verdict = "ok" if topic.shared else follower.accept(message.run_id, message.seq, now)
         if verdict == "ok":
             self._take(message, now)
         else:
@@ -199,12 +201,14 @@ class Monitor:
             case m.PlantState():
                 if text := self._plant.came(message.run_id, now):
                     self.say(text, now, "good")
+                self._take_source(message, now)
                 self._x, seen.source = message.x, message.source
             case m.Command():
                 if self.first_command is None:
                     self.first_command = now
                     self.say("the first command: the run begins", now)
-                self._u = message.u
+                if seen.source != "manual":
+                    self._u = message.u
             case m.Tick():
                 if not seen.ticks:
                     self._first_slot = message.slot
@@ -222,6 +226,16 @@ class Monitor:
                 seen.loss, seen.samples = (message.loss_before, message.loss_after), message.samples
             case m.Health():
                 self._take_health(message, now)
+
+    def _take_source(self, state: m.PlantState, now: float) -> None:
+        """Say where a person took over, and where they gave back or it was taken from them."""
+        before = self._seen.source
+        if before and (state.source == "manual") != (before == "manual"):
+            by_hand = state.source == "manual"
+            what = "driven by hand" if by_hand else f"no longer driven by hand: {state.source}"
+            self.say(f"the plant is {what}", now, "note" if by_hand else "good")
+        if state.source == "manual":
+            self._u = state.pieces[-1].u if state.pieces else state.applied
 
     def miss_plant(self, now: float) -> None:
         """Say it, once, when a plant that was there is silent."""
@@ -242,9 +256,11 @@ class Monitor:
         self._take_margin(result, now)
         self._take_faults(result, now)
         seen.reference, seen.target_status = result.reference, result.target_status
-        if result.reference_verdict != "none":
-            taken = result.reference_verdict == "taken"
+        taken = result.reference_verdict == "taken"
+        again = taken and result.reference_from == self._asked_by
+        if result.reference_verdict != "none" and not again:
             self.say(f"{tick} reference {result.reference_verdict}", now, "good" if taken else "bad")
+        self._asked_by = result.reference_from or self._asked_by
         if result.weight:
             self._take_weight(max(result.weight + result.constant_weight), tick, now)
         seen.weights_version = result.hidden_version

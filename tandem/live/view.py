@@ -215,6 +215,7 @@ def _loop(now: Snapshot) -> Table:
         "command": "follows commands",
         "plan": Text("follows the last plan", "bold yellow"),
         "safe": Text("its own safe input", "bold red"),
+        "manual": Text("driven by hand", "bold yellow"),
     }
     mode = now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"
     slack = f"{now.slack:.1e} {now.slack_row}" if now.slack else "none"

@@ -15,7 +15,7 @@ from protocol.topics import Topic
 from tests.helpers.paths import DOCS
 
 PAGE = (DOCS / "gateway.md").read_text(encoding="utf-8")
-SHOWN = (m.PlantState, m.Piece, m.Command, m.Backup, m.Health)
+SHOWN = (m.PlantState, m.Piece, m.Command, m.Backup, m.Override, m.Health)
 
 
 def table(heading: str) -> list[list[str]]:
@@ -37,6 +37,8 @@ def on_the_wire(kind: inspect.Type) -> str:
             return "str"
         case inspect.StrType(min_length=least, max_length=most):
             return f"str, {least} to {most} characters"
+        case inspect.FloatType(gt=above, le=most) if above is not None and most is not None:
+            return f"float, more than {above:g}, {most:g} at most"
         case inspect.IntType(ge=least) | inspect.FloatType(ge=least):
             name = "int" if isinstance(kind, inspect.IntType) else "float"
             return name if least is None else f"{name}, {least:g} or more"
@@ -58,7 +60,8 @@ def type_of(field: msgspec.structs.FieldInfo) -> str:
         quoted = [f'"{value}"' for value in values]
         return f"{', '.join(quoted[:-1])} or {quoted[-1]}"
     text = on_the_wire(inspect.type_info(field.type))
-    return text if field.required else f"{text}; may be left out: empty"
+    default = "empty" if field.default in (msgspec.NODEFAULT, []) else f"{field.default:g}"
+    return text if field.required else f"{text}; may be left out: {default}"
 
 
 @pytest.mark.parametrize("message", SHOWN, ids=lambda message: message.__name__)

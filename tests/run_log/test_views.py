@@ -61,6 +61,8 @@ def messages() -> list[tuple[Topic, m.Message]]:
         (topics.SAMPLES, m.Samples(**who, samples=[])),
         (topics.OUTPUT_WEIGHTS, m.OutputWeights(**who, hidden_version=3, hidden_sha256="ef", K=K)),
         (topics.HIDDEN_WEIGHTS, weights),
+        (topics.OVERRIDE, m.Override(run_id="h-1", seq=0, mode="manual", u=u, lease=1.5)),
+        (topics.OVERRIDE, m.Override(run_id="h-1", seq=1, mode="auto")),
         (topics.SETS, m.CertifiedSets(**who, kind="invariant", sha256="01", content=b"x")),
         *(
             (topic, m.RunInfo(

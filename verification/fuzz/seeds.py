@@ -107,6 +107,8 @@ def seeds() -> dict[str, list[bytes]]:
     said(
         topics.SETS, m.CertifiedSets(run_id="controller-1", seq=0, kind="box", sha256="0" * 64, content=b"{}")
     )
+    said(topics.OVERRIDE, m.Override(run_id="commander-1", seq=0, mode="manual", u=[1.2], lease=1.0))
+    said(topics.OVERRIDE, m.Override(run_id="commander-1", seq=1, mode="auto"))
     for process in topics.PROCESSES:
         said(topics.RUN_INFO[process], run_info(settings, process, f"{process}-1", {"z": "1"}))
         health = m.Health(

@@ -28,6 +28,8 @@ from node_runtime.config.loading import from_json, from_tree, to_json, to_toml
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.rejected import RejectedMessages
+from plant_sim.hand import Hand
+from plant_sim.way_back import WayBack
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.codec import BadMessage
@@ -85,6 +87,7 @@ def targets(seed: int, folder: Path) -> list[Target]:
     settings = config()
     core = ControllerCore(settings, "controller-1")
     add("hidden weights: adoption", _adopting(core), payloads[topics.HIDDEN_WEIGHTS.name], 0.5)
+    add("override: at a plant", _driving(core), payloads[topics.OVERRIDE.name], 0.2)
     add("reference: what a plan makes of it", _aiming(core), payloads[topics.REFERENCE.name], 0.2)
     add("keyframe: restored", _restoring(core), payloads[topics.KEYFRAME.name], 0.2)
     add(
@@ -157,6 +160,29 @@ def _adopting(core: ControllerCore) -> Read:
         assert seen.hidden is not None
         _, verdict = core.controller.oracle.adopt(before.oracle, seen.hidden)
         return ACCEPTED[0] if verdict.outcome == "adopted" else _kind(verdict.reason)
+
+    return read
+
+
+def _driving(core: ControllerCore) -> Read:
+    """From the bus to the input of a plant, over the sample behind it."""
+    plant, period = core.plant, core.config.period
+    way_back = WayBack(core.controller.model, core.config.controller.backup.margin, 60)
+
+    def read(payload: bytes) -> str:
+        try:
+            override = codec.decode(topics.OVERRIDE, payload)
+            codec.check_dimensions(topics.OVERRIDE, override, plant.d, plant.m)
+        except BadMessage as error:
+            return error.reason
+        assert isinstance(override, m.Override)
+        hand = Hand(plant, way_back)
+        verdict = hand.take(override, 0.0)
+        hand.look(plant.x_e, plant.u_e)
+        u = hand.input(period)
+        if u is not None:
+            assert ((u >= plant.u_min) & (u <= plant.u_max)).all(), "outside of U"
+        return ACCEPTED[0] if verdict == "ok" else verdict
 
     return read
 

@@ -28,6 +28,7 @@ from node_runtime.realtime.scheduling import one_blas_thread
 from plant_sim.sensors import Sensors
 from plant_sim.shield import measurement
 from plant_sim.simulator import PlantSim
+from plant_sim.way_back import WayBack
 from protocol import messages as m
 from protocol import topics
 from protocol.topics import Topic
@@ -41,6 +42,7 @@ Progress = Callable[[int], None]
 NO_FAULTS = Faults()
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
 COMMANDER = "commander-simulated"
+LEASE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,12 @@ class LockStep:
         self.motion = self._motion(self.true)
         self.dead_time = true_dead_time(config, self.core.plant, self.true)
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
+        settings = config.controller
+        self.way_back = WayBack(self.core.controller.model, settings.backup.margin, settings.horizon)
+        self.by_hand: m.Override | None = None
+        self.intentions = 0
+        self.acting = self.core.plant.safe_input
+        """The input, (m,), that the last step gave the plant."""
         self.plant = self._started_plant(initial_state(config, self.core.plant))
         self.changes = self._changes()
         self.sensors = Sensors(config, self.core.plant)
@@ -184,7 +192,8 @@ class LockStep:
     def _started_plant(self, x0: np.ndarray) -> PlantSim:
         run_id = PLANT if self.episode == 1 else f"{PLANT}-{self.episode}"
         plant, patience = self.core.plant, self.config.plant.plan_patience
-        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id, self.dead_time)
+        dead_time, way_back = self.dead_time, self.way_back
+        return PlantSim(plant, self.motion, self.config.period, x0, patience, run_id, dead_time, way_back)
 
     def _changes(self) -> list[tuple[float, Plant]]:
         if self.faults.drift is None:
@@ -221,6 +230,39 @@ class LockStep:
         run = gather(self.config, log)
         run.plant, run.truth, run.files = self.core.plant, self.true, files_of(self.config)
         return run
+
+    def manual(self, u: np.ndarray) -> None:
+        """From the next sample on u, (m,), plant units, acts by hand: until `auto`, or until X would be left."""
+        self._intend(m.Override(run_id=self._intention(), seq=0, mode="manual", u=u.tolist(), lease=LEASE_S))
+
+    def auto(self) -> None:
+        """From the next sample on the controller's commands act again."""
+        self._intend(m.Override(run_id=self._intention(), seq=0, mode="auto"))
+
+    def _intention(self) -> str:
+        self.intentions += 1
+        return f"{COMMANDER}-hand-{self.intentions}"
+
+    def _intend(self, override: m.Override) -> None:
+        self._say(override, self.taken * self.config.period)
+        self.by_hand = override if override.mode == "manual" else None
+
+    def _say(self, override: m.Override, t: float) -> None:
+        self.plant.override(override, t)
+        self._note(topics.OVERRIDE, override, self.taken)
+
+    def _renew_the_lease(self, t: float) -> None:
+        """In time for the period from t on; what has ended is said no more."""
+        said = self.by_hand
+        if said is None:
+            return
+        if not self.plant.hand.acts:
+            self.by_hand = None
+            return
+        while self.plant.hand.until <= t + self.config.period:
+            said = msgspec.structs.replace(said, seq=said.seq + 1)
+            self._say(said, self.plant.hand.until - LEASE_S / 2.0)
+        self.by_hand = said
 
     def start_again(self, lost: bool = False) -> None:
         """Another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
@@ -267,6 +309,7 @@ class LockStep:
             self.plant = self._started_plant(x)
         t = seq * self.config.period
         true = self.plant.sample(t)
+        self._renew_the_lease(t)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             now = self.changes.pop(0)[1]
@@ -301,6 +344,8 @@ class LockStep:
             state_age_ms=(stepped - started) * 1e3,
         )
         self.plant.command(outputs.command, t + self.faults.command_seconds)
+        by_hand = self.plant.hand.input(t) is not None
+        self.acting = self.plant.acting if by_hand else np.array(outputs.command.u)
         for topic, message in (
             (topics.TICK, tick),
             (topics.COMMAND, outputs.command),

@@ -247,6 +247,8 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "W",
         "Q",
         "R",
+        "S",
+        "input_rate_max",
         "x0",
         "x_e",
         "u_e",

@@ -283,6 +283,9 @@ FOREIGN = [
         ("controller", topics.PLANT_STATE),
         ("recorder", topics.HIDDEN_WEIGHTS),
         ("operator", topics.COMMAND),
+        ("operator", topics.OVERRIDE),
+        ("operator", topics.REFERENCE),
+        ("commander", topics.COMMAND),
         ("nobody", topics.HIDDEN_WEIGHTS),
         ("neighbour", topics.HIDDEN_WEIGHTS),
     ]

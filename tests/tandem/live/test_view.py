@@ -399,3 +399,18 @@ def test_a_state_without_bounds_has_an_axis_as_long_as_its_scale() -> None:
     push = monitor.snapshot(START).inputs[0]
     assert view._bar(push, 41).plain[0] == "├"
     assert view._bar(push, 41).plain[-1] == "╌"
+
+
+def test_who_drives_by_hand_is_said_when_it_begins_and_when_it_ends() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    for k, source in enumerate(["command", "manual", "manual", "plan"]):
+        driven = msgspec.structs.replace(state(k), source=source, applied=[1.5 + k])
+        seen.feed(delivery(topics.PLANT_STATE, driven, START + k))
+        seen.feed(delivery(topics.COMMAND, command(k), START + k))
+        now = seen.snapshot(START + k)
+        # What is shown of the input is what acts.
+        assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
+    assert [event.text for event in now.events if "hand" in event.text] == [
+        "the plant is driven by hand",
+        "the plant is no longer driven by hand: plan",
+    ]

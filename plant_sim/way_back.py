@@ -1,0 +1,98 @@
+"""Whether a plant under an input by hand can still be brought back inside X, one period later.
+
+A gateway knows the linear model and no h. So of the state after one more period under u it asks whether the feedback of
+the model, clipped to U and to the inputs' rates, keeps what the model predicts in X from there on,
+
+    z_1 = A x + B u,    v_i = clip(K z_i, U and the rate after v_{i-1}),    z_{i+1} = A z_i + B v_i,
+    z_i in (1 - margin_i) X - (A + BK)^{i-1} W                                            i = 1 .. N,
+
+where W is what the model may miss in that one period, and margin_i grows to the margin of the backup policy. Who takes
+over then, a controller that sees the state and has learned h, can do no worse by this model than K does. What h does on
+the way back itself is in the margin alone, and asked anew at the next sample.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lbmpc.model import Model, ModelError, build_model
+from lbmpc.plants import Known, Plant
+from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
+
+RAMP = 4
+"""Steps over which the margin grows, as that of `lbmpc.controller.backup_policy` does."""
+
+
+class Ahead(NamedTuple):
+    """Where the model expects the plant, in deviations, and by how much each state may be elsewhere: (d,) both."""
+
+    z: np.ndarray
+    spread: np.ndarray
+
+
+class WayBack:
+    """For one plant; it keeps nothing.
+
+    Args:
+        model: of the plant, at its period.
+        margin: by how much X shrinks, as a share of its half-widths.
+        steps: N, how far it is followed.
+    """
+
+    def __init__(self, model: Model, margin: float, steps: int):
+        self._model = model
+        plant = model.plant
+        self._w = plant.W * model.period
+        self._absolute = np.abs(model.A)
+        shares = np.minimum(np.arange(1, steps + 1) / RAMP, 1.0)[:, None]
+        inside = margin * shares * plant.x_scale
+        self._low, self._high = plant.x_min - plant.x_e + inside, plant.x_max - plant.x_e - inside
+        self._u_low, self._u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
+        self._step = plant.input_rates * model.period
+        powers = [np.eye(model.d)]
+        for _ in range(steps - 1):
+            powers.append(model.closed_loop @ powers[-1])
+        self._spread = np.abs(np.array(powers))
+
+    def of(self, x: np.ndarray) -> Ahead:
+        """Where a measured state, (d,), is."""
+        return Ahead(x - self._model.plant.x_e, np.zeros(self._model.d))
+
+    def after(self, now: Ahead, u: np.ndarray) -> Ahead:
+        """A period later, under the input u, (m,)."""
+        model = self._model
+        return Ahead(model.step(now.z, u - model.plant.u_e), self._absolute @ now.spread + self._w)
+
+    def reached(self, acting: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """The input, (m,), that acts in the next period where `wanted` is asked for: as far as its rate allows."""
+        return np.minimum(np.maximum(wanted, acting - self._step), acting + self._step)
+
+    def lost(self, there: Ahead, u: np.ndarray) -> str:
+        """What leaves X on the way back from there, after the input u, (m,), for a person; empty where nothing does."""
+        model, z, v = self._model, there.z, u - self._model.plant.u_e
+        with np.errstate(over="ignore", invalid="ignore"):
+            beside = self._spread @ there.spread
+            low, high = self._low + beside, self._high - beside
+            for i in range(len(low)):
+                # A number that is none is not inside.
+                inside = (z >= low[i]) & (z <= high[i])
+                if not inside.all():
+                    state = model.plant.states[int(np.argmin(inside))]
+                    return f"{state} would leave X within {(i + 1) * model.period:.3g} s"
+                v = self.reached(v, np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high))
+                z = model.step(z, v)
+        return ""
+
+
+def way_back_of(config: Config, plant: Known | Plant) -> WayBack:
+    """That of the configured controller's model. Raises `ConfigError`: there is no such model."""
+    settings = config.controller
+    Q, R = (None if weights is None else np.array(weights) for weights in (settings.Q, settings.R))
+    try:
+        model = build_model(plant, config.period, Q, R, settings.terminal)
+    except ModelError as error:
+        raise ConfigError(f"controller: {error}") from error
+    return WayBack(model, settings.backup.margin, settings.horizon)

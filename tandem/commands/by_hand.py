@@ -1,0 +1,235 @@
+"""`tandem manual`, `tandem pause` and `tandem auto`: a hand on the switch of a plant that runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from tandem import terminal
+from tandem.commands.base import Configured
+
+if TYPE_CHECKING:
+    import threading
+
+    from lbmpc.plants import Description
+    from node_runtime.config.sections import Config
+    from protocol.messages import Override, Reference
+    from tandem.commander import Commander
+    from tandem.hand_session import Follower
+
+RENEWALS = 3
+"""Of a lease: two may be lost."""
+HEARD_S, HEARD_PERIODS = 2.0, 4.0
+HEALTH_S = 0.7
+"""A little more than from one health to the next."""
+LOOK_S = 0.1
+LAST_WORDS = 3
+"""How often what ends something is said: the control lane drops what finds no room."""
+LONGEST_S = 1e8
+ENDED = 1
+
+
+@contextmanager
+def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
+    """A commander, and what Ctrl-C sets. Raises as `tandem.commander.commanding`."""
+    from node_runtime.lifecycle import stopped_by_signals
+    from protocol import topics
+    from tandem.commander import commanding
+
+    heard = (
+        *(topics.PLANT_STATE, topics.RESULT, topics.HEALTH["plant"]),
+        *(topics.OVERRIDE, topics.REFERENCE),
+    )
+    with stopped_by_signals() as stopping, commanding(config, *heard) as commander:
+        yield commander, stopping
+
+
+def say(commander: Commander, word: Override | Reference, again: bool = False) -> None:
+    """Once; again: by the number of what was said last."""
+    from protocol import messages, topics
+
+    topic = topics.OVERRIDE if isinstance(word, messages.Override) else topics.REFERENCE
+    (commander.say_again if again else commander.say)(topic, word)
+
+
+def say_last(commander: Commander, word: Override | Reference) -> None:
+    """What ends something: more than once, in little time."""
+    from node_runtime.realtime import clock
+
+    for i in range(LAST_WORDS):
+        say(commander, word, again=i > 0)
+        clock.sleep_until(clock.now() + LOOK_S)
+
+
+def patience(config: Config) -> float:
+    """Seconds in which a plant says what acts."""
+    return max(HEARD_S, HEARD_PERIODS * config.period)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByHand(Configured):
+    """A command that stays in the foreground while what it says counts."""
+
+    seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="(default: until Ctrl-C)")] = None
+    """For how long."""
+
+    def run(self) -> int:
+        config, plant = self.resolve_with_plant()
+        if self.seconds is not None:
+            terminal.limited("--seconds", self.seconds, 0.0, LONGEST_S)
+        self._check(plant)
+        with on_the_bus(config) as (commander, stopping):
+            return self._command(config, plant, commander, stopping)
+
+    def _check(self, plant: Description) -> None:
+        """Raises `Refused` for what needs nobody to be seen as wrong."""
+
+    def _command(
+        self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
+    ) -> int:
+        raise NotImplementedError
+
+    def _stay(
+        self,
+        config: Config,
+        plant: Description,
+        commander: Commander,
+        stopping: threading.Event,
+        word: Override | Reference,
+        follower: Follower,
+    ) -> str:
+        """Say it again and again until something ends it: why, or "" where the person did."""
+        from node_runtime.realtime import clock
+        from tandem.hand_session import lease_of, line
+
+        began = clock.now()
+        every, limit = lease_of(config.period) / RENEWALS, patience(config)
+        end = math.inf if self.seconds is None else began + self.seconds
+        said = shown = -math.inf
+        while not stopping.is_set() and (now := clock.now()) < end:
+            if now - said >= every:
+                # Number 0 begins it, and is said until it is taken; those behind it only renew.
+                say(commander, word, again=not follower.begun)
+                follower.said()
+                said = now
+            heard = commander.hear(min(said + every - now, end - now, LOOK_S))
+            why = "" if heard is None else follower.take(heard)
+            if not why and not follower.begun and now - began > limit:
+                why = "nobody took it"
+            if why:
+                return self._reason(commander, follower, why)
+            if follower.state is not None and now - shown >= 1.0:
+                self.say(line(follower.state, plant, now - began))
+                shown = now
+        return ""
+
+    def _reason(self, commander: Commander, follower: Follower, why: str) -> str:
+        """As the plant says it, where it is the plant that ended it: in its next health."""
+        from node_runtime.realtime import clock
+
+        end = clock.now() + HEALTH_S
+        while follower.mine and not follower.told and (left := end - clock.now()) > 0.0:
+            heard = commander.hear(left)
+            if heard is not None:
+                follower.take(heard)
+        return follower.told or why if follower.mine else why
+
+    def _ended(self, why: str, what: str) -> int:
+        self.say(f"no longer {what}: {why}" if why else "given back", style="yellow" if why else None)
+        self.emit({"ended": why or "given back"})
+        return ENDED if why else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manual(ByHand):
+    """Drive a running plant's input by hand, until Ctrl-C or until the plant would leave X. The controller learns on,
+    and takes over then. With certificates it needs the commander's."""
+
+    inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]
+    """u=1.2, in the plant's own units; inputs that are not named stay what they are."""
+
+    def _check(self, plant: Description) -> None:
+        from tandem.hand_session import assignments
+
+        assignments(self.inputs, plant)
+
+    def _command(
+        self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
+    ) -> int:
+        from node_runtime.realtime import clock
+        from protocol.messages import Override
+        from tandem.hand_session import Follower, acting, assignments, completed, figures, lease_of
+
+        named = assignments(self.inputs, plant)
+        follower, end = Follower(commander.run_id, Override), clock.now() + patience(config)
+        while follower.state is None and (left := end - clock.now()) > 0.0:
+            heard = commander.hear(left)
+            if heard is not None:
+                follower.take(heard)
+        if follower.state is None:
+            raise terminal.Refused(f"no plant of {config.name} says anything at {config.bus.endpoint}")
+        u = completed(named, plant, acting(follower.state))
+        word = Override(
+            run_id=commander.run_id, seq=0, mode="manual", u=u.tolist(), lease=lease_of(config.period)
+        )
+        self.say(f"by hand: {figures(plant.inputs, u)}; Ctrl-C gives it back")
+        follower.told = ""
+        why = self._stay(config, plant, commander, stopping, word, follower)
+        if not (why and follower.begun):
+            say_last(commander, Override(run_id=commander.run_id, seq=0, mode="auto"))
+        return self._ended(why, "by hand")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pause(ByHand):
+    """Hold a running plant where it is, as far as it can rest there, until Ctrl-C: its controller does it. With
+    certificates it needs the commander's."""
+
+    def _command(
+        self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
+    ) -> int:
+        from protocol.messages import Reference
+        from tandem.hand_session import Follower, lease_of
+
+        word = Reference(run_id=commander.run_id, seq=0, kind="hold", lease=lease_of(config.period))
+        follower = Follower(commander.run_id, Reference)
+        self.say("paused; Ctrl-C goes on")
+        why = self._stay(config, plant, commander, stopping, word, follower)
+        # Where another has said where to go, that counts; who says `auto` leaves this to us.
+        if not follower.elsewhere:
+            say_last(commander, Reference(run_id=commander.run_id, seq=0, kind="configured"))
+        return self._ended(why, "paused")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Auto(Configured):
+    """Give a plant that somebody drives by hand, or has paused, back to its controller. With certificates it needs the
+    commander's."""
+
+    def run(self) -> int:
+        config, _plant = self.resolve_with_plant()
+        from node_runtime.realtime import clock
+        from protocol.messages import Override
+        from tandem.hand_session import Follower
+
+        with on_the_bus(config) as (commander, stopping):
+            say_last(commander, Override(run_id=commander.run_id, seq=0, mode="auto"))
+            follower, source = Follower(commander.run_id, Override), ""
+            end = clock.now() + patience(config)
+            while source in ("", "manual") and not stopping.is_set() and (left := end - clock.now()) > 0.0:
+                heard = commander.hear(min(left, LOOK_S))
+                if heard is not None:
+                    follower.take(heard)
+                    source = "" if follower.state is None else follower.state.source
+        if source in ("", "manual"):
+            why = "the plant is still driven by hand" if source else "no plant says anything"
+            terminal.complain(f"{why} at {config.bus.endpoint}", self.json)
+            return ENDED
+        self.say(f"driven by: {source}")
+        self.emit({"source": source})
+        return 0

@@ -1,0 +1,132 @@
+"""What a person says at the switch, and what the plant and others answer: pure, but for who calls it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lbmpc.plants import Description
+from plant_sim.hand import NO_LONGER
+from protocol import messages as m
+from tandem.terminal import Refused
+
+LEASE_S, LEASE_PERIODS, LONGEST_LEASE_S = 1.0, 3.0, 60.0
+
+
+def lease_of(period: float) -> float:
+    """Seconds for which a word counts in a loop of this period, in seconds."""
+    return min(max(LEASE_S, LEASE_PERIODS * period), LONGEST_LEASE_S)
+
+
+class Follower:
+    """What others say while a person commands.
+
+    Args:
+        run_id: of that person's words.
+        of: what they are, `Override` or `Reference`.
+    """
+
+    def __init__(self, run_id: str, of: type[m.Override] | type[m.Reference]):
+        self._run_id, self._of = run_id, of
+        self._said_at: int | None = None
+        self.state: m.PlantState | None = None
+        """The newest."""
+        self.begun = False
+        """Whether it was taken, by the plant or by its controller."""
+        self.mine = True
+        """Whether nobody else has ended it."""
+        self.elsewhere = False
+        """Whether that was by another reference."""
+        self.told = ""
+        """Why nobody drives the plant by hand any more, as it says."""
+
+    def said(self) -> None:
+        """A word was sent."""
+        if self._said_at is None:
+            self._said_at = -1 if self.state is None else self.state.seq
+
+    def take(self, message: m.Message) -> str:
+        """Take note; why the person's word counts no more, or ""."""
+        if message.run_id == self._run_id:
+            return ""
+        match message:
+            case m.PlantState():
+                return self._take_state(message)
+            case m.TickResult() if message.reference_from == self._run_id:
+                self.begun = message.reference_verdict == "taken"
+                return "" if self.begun else f"the controller {message.reference_verdict}"
+            case m.Health():
+                self.told = message.note.partition(NO_LONGER)[2]
+            case m.Override(mode="auto", seq=0) if self._said_at is not None:
+                return self._lost(f"{message.run_id} gave it back to the controller")
+            case m.Override(mode="manual", seq=0) if self._said_at is not None and self._of is m.Override:
+                return self._lost(f"{message.run_id} took over")
+            case m.Reference() if self._said_at is not None and self._of is m.Reference:
+                self.elsewhere = True
+                return self._lost(f"{message.run_id} said where to go")
+        return ""
+
+    def _lost(self, why: str) -> str:
+        self.mine = False
+        return why
+
+    def _take_state(self, state: m.PlantState) -> str:
+        before, self.state = self.state, state
+        if self._said_at is None or self._of is m.Reference:
+            return ""
+        if before is not None and state.run_id != before.run_id:
+            return "the gateway was started again"
+        by_hand = state.source == "manual"
+        if self.begun and not by_hand:
+            return "the plant is not driven by hand any more"
+        # What is said after one sample acts from the next one on, and the one behind that says so.
+        self.begun = self.begun or (by_hand and state.seq > self._said_at + 1)
+        return ""
+
+
+def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
+    """`u=1.2` and so on, by input. Raises `Refused`."""
+    given: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in plant.inputs:
+            known = ", ".join(plant.inputs)
+            raise Refused(f"{text}: {plant.name} has no input {name!r}; it has {known}")
+        try:
+            given[name] = float(value)
+        except ValueError:
+            raise Refused(f"{text}: write {name}=VALUE, with a number") from None
+        if not math.isfinite(given[name]):
+            raise Refused(f"{text}: a finite number is needed")
+    return given
+
+
+def acting(state: m.PlantState) -> list[float] | None:
+    """The input that acts at a sample, (m,); None where that is not known."""
+    return state.pieces[-1].u if state.pieces else state.applied
+
+
+def completed(named: Mapping[str, float], plant: Description, acts: Sequence[float] | None) -> np.ndarray:
+    """The whole input, (m,), with those that are not named as they are. Raises `Refused`: that is not known."""
+    others = [name for name in plant.inputs if name not in named]
+    if others and acts is None:
+        raise Refused(f"it is not known what acts now: name {', '.join(others)} too")
+    now = dict(zip(plant.inputs, acts or (), strict=False))
+    return np.array([named[name] if name in named else now[name] for name in plant.inputs])
+
+
+def figures(names: Sequence[str], values: Sequence[float] | np.ndarray) -> str:
+    """z 0.5000  y 1.6070"""
+    return "  ".join(f"{name} {value:.4f}" for name, value in zip(names, values, strict=True))
+
+
+def line(state: m.PlantState, plant: Description, seconds: float) -> str:
+    """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
+    x, acts = np.array(state.x), acting(state)
+    room = np.minimum(x - plant.x_min, plant.x_max - x) / plant.x_scale
+    least = int(np.argmin(room))
+    u = "not known" if acts is None else figures(plant.inputs, acts)
+    margin = f"margin {room[least]:.3f} ({plant.states[least]})"
+    return f"{seconds:6.1f} s  {state.source:7}  {figures(plant.states, x)}  |  {u}  |  {margin}"

@@ -1,0 +1,286 @@
+"""A hand on the switch: what it takes to begin, what ends it, and that the plant stays in X; no clock, no process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lbmpc.plants import Known
+from node_runtime.config.sections import Config
+from plant_sim.shield import Shield
+from plant_sim.simulator import Motion
+from plant_sim.way_back import way_back_of
+from protocol import messages as m
+
+PERIOD = 0.05
+CART = Known.from_matrices(
+    [[0.0, 1.0], [0.0, 0.0]],
+    [[0.0, 0.0], [1.0, 0.5]],
+    name="cart",
+    states=("place", "speed"),
+    inputs=("pull", "push"),
+    W=[0.01, 0.05],
+    x_min=[-1.0, -1.0],
+    x_max=[1.0, 1.0],
+    u_min=[-1.0, -1.0],
+    u_max=[1.0, 1.0],
+)
+"""It goes on by itself: without a way back in time it leaves X."""
+WAY_BACK = way_back_of(Config(rate=1.0 / PERIOD), CART)
+
+
+class Cart:
+    """Behind the rules, in virtual time; who commands it wants `commanded`."""
+
+    def __init__(self, x0: tuple[float, float] = (0.0, 0.0), way_back: object = WAY_BACK):
+        self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)  # type: ignore[arg-type]
+        self.motion = Motion(_Exactly(), np.array(x0), PERIOD)
+        self.k = -1
+        self.commanded: list[float] | None = [0.0, 0.0]
+        self.blind = False
+
+    def next(self, periods: int = 1) -> m.PlantState:
+        """The samples of so many periods, each with its command; the last."""
+        for _ in range(periods):
+            self.k += 1
+            t = self.k * PERIOD
+            self.shield.advance(t, self.motion)
+            x = self.motion.read(t)
+            state = self.shield.sample(t, x)
+            self.shield.renew(t, None if self.blind else x, self.motion)
+            if self.commanded is not None:
+                self.shield.command(_command(self.k, self.commanded), t)
+        return state
+
+    def say(self, run_id: str, seq: int, u: float | None = 0.4, lease: float = 1.0) -> str:
+        """A word that arrives in the middle of the period; u None: auto."""
+        both = [] if u is None else [u, 0.0]
+        word = m.Override(run_id=run_id, seq=seq, mode="auto" if u is None else "manual", u=both, lease=lease)
+        return self.shield.override(word, (self.k + 0.5) * PERIOD)
+
+
+class _Exactly:
+    """As the model says."""
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        push = CART.B[1] @ u
+        return np.array([x[0] + dt * x[1] + 0.5 * dt**2 * push, x[1] + dt * push])
+
+
+def _command(seq: int, u: list[float]) -> m.Command:
+    who = {"run_id": "controller-a", "seq": seq, "state_run_id": "plant-a", "state_seq": seq}
+    return m.Command(**who, period=PERIOD, mode="solver", u=u, plan=[u] * 3)  # type: ignore[arg-type]
+
+
+def test_it_acts_from_the_next_sample_on_and_when_it_is_given_back_the_newest_command() -> None:
+    cart = Cart()
+    cart.next(3)
+    assert cart.say("a", 0) == "ok"
+    first, second = cart.next(), cart.next()
+    assert (first.source, second.source, second.applied) == ("command", "manual", [0.4, 0.0])
+    cart.commanded = [-0.2, 0.1]
+    cart.next(2)
+    assert cart.say("a", 1, None) == "ok"
+    last = cart.next()
+    # What was commanded meanwhile acts at once, and is known to be the last.
+    assert [piece.u for piece in last.pieces] == [[0.4, 0.0], [-0.2, 0.1]]
+    after = cart.next()
+    assert (last.source, after.source, after.applied) == ("command", "command", [-0.2, 0.1])
+    assert (after.command_seq, cart.shield.hand.ended) == (cart.k - 1, "")
+
+
+def test_what_is_beyond_the_actuator_is_clipped() -> None:
+    cart = Cart()
+    cart.next(2)
+    cart.say("a", 0, 99.0)
+    assert cart.next(2).applied == [1.0, 0.0]
+
+
+def test_it_ends_with_its_lease_to_the_moment_and_does_not_come_back() -> None:
+    cart = Cart()
+    cart.next(2)
+    cart.say("a", 0, lease=2.25 * PERIOD)
+    for seq in (1, 1, 2):
+        cart.next()
+        assert cart.say("a", seq, lease=2.25 * PERIOD) == "ok"
+    cart.next(2)
+    state = cart.next()
+    assert [(round(piece.seconds / PERIOD, 6), piece.u[0]) for piece in state.pieces] == [
+        (0.75, 0.4),
+        (0.25, 0.0),
+    ]
+    assert cart.shield.hand.ended == "the lease is over"
+    assert cart.say("a", 3) == "ended"
+    assert cart.say("b", 0) == "ok"
+    assert cart.next(2).source == "manual"
+
+
+def test_the_last_who_says_something_has_it() -> None:
+    cart = Cart()
+    cart.next(2)
+    assert cart.say("a", 0, 0.4) == "ok"
+    cart.next()
+    assert cart.say("b", 0, -0.4) == "ok"
+    # Who was there before only renews what is over.
+    assert [cart.say("a", 1, 0.4), cart.say("a", 2, None), cart.say("b", 1, -0.4)] == ["ended", "ended", "ok"]
+    cart.next()
+    assert (cart.next().applied, cart.shield.hand.run_id) == ([-0.4, 0.0], "b")
+    assert (cart.say("b", 0, 0.4), cart.say("c", 0, None)) == ("out of order", "ok")
+    assert cart.say("b", 2) == "ended"
+    assert cart.next().source == "command"
+    assert cart.shield.hand.ended == "c gave it back"
+
+
+def test_a_gateway_that_was_started_again_takes_no_renewals() -> None:
+    cart = Cart()
+    cart.next(2)
+    assert cart.say("a", 7) == "ended"
+    assert cart.next(2).source == "command"
+
+
+def test_a_new_origin_ends_it() -> None:
+    cart = Cart()
+    cart.next(2)
+    cart.say("a", 0)
+    cart.next(2)
+    cart.shield.jump()
+    cart.next()
+    assert cart.shield.hand.ended == "the state is another one"
+    assert cart.next().source != "manual"
+
+
+def test_without_a_controller_it_works_alone_and_the_safe_input_follows() -> None:
+    cart = Cart()
+    cart.commanded = None
+    cart.next(2)
+    cart.say("a", 0)
+    states = [cart.next() for _ in range(3)]
+    assert [state.source for state in states] == ["hold", "manual", "manual"]
+    cart.say("a", 1, None)
+    cart.next()
+    assert cart.next().source == "safe"
+
+
+def test_between_controller_and_safe_input_the_plan_is_taken_up_where_it_is() -> None:
+    cart = Cart()
+    cart.next(3)
+    cart.commanded = None
+    cart.say("a", 0)
+    cart.next(2)
+    cart.say("a", 1, None)
+    assert [cart.next().source for _ in range(3)] == ["plan", "safe", "safe"]
+
+
+@pytest.mark.parametrize("u", [1.0, -1.0, 0.3])
+def test_where_x_would_be_left_the_controller_has_it_in_time(u: float) -> None:
+    cart = Cart((0.2, 0.0))
+    cart.next(2)
+    cart.say("a", 0, u)
+    seq, farthest = 0, 0.0
+    while cart.shield.hand.acts:
+        seq += 1
+        x = np.array(cart.next().x)
+        cart.commanded = _braking(x)
+        cart.say("a", seq, u)
+        assert cart.k < 500
+    assert "would leave X within" in cart.shield.hand.ended
+    # Repeated as it is, it does not come back; the controller brakes, and needs what there was left.
+    for _ in range(100):
+        seq += 1
+        assert cart.say("a", seq, u) == "ended"
+        x = np.array(cart.next().x)
+        cart.commanded = _braking(x)
+        farthest = max(farthest, float(np.abs(x).max()))
+    assert 0.5 < farthest < 1.0
+
+
+def test_an_input_that_keeps_x_for_ever_is_not_ended() -> None:
+    cart = Cart((0.2, 0.0))
+    cart.next(2)
+    cart.say("a", 0, 0.0)
+    for seq in range(1, 300):
+        cart.say("a", seq, 0.0)
+        cart.next()
+    assert cart.shield.hand.acts
+
+
+def test_what_is_not_measured_is_predicted_for_as_long_as_that_is_worth_something() -> None:
+    cart = Cart()
+    cart.next(2)
+    cart.blind = True
+    cart.say("a", 0, 0.0)
+    cart.next()
+    assert cart.shield.hand.ended == "the state is not measured"
+    cart.blind = False
+    cart.say("b", 0, 0.0)
+    cart.next()
+    cart.blind = True
+    blind = 0
+    while cart.shield.hand.acts:
+        blind += 1
+        cart.say("b", blind, 0.0)
+        cart.next()
+    # W is half a per cent of X a period in one state and adds up in the other.
+    assert 10 < blind < 500
+    assert "would leave X" in cart.shield.hand.ended
+
+
+def test_a_plant_without_a_model_is_not_driven_by_hand() -> None:
+    cart = Cart(way_back=None)
+    cart.next(2)
+    assert cart.say("a", 0) == "no model"
+    assert cart.next(2).source == "command"
+
+
+def test_the_way_back_is_asked_of_numbers_that_are_none() -> None:
+    beyond = WAY_BACK.of(np.array([1e308, 1e308]))
+    u = np.array([1e308, 1e308])
+    assert WAY_BACK.lost(WAY_BACK.after(beyond, u), u)
+    far = replace(CART, x_min=[-np.inf, -np.inf], x_max=[np.inf, np.inf], scale={"place": 1.0, "speed": 1.0})
+    free = way_back_of(Config(rate=1.0 / PERIOD), far)
+    u = np.array([1.0, 1.0])
+    assert not free.lost(free.after(free.of(np.array([5.0, 3.0])), u), u)
+
+
+def test_a_slow_actuator_needs_a_longer_way_back() -> None:
+    ends = []
+    for rate in (np.inf, 1.0):
+        slow = replace(CART, u_rate_max=[rate, rate])
+        shield = Shield(slow, PERIOD, 1.25, "plant-a", True, way_back_of(Config(rate=1.0 / PERIOD), slow))
+        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD)
+        for k in range(200):
+            shield.advance(k * PERIOD, motion)
+            x = motion.read(k * PERIOD)
+            shield.sample(k * PERIOD, x)
+            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.3, 0.0])
+            if shield.override(word, k * PERIOD) == "ended":
+                break
+            shield.renew(k * PERIOD, x, motion)
+        ends.append(float(x[0]))
+    assert ends[1] < ends[0] - 0.05
+
+
+def _braking(x: np.ndarray) -> list[float]:
+    """What a controller does: to rest at the middle, within its range."""
+    wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))
+    return [wanted, wanted]
+
+
+def test_what_is_on_its_way_through_a_dead_time_counts() -> None:
+    """At full speed towards the edge the way back is shorter by the way of two periods and a half."""
+    ends = []
+    for dead_time in (0.0, 2.5 * PERIOD):
+        shield = Shield(replace(CART, dead_time=dead_time), PERIOD, 1.25, "plant-a", True, WAY_BACK)
+        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD, dead_time, np.zeros(2))
+        for k in range(200):
+            shield.advance(k * PERIOD, motion)
+            x = motion.read(k * PERIOD)
+            shield.sample(k * PERIOD, x)
+            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.2, 0.0])
+            if shield.override(word, k * PERIOD) == "ended":
+                break
+            shield.renew(k * PERIOD, x, motion)
+        ends.append(float(x[0] + dead_time * x[1]))
+    assert ends[0] == pytest.approx(ends[1], abs=0.05)

@@ -1,0 +1,208 @@
+"""`tandem manual` and `tandem auto` at a gateway on a router; and what a session makes of what it hears."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from lbmpc.plants import get_plant
+from node_runtime.bus.zenoh_bus import Bus
+from node_runtime.config.loading import override, to_toml
+from node_runtime.config.sections import Config
+from node_runtime.router import open_router
+from node_runtime.tls import credentials
+from plant_sim import Gateway
+from protocol import messages as m
+from protocol import topics
+from tandem import certificate_authority
+from tandem.cli import main
+from tandem.hand_session import Follower, assignments, completed, lease_of, line
+from tandem.terminal import Refused
+from tests.helpers.live import BusListener, free_endpoint, live_config, wait_for
+
+PLANT = get_plant("moore_greitzer")
+U = float(PLANT.u_e[0])
+
+
+class Machine:
+    """Stands still, whatever it is given."""
+
+    def __init__(self) -> None:
+        self.written: list[float] = []
+        self.x = PLANT.x_e
+
+    def read(self) -> np.ndarray:
+        return self.x
+
+    def write(self, u: np.ndarray) -> None:
+        self.written.append(float(u[0]))
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Config, Machine]]:
+    """A gateway behind a router, nobody commands it."""
+    config, machine, stop = live_config(), Machine(), threading.Event()
+    thread = threading.Thread(target=Gateway(None, config).serve, args=(machine.read, machine.write, stop))
+    with open_router(config):
+        thread.start()
+        yield config, machine
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.live
+def test_a_hand_on_the_switch_of_a_machine(
+    served: tuple[Config, Machine], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, machine = served
+    file = tmp_path / "a.toml"
+    file.write_text(to_toml(config))
+    at = ["--config", str(file)]
+    with Bus(config, "recorder", "r-1") as bus:
+        ear = BusListener(bus)
+        assert main(["manual", f"u={U + 0.02}", "--seconds", "1.5", *at]) == 0
+        said = capsys.readouterr().out
+        assert "given back" in said
+        assert "manual" in said
+        assert U + 0.02 in machine.written
+        # Where there is no way back from such an input, it never acts: the plant says which state and when.
+        machine.x = PLANT.x0
+        assert main(["manual", "u=99", "--seconds", "9", *at]) == 1
+        assert "would leave X within" in capsys.readouterr().out
+        assert PLANT.u_max[0] not in machine.written
+        machine.x = PLANT.x_e
+        # From elsewhere.
+        result: list[int] = []
+        session = threading.Thread(
+            target=lambda: result.append(main(["manual", f"u={U + 0.03}", "--seconds", "30", *at]))
+        )
+        session.start()
+        wait_for(lambda: machine.written[-1] == U + 0.03)
+        assert main(["auto", *at]) == 0
+        session.join()
+        assert result == [1]
+        assert "gave it back to the controller" in capsys.readouterr().out
+        states = ear.of(topics.PLANT_STATE)
+        notes = {one.note for name, one in ear.heard if name == topics.HEALTH["plant"].name}
+    assert {state.source for state in states} - {"hold"} == {"safe", "manual"}
+    assert [state.applied for state in states if state.source == "manual"].count([U + 0.02]) > 10
+    assert any(note.startswith("driven by hand (commander-") for note in notes)
+
+
+@pytest.mark.live
+def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = tmp_path / "jet1"
+    certificate_authority.create("jet1", [], keys, 30)
+    remote = free_endpoint().replace("tcp/", "tls/")
+    local = live_config(f'bus.remote="{remote}"', f'bus.tls.keys="{keys / "router"}"')
+    machine, stop = Machine(), threading.Event()
+    gateway = threading.Thread(target=Gateway(None, local).serve, args=(machine.read, machine.write, stop))
+
+    def far(role: str) -> list[str]:
+        config = override(
+            local, [f'bus.endpoint="{remote}"', f'bus.tls.keys="{keys / role}"', 'bus.remote=""']
+        )
+        file = tmp_path / f"{role}.toml"
+        file.write_text(to_toml(config))
+        return ["--config", str(file)]
+
+    authority = keys / "authority"
+    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
+    issued_by = credentials.load_certificate(authority / "certificate.pem")
+    (keys / "brief").mkdir(mode=0o700)
+    seconds = timedelta(seconds=4) / timedelta(days=1)
+    with open_router(local):
+        gateway.start()
+        assert main(["manual", f"u={U + 0.01}", *far("operator")]) == 2
+        assert "is the certificate of operator.jet1" in capsys.readouterr().err
+        certificate_authority.issue(keys / "brief", "commander.jet1", key, issued_by, seconds, [])  # type: ignore[arg-type]
+        done: list[int] = []
+        session = threading.Thread(
+            target=lambda: done.append(main(["manual", f"u={U + 0.02}", "--seconds", "5", *far("brief")]))
+        )
+        session.start()
+        wait_for(lambda: U + 0.02 in machine.written)
+        # The session goes on saying it, and nobody hears it: the lease is over.
+        wait_for(lambda: machine.written[-1] != U + 0.02)
+        session.join()
+        stop.set()
+        gateway.join()
+
+
+def state(seq: int, source: str = "command", run_id: str = "plant-1") -> m.PlantState:
+    return m.PlantState(
+        run_id=run_id, seq=seq, t=0.0, x=PLANT.x_e.tolist(), applied=[U], source=source, command_seq=0  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def begun() -> Follower:
+    """Of somebody who drives by hand."""
+    follower = Follower("me", m.Override)
+    follower.take(state(7))
+    follower.said()
+    for seq in (8, 9):
+        assert follower.take(state(seq, "command" if seq == 8 else "manual")) == ""
+    assert follower.begun
+    return follower
+
+
+def word(mode: str, seq: int, run_id: str) -> m.Override:
+    return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])  # type: ignore[arg-type]
+
+
+def test_what_ends_a_session_by_hand() -> None:
+    assert begun().take(word("manual", 0, "other")) == "other took over"
+    assert begun().take(word("auto", 0, "other")) == "other gave it back to the controller"
+    assert begun().take(state(10)) == "the plant is not driven by hand any more"
+    assert begun().take(state(0, "safe", "plant-2")) == "the gateway was started again"
+    for none in (word("manual", 5, "other"), word("auto", 3, "me"), state(10, "manual")):
+        assert begun().take(none) == ""
+
+
+def test_what_was_by_hand_before_is_not_taken_for_one_s_own() -> None:
+    follower = Follower("me", m.Override)
+    follower.take(state(7, "manual"))
+    follower.said()
+    follower.take(state(8, "manual"))
+    assert not follower.begun
+    follower.take(state(9, "manual"))
+    assert follower.begun
+
+
+def test_what_ends_a_pause() -> None:
+    for message, why in (
+        (word("auto", 0, "other"), "other gave it back to the controller"),
+        (m.Reference(run_id="other", seq=3), "other said where to go"),
+        (word("manual", 0, "other"), ""),
+        (m.Reference(run_id="me", seq=3), ""),
+    ):
+        follower = Follower("me", m.Reference)
+        follower.said()
+        assert follower.take(message) == why
+
+
+def test_inputs_are_named_and_the_others_stay() -> None:
+    quad = get_plant("moore_greitzer")
+    assert assignments(["u=1.2"], quad) == {"u": 1.2}
+    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a number"), ("u=inf", "finite")):
+        with pytest.raises(Refused, match=says):
+            assignments([text], quad)
+    two = type("Two", (), {"inputs": ("a", "b")})
+    assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]  # type: ignore[arg-type]
+    with pytest.raises(Refused, match="name a too"):
+        completed({"b": 3.0}, two, None)  # type: ignore[arg-type]
+
+
+def test_a_line_says_what_acts_and_the_nearest_bound() -> None:
+    said = line(state(3, "manual"), PLANT, 2.0)
+    assert "2.0 s  manual" in said
+    assert "u 1.1547  |  margin" in said
+    assert [lease_of(period) for period in (0.05, 5.0, 100.0)] == [1.0, 15.0, 60.0]
