@@ -98,7 +98,8 @@ class InputLine:
         else:
             periods = seen.sequence - sequence
             most = self._span / self._period
-            if sequence < 0 or seen.source != source or not 1.0 - most < periods <= most:
+            # One that comes so late that nothing from before it is remembered begins anew.
+            if sequence < 0 or seen.source != source or not 1.0 - most + REPORTED < periods <= most:
                 written = [_Written(self._span, self._before(seen), False)]
                 written += self._reported(seen, written)
             else:
