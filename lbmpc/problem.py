@@ -134,8 +134,8 @@ def _require_steps(model: Model, tightening: Tightening) -> None:
     plant = model.plant
     if plant.input_rows.names and tightening == "tube":
         raise CertificateError(
-            f"the tightening `tube` takes inputs in boxes, and {', '.join(plant.input_rows.names)} is a row of several: "
-            "leave out that row, or take the tightening `first_step`"
+            "the tightening `tube` takes inputs in boxes, and there are rows of several "
+            f"({', '.join(plant.input_rows.names)}): leave these out, or take the tightening `first_step`"
         )
     if limited := [
         name for name, rate in zip(plant.inputs, plant.input_rates, strict=True) if np.isfinite(rate)

@@ -16,8 +16,8 @@ class RateLimit:
 
     On a grid of whole periods that is |u_i - u_{i-1}| <= rate period. It holds at broken times and through a burst of
     commands too, and so do the means over a period differ from one to the next. What may not act yet may act once
-    what holds it back is a period old: a command that comes early waits. Where U has rows beside its box all inputs move
-    together, on the straight way to what is asked for, which stays in U. Times in seconds, which must not fall.
+    what holds it back is a period old: a command that comes early waits. Where U has rows beside its box all inputs
+    move together, on the straight way to what is asked for, which stays in U. Times in seconds, which must not fall.
     """
 
     def __init__(self, plant: Description, period: float):

@@ -58,9 +58,7 @@ class Rows:
         self._changing = m + np.flatnonzero(np.tile(np.isfinite(self._steps), n - 1))
         change = np.tile(self._steps, n)[self._changing]
         self._together = self._limited and bool(self._beside.names)
-        self._one_by_one = (
-            Bound(build_clip(n, self._steps)) if len(change) and not self._together else None
-        )
+        self._one_by_one = Bound(build_clip(n, self._steps)) if len(change) and not self._together else None
         self.lower = np.concatenate(
             [*(part.lower for part in problem.inputs), -change, *(part.lower for part in problem.states)]
         )

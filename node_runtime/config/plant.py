@@ -15,7 +15,6 @@ from node_runtime.config.reference import is_reference, load, sha256_of
 from node_runtime.config.sections import DEAD_TIME, Config, ReferenceConfig, Shares
 from node_runtime.config.strict import ConfigError, did_you_mean
 
-
 Row = Mapping[str, float]
 """As of `lbmpc.plants.description.Description.rows`."""
 

@@ -60,7 +60,10 @@ def test_the_optimum_is_that_of_ipopt() -> None:
         direction = rng.normal(size=model.d) / plant.x_scale
         room = 0.3 * np.abs(direction * plant.x_scale).sum()
         rows["slope"] = dict(zip(plant.states, direction.tolist(), strict=True))
-        rows["slope"] |= {"min": float(direction @ plant.x_e - room), "max": float(direction @ plant.x_e + room)}
+        rows["slope"] |= {
+            "min": float(direction @ plant.x_e - room),
+            "max": float(direction @ plant.x_e + room),
+        }
         direction = rng.normal(size=model.m) / plant.u_scale
         room = 0.2 * np.abs(direction * plant.u_scale).sum()
         rows["supply"] = dict(zip(plant.inputs, direction.tolist(), strict=True))
@@ -117,7 +120,9 @@ def test_a_less_important_row_costs_more_important_ones_nothing() -> None:
             contradicted += 1
             kept += bool(alone.max() < 1e-7 and violation(plain.values, lower, upper)[1:3].max() > 1e-3)
         else:
-            np.testing.assert_allclose(plain.values, y + M @ in_order(y, M, lower, upper, penalty, levels)[0].w, atol=1e-5)
+            np.testing.assert_allclose(
+                plain.values, y + M @ in_order(y, M, lower, upper, penalty, levels)[0].w, atol=1e-5
+            )
     assert contradicted >= 20
     assert kept >= 3
 
@@ -161,7 +166,9 @@ def test_inputs_stay_in_all_of_U(rates: list[float] | None) -> None:
         found = solver.solve(x, NOTHING, rng.normal(size=(8, 2)), previous=acts)
         plans = [found.v, found.u, feedback_plan(model, x, 8, previous=None if rates is None else acts)]
         if rates is not None:
-            plans.append(all_reachable(model, np.array([plant.within(u) for u in rng.normal(size=(8, 2))]), acts))
+            plans.append(
+                all_reachable(model, np.array([plant.within(u) for u in rng.normal(size=(8, 2))]), acts)
+            )
         for plan in plans:
             assert (plant.input_rows.beyond(plan) <= 1e-15).all()
             assert (np.abs(plan) <= 1.0).all()
