@@ -46,6 +46,8 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     constraint_violations: int
     """Samples at which the true state, or the mean input before it, is outside X or U by more than 1e-6 of a
     half-width."""
+    violated_rows: dict[str, int] = {}
+    """Of these, per row beside the boxes of X and U, by its name; empty where there are none."""
     excess_between_samples: float | None
     """Largest distance of the true motion from X, between samples too, as a share of the state's half-width; null
     where the equations of the truth do not lead from sample to sample."""
@@ -104,6 +106,7 @@ def performance(
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
+        violated_rows={name: int(found.sum()) for name, found in outside_rows(motion, plant).items()},
         excess_between_samples=excess(behind(motion, true_dead_time(config, plant, truth)), plant, truth),
         offset=_offset(motion, dx, plant, config),
     )
@@ -130,6 +133,9 @@ def of_episodes(every: Sequence[Performance]) -> Performance:
             name: _largest([one.settled_by_state_s[name] for one in every]) for name in names
         },
         constraint_violations=sum(one.constraint_violations for one in every),
+        violated_rows={
+            name: sum(one.violated_rows[name] for one in every) for name in every[0].violated_rows
+        },
         excess_between_samples=_largest([one.excess_between_samples for one in every]),
         offset={name: max(one.offset[name] for one in every) for name in every[0].offset},
     )
@@ -141,7 +147,17 @@ def outside(motion: Trajectory, plant: Description) -> np.ndarray:
     x_room, u_room = TOLERANCE * plant.x_scale, TOLERANCE * plant.u_scale
     state = (x < plant.x_min - x_room) | (x > plant.x_max + x_room)
     applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false where there was none
-    return np.asarray(state.any(axis=1) | applied.any(axis=1))
+    rows = outside_rows(motion, plant).values()
+    return np.asarray(state.any(axis=1) | applied.any(axis=1) | np.any([*rows], axis=0))
+
+
+def outside_rows(motion: Trajectory, plant: Description) -> dict[str, np.ndarray]:
+    """(n,) by the name of a row beside the boxes: whether it is exceeded, likewise."""
+    return {
+        name: beyond > TOLERANCE
+        for rows, values in ((plant.state_rows, motion.x), (plant.input_rows, motion.applied))
+        for name, beyond in zip(rows.names, rows.beyond(values).T, strict=True)
+    }
 
 
 def _largest(values: list[float | None]) -> float | None:

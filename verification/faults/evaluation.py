@@ -103,7 +103,7 @@ def _not_led(results: list[m.TickResult]) -> int:
 
 
 def _deepest(x: np.ndarray, applied: np.ndarray, plant: Description) -> float:
-    state = np.maximum(plant.x_min - x, x - plant.x_max) / plant.x_scale
+    state = plant.beyond_x(x)
     given = np.maximum(plant.u_min - applied, applied - plant.u_max) / plant.u_scale
     return max(0.0, float(state.max()), float(np.nanmax(given, initial=0.0)))
 

@@ -178,6 +178,11 @@ def _start(model: Model, x0: np.ndarray) -> Finding:
         f"{plant.states[i]} = {x0[i]:g}, X is [{plant.x_min[i]:g}, {plant.x_max[i]:g}]"
         for i in np.flatnonzero((x0 < plant.x_min) | (x0 > plant.x_max))
     ]
+    rows = plant.state_rows
+    outside += [
+        f"{rows.names[i]} = {rows.F[i] @ x0:g}, the row is [{rows.lower[i]:g}, {rows.upper[i]:g}]"
+        for i in np.flatnonzero(rows.beyond(x0) > 0.0)
+    ]
     if outside:
         return Finding("note", "x0", f"outside of X: {'; '.join(outside)}")
     return Finding("ok", "x0", "in X")
