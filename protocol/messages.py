@@ -97,8 +97,8 @@ class PlantState(Message, frozen=True, kw_only=True):
     source: InputSource
     command_seq: Sequence
     """Tick of the last command received, -1 before the first."""
-    missing: list[str] = msgspec.field(default_factory=list)
-    """States of which no number came, by name; their entries of x count nothing."""
+    missing: list[str] | msgspec.UnsetType = msgspec.UNSET
+    """States of which no number came, by name; their entries of x count nothing. Unset, and no byte, where all did."""
 
 
 class Command(Message, frozen=True):

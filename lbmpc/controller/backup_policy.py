@@ -117,7 +117,7 @@ class BackupPlanner:
             s: where the command that was just given leads, with its past where the oracle looks back.
             theta: the oracle's parameters.
             plan: the nominal plan from there on, (N, m).
-            xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`, the same at every step.
+            xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`.
             previous: that command, (m,), as for `Solver.solve`.
 
         Returns:
@@ -151,7 +151,7 @@ class BackupPlanner:
         return (0.0, free) if between is None else (share, between)
 
     def _end(self, rollout: Rollout) -> float:
-        """|z_N|_P of |z_0|_P, both from the target."""
+        """|z_N|_P of |z_0|_P, both from the last target."""
         inputs, d = self._subproblem.sweep.inputs, self.problem.model.d
         start, target = inputs["x"][:d, 0], inputs["xr"][:, -1]
         return self._norm(rollout.z[-1] - target) / max(self._norm(start - target), np.finfo(float).tiny)

@@ -56,7 +56,13 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     sample, as a share of its half-width; empty without outputs."""
 
 
-def performance(motion: Trajectory, plant: Description, config: Config, truth: object) -> Performance:
+def performance(
+    motion: Trajectory,
+    plant: Description,
+    config: Config,
+    truth: object,
+    rests: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
     Args:
@@ -64,12 +70,17 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         plant: its equilibrium, bounds and half-widths.
         config: the weights and the rate.
         truth: the plant whose motion this is, as of `excess`.
+        rests: where states and input should be at each sample but the last, (n - 1, d) and (n - 1, m), plant units,
+            where they move: overshoot and settling are then none. None: `goal`, and u_e.
     """
     names = config.reference.outputs or [plant.states[i] for i in plant.performance]
     own = [plant.states.index(name) for name in names]
+    x_goal, u_goal = (goal(plant, config), plant.u_e) if rests is None else rests
+    if rests is not None:
+        x_goal = np.append(x_goal, x_goal[-1:], axis=0)
     dx, du = (
         np.clip(off, -FARTHEST, FARTHEST)
-        for off in (motion.x - goal(plant, config), np.nan_to_num(motion.applied[1:] - plant.u_e))
+        for off in (motion.x - x_goal, np.nan_to_num(motion.applied[1:] - u_goal))
     )
     q, r = (
         np.ones(n) if w is None else np.array(w)
@@ -81,13 +92,17 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
     stages = squares @ q + du**2 @ r
     off = np.abs(dx) > SETTLED * plant.x_scale
     settled = {
-        name: _settled(off[:, i], motion.step, config.rate) for name, i in zip(names, own, strict=True)
+        name: _settled(off[:, i], motion.step, config.rate) if rests is None else None
+        for name, i in zip(names, own, strict=True)
     }
     times = [time for time in settled.values() if time is not None]
     return Performance(
         J=float(seconds @ stages),
         deviation=float(seconds @ squares[:, own].sum(axis=1)),
-        overshoot={name: _overshoot(dx[:, i], bool(off[0, i])) for name, i in zip(names, own, strict=True)},
+        overshoot={
+            name: _overshoot(dx[:, i], bool(off[0, i]) and rests is None)
+            for name, i in zip(names, own, strict=True)
+        },
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import typing
 
 import msgspec
 import pytest
@@ -55,6 +56,9 @@ def on_the_wire(kind: inspect.Type) -> str:
 
 
 def type_of(field: msgspec.structs.FieldInfo) -> str:
+    if field.default is msgspec.UNSET:
+        (given,) = (one for one in typing.get_args(field.type) if one is not msgspec.UnsetType)
+        return f"{on_the_wire(inspect.type_info(given))}; may be left out"
     values = getattr(field.type, "__args__", ())
     if values and all(isinstance(value, str) for value in values):
         quoted = [f'"{value}"' for value in values]

@@ -21,7 +21,7 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)[^)]*\)")
 MODULE = re.compile(rf"`((?:{NAME})(?:\.\w+)+)")
 RUN = re.compile(r"python -m ([\w.]+)")
 MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
-TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+ ?){1,2})([^`\n|]*)", re.MULTILINE)
+TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+(?:-[a-z]+)* ?){1,2})([^`\n|]*)", re.MULTILINE)
 # What a page may name that is made when something runs, or is an example of the reader's own.
 MADE = ("tandem/jet",)
 OWN = {"gru.py", "tanks.py", "true.py"}

@@ -93,7 +93,13 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         counted=_counted(witness),
         said=_said(rig, witness),
         extra=extra,
+        not_led=_not_led(results),
     )
+
+
+def _not_led(results: list[m.TickResult]) -> int:
+    led = [bool(result.reference) for result in results]
+    return led[led.index(True) :].count(False) if True in led else 0
 
 
 def _deepest(x: np.ndarray, applied: np.ndarray, plant: Description) -> float:
