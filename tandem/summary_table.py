@@ -34,6 +34,7 @@ MEANING = {
     "settled_s": "all performance states within 4 % of their half-widths",
     "settled_by_state_s": "each of them",
     "constraint_violations": "at samples: true state or applied input outside X or U",
+    "violated_rows": "of these, by row beside the boxes",
     "excess_between_samples": "largest distance of the true motion from X, of a half-width",
     "offset": "of the outputs in the last second, of their half-widths",
     "solve_ms": "p50 / p99 / max",
@@ -57,6 +58,7 @@ OF_EACH_STATE = {
 """Which figure of each performance state these are."""
 WHERE_THERE_IS_ONE = (
     "unreached_ticks",
+    "violated_rows",
     "target_distance",
     "offset",
     "sensor_faults",

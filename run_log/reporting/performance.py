@@ -47,6 +47,8 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     constraint_violations: int
     """Samples at which the true state, or the mean input before it, is outside X or U by more than 1e-6 of a
     half-width."""
+    violated_rows: dict[str, int] = {}
+    """Of these, per row beside the boxes of X and U, by its name; empty where there are none."""
     excess_between_samples: float | None
     """Largest distance of the true motion from X, between samples too, as a share of the state's half-width; null
     where the equations of the truth do not lead from sample to sample."""
@@ -55,7 +57,13 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     sample, as a share of its half-width; empty without outputs, neither configured nor given."""
 
 
-def performance(motion: Trajectory, plant: Description, config: Config, truth: object) -> Performance:
+def performance(
+    motion: Trajectory,
+    plant: Description,
+    config: Config,
+    truth: object,
+    rests: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
     Args:
@@ -63,14 +71,19 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         plant: its equilibrium, bounds and half-widths.
         config: the weights and the rate.
         truth: the plant whose motion this is, as of `excess`.
+        rests: where states and input should be at each sample but the last, (n - 1, d) and (n - 1, m), plant units,
+            where they move: overshoot and settling are then none. None: where the motion has its goal, and u_e.
     """
     names = config.reference.outputs or [plant.states[i] for i in plant.performance]
     own = [plant.states.index(name) for name in names]
-    wanted = goal(plant, config) if motion.goal is None else motion.goal
-    moves = motion.goal is not None and bool((motion.goal != motion.goal[0]).any())
+    given = goal(plant, config) if motion.goal is None else motion.goal
+    moves = rests is not None or (motion.goal is not None and bool((motion.goal != motion.goal[0]).any()))
+    x_goal, u_goal = (given, plant.u_e) if rests is None else rests
+    if rests is not None:
+        x_goal = np.append(x_goal, x_goal[-1:], axis=0)
     dx, du = (
         np.clip(off, -FARTHEST, FARTHEST)
-        for off in (motion.x - wanted, np.nan_to_num(motion.applied[1:] - plant.u_e))
+        for off in (motion.x - x_goal, np.nan_to_num(motion.applied[1:] - u_goal))
     )
     q, r = (
         np.ones(n) if w is None else np.array(w)
@@ -82,7 +95,8 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
     stages = squares @ q + du**2 @ r
     off = np.abs(dx) > SETTLED * plant.x_scale
     settled = {
-        name: _settled(off[:, i], motion.step, config.rate) for name, i in zip(names, own, strict=True)
+        name: _settled(off[:, i], motion.step, config.rate) if rests is None else None
+        for name, i in zip(names, own, strict=True)
     }
     times = [time for time in settled.values() if time is not None]
     return Performance(
@@ -95,6 +109,7 @@ def performance(motion: Trajectory, plant: Description, config: Config, truth: o
         settled_s=max(times) if len(times) == len(settled) else None,
         settled_by_state_s=settled,
         constraint_violations=int(outside(motion, plant).sum()),
+        violated_rows={name: int(found.sum()) for name, found in outside_rows(motion, plant).items()},
         excess_between_samples=excess(behind(motion, true_dead_time(config, plant, truth)), plant, truth),
         offset=_offset(motion, dx, plant, config),
     )
@@ -113,6 +128,9 @@ def of_episodes(every: Sequence[Performance]) -> Performance:
             name: _largest([one.settled_by_state_s[name] for one in every]) for name in names
         },
         constraint_violations=sum(one.constraint_violations for one in every),
+        violated_rows={
+            name: sum(one.violated_rows[name] for one in every) for name in every[0].violated_rows
+        },
         excess_between_samples=_largest([one.excess_between_samples for one in every]),
         offset={
             name: max(one.offset[name] for one in every if name in one.offset)
@@ -127,7 +145,17 @@ def outside(motion: Trajectory, plant: Description) -> np.ndarray:
     x_room, u_room = TOLERANCE * plant.x_scale, TOLERANCE * plant.u_scale
     state = (x < plant.x_min - x_room) | (x > plant.x_max + x_room)
     applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false where there was none
-    return np.asarray(state.any(axis=1) | applied.any(axis=1))
+    rows = outside_rows(motion, plant).values()
+    return np.asarray(state.any(axis=1) | applied.any(axis=1) | np.any([*rows], axis=0))
+
+
+def outside_rows(motion: Trajectory, plant: Description) -> dict[str, np.ndarray]:
+    """(n,) by the name of a row beside the boxes: whether it is exceeded, likewise."""
+    return {
+        name: beyond > TOLERANCE
+        for rows, values in ((plant.state_rows, motion.x), (plant.input_rows, motion.applied))
+        for name, beyond in zip(rows.names, rows.beyond(values).T, strict=True)
+    }
 
 
 def _largest(values: list[float | None]) -> float | None:

@@ -111,6 +111,18 @@ def test_a_violation_is_a_share_of_the_half_width() -> None:
     assert figures(motion(np.zeros((3, 2)), [1e3 + 5e-4, 1e3 + 2e-3]), plant=small).constraint_violations == 1
 
 
+def test_rows_beside_the_boxes_are_counted_by_name() -> None:
+    rows = {"sum": {"position": 1.0, "speed": 1.0, "max": 0.5}, "force": {"push": 2.0, "max": 1.0}}
+    plant = dataclasses.replace(OSCILLATOR, rows=rows)
+    given = motion([[0.3, 0.1], [0.3, 0.3], [0.4, 0.4], [0.0, 0.0]], [0.0, 0.6, 0.0])
+    found = figures(given, plant=plant)
+    assert found.violated_rows == {"sum": 2, "force": 1}
+    assert found.constraint_violations == 2
+    assert figures(given).violated_rows == {}
+    still = motion([[0.4, 0.4]] * 3, period=0.0)
+    assert figures(still, plant=plant).excess_between_samples == pytest.approx(0.3 / 1.5)
+
+
 def test_the_motion_between_samples_is_that_of_the_truth() -> None:
     # Once around in every period: the samples see nothing of it, and a quarter of the way the speed is 0.9.
     around = motion([[0.9, 0.0]] * 3, period=TURN)
