@@ -42,6 +42,7 @@ KEYS = {
     *(
         "episodes",
         "constraint_violations",
+        "violated_rows",
         "excess_between_samples",
         "J",
         "deviation",
