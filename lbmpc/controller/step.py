@@ -178,6 +178,8 @@ class Controller:
         )
         x, u = s[: self.model.d], plan.u[0]
         after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
+        if not np.isfinite(after).all():
+            after = s
         estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
         memory = ControllerState(
             shift(plan),
@@ -265,7 +267,8 @@ class Controller:
         acts: np.ndarray | None,
         delay: float,
     ) -> tuple[np.ndarray | None, OracleState]:
-        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there.
+        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there; None:
+        it is not known.
 
         Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
         which the model knows; without this every millisecond between sample and command would be a disturbance. With
@@ -279,7 +282,10 @@ class Controller:
             there = self._motion.after(x, acts, delay)
             if there is not None:
                 return there, oracle
-        return predicted(self.model, self.oracle, oracle, x, inputs)
+        with np.errstate(all="ignore"):
+            there, after = predicted(self.model, self.oracle, oracle, x, inputs)
+        # Where an oracle has no numbers, nobody knows where the plant will be.
+        return (there, after) if np.isfinite(there).all() else (None, oracle)
 
     def _aim(
         self,
