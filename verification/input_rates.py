@@ -111,7 +111,11 @@ def by_hand(config: Config, seed: int, ticks: int) -> Found:
             else:
                 loop.auto()
             until += int(rng.integers(2, 20))
-        states.append(loop.step()[0])
+        try:
+            states.append(loop.step()[0])
+        except PlantError:
+            # Lost, with so slow an input; what was written until then counts.
+            break
     rate, period = float(loop.core.plant.input_rates[0]), config.period
     written, t = [(-np.inf, float(plant.safe_input[0]))], 0.0
     for state in states[1:]:

@@ -53,6 +53,17 @@ def figures(
     return performance(given, plant, override(Config(), list(settings)), truth or plant)
 
 
+def test_figures_are_about_the_reference_of_each_sample() -> None:
+    goal = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.0]])
+    x = [[0.1, 0.0], [0.5, 0.0], [0.45, 0.0]]
+    found = figures(msgspec.structs.replace(motion(x), goal=goal), "rate=1")
+    assert found.J == pytest.approx(0.01)
+    assert found.deviation == pytest.approx(0.01)
+    assert found.offset == {"position": pytest.approx(0.05)}
+    assert set(found.overshoot.values()) == {None}
+    assert figures(motion(x), "rate=1").offset == {}
+
+
 def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:
     x = [[0.5, 0.1], [-0.25, 0.2], [0.0, 0.0]]
     weights = ["controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]

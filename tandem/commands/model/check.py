@@ -218,7 +218,6 @@ def _state_table(
 
 
 def _input_table(known: Known) -> Table:
-    import numpy as np
     from rich.table import Column
 
     from tandem.model_tables import plain
