@@ -101,7 +101,11 @@ class Controller:
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
         self.oracle = problem.oracle
         self.estimator = Samples(self.model.d) if estimator is None else estimator
-        self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
+        plant = self.model.plant
+        self._absurd = ABSURD * plant.x_scale, ABSURD * plant.u_scale
+        # U about the equilibrium: its box, and the rows beside it.
+        self._box = plant.u_min - plant.u_e, plant.u_max - plant.u_e
+        self._beside = plant.input_rows.about(plant.u_e)
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -347,12 +351,8 @@ class Controller:
         """What was written before v_0, (m,), in U: as the plant says, or as commanded; None: nothing depends on it."""
         if not self.problem.looks_back:
             return None
-        acts, plant = acting(written), self.model.plant
-        return (
-            state.commanded
-            if acts is None
-            else np.clip(acts, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
-        )
+        acts = acting(written)
+        return state.commanded if acts is None else self._beside.pulled(np.clip(acts, *self._box), 0.0)
 
     def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
         """The plan within the rate limits from `previous` on."""

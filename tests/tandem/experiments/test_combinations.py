@@ -78,13 +78,17 @@ def compressor() -> Built:
 
 
 def quadrotor() -> Built:
-    """Two inputs, one of them with a rate; a network with a memory; not all is measured, and not all that is comes."""
+    """Two inputs, one of them with a rate, and rows; a network with a memory; not all is measured, and a sensor sticks."""
     loop = Loop(
         config=ROOT / "examples/quadrotor/quadrotor.toml",
         train=False,
         controller={"horizon": 6, "keyframe_every": 8, "solver": QUICK},
         plant={
             "input_rate_max": {"left": 5.0},
+            "rows": {
+                "battery": {"left": 1.0, "right": 1.0, "max": 6.0},
+                "slow": {"vz": 1.0, "max": 0.2, "priority": 1},
+            },
             "sensors": {"noise": 0.01, "stuck": {"z": 0.2}},
             "x0": [0.1, 0.1, 0.0, 0.0, 0.0, 0.0],
         },
@@ -152,6 +156,11 @@ def driven(loop: Loop, seed: int) -> Run:
     return loop.result.run
 
 
+def require_in_u(u: np.ndarray, plant: Description) -> None:
+    assert ((u >= plant.u_min - 1e-9) & (u <= plant.u_max + 1e-9)).all()
+    assert (plant.input_rows.beyond(u) < 1e-9).all()
+
+
 def require_inputs(run: Run, plant: Description, period: float) -> None:
     """What acted is in U, and each input within its rate of the one before it."""
     step, before, who = plant.input_rates * period * (1.0 + 1e-5), None, ""
@@ -159,7 +168,7 @@ def require_inputs(run: Run, plant: Description, period: float) -> None:
         before, who = before if state.run_id == who else None, state.run_id
         told = [piece.u for piece in state.pieces] or ([] if state.applied is None else [state.applied])
         for u in np.array(told):
-            assert ((u >= plant.u_min - 1e-9) & (u <= plant.u_max + 1e-9)).all()
+            require_in_u(u, plant)
             assert before is None or (np.abs(u - before) <= step).all()
             before = u
 
@@ -206,6 +215,5 @@ def test_all_that_holds_for_each_holds_together(build: Callable[[], Built]) -> N
     rng = np.random.default_rng(2)
     for tick in run.ticks * 3:
         command = after.step(wild(tick, plant, rng) if rng.uniform() < 0.6 else tick).command
-        plan = np.array(command.plan)
-        assert ((plan >= plant.u_min - 1e-9) & (plan <= plant.u_max + 1e-9)).all()
+        require_in_u(np.array(command.plan), plant)
     before.memory.restore(after.memory.keyframe(len(run.ticks) - 1))
