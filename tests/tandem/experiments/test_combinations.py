@@ -78,7 +78,7 @@ def compressor() -> Built:
 
 
 def quadrotor() -> Built:
-    """Two inputs, one of them with a rate, and rows; a network with a memory; not all is measured, and a sensor sticks."""
+    """Two inputs with rows, one with a rate; a network with a memory; not all is measured, and a sensor sticks."""
     loop = Loop(
         config=ROOT / "examples/quadrotor/quadrotor.toml",
         train=False,
