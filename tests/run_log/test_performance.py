@@ -53,6 +53,16 @@ def figures(
     return performance(given, plant, override(Config(), list(settings)), truth or plant)
 
 
+def test_where_states_and_input_should_be_may_move() -> None:
+    goals = np.array([[0.1, 0.0], [0.2, 0.0]]), np.array([[0.3], [-0.3]])
+    given = motion([[0.1, 0.0], [0.2, 0.1], [0.9, 0.9]], [0.3, -0.3], 1.0)
+    weights = ["rate=1", "controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
+    found = performance(given, OSCILLATOR, override(Config(), weights), OSCILLATOR, goals)
+    assert found.J == pytest.approx(3 * 0.01)
+    assert found.deviation == pytest.approx(0.01)
+    assert (found.overshoot, found.settled_s) == ({"position": None, "speed": None}, None)
+
+
 def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:
     x = [[0.5, 0.1], [-0.25, 0.2], [0.0, 0.0]]
     weights = ["controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
