@@ -15,7 +15,7 @@ FOR_A_PERSON = ("skipped_slots",)
 
 MEANING = {
     "ticks": "control steps",
-    "late_ticks": "began later than they may",
+    "late_ticks": "began later than they may, or took longer than a period",
     "skipped_slots": "slots without a tick",
     "lost_ticks": "never reached the recorder",
     "weights_adopted": "sets of hidden weights",
@@ -28,7 +28,7 @@ MEANING = {
     "sensor_faults": "sensors that were not believed",
     "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
-    "J": "sum of the stage costs, Q and R per second",
+    "J": "sum of the stage costs, Q and R per second, from the set-points and else from x_e, u_e",
     "deviation": "integral of the performance states' squared deviations",
     "overshoot": "share of the state's own initial deviation",
     "settled_s": "all performance states within 4 % of their half-widths",

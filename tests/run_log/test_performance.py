@@ -53,14 +53,23 @@ def figures(
     return performance(given, plant, override(Config(), list(settings)), truth or plant)
 
 
-def test_where_states_and_input_should_be_may_move() -> None:
-    goals = np.array([[0.1, 0.0], [0.2, 0.0]]), np.array([[0.3], [-0.3]])
-    given = motion([[0.1, 0.0], [0.2, 0.1], [0.9, 0.9]], [0.3, -0.3], 1.0)
-    weights = ["rate=1", "controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
-    found = performance(given, OSCILLATOR, override(Config(), weights), OSCILLATOR, goals)
-    assert found.J == pytest.approx(3 * 0.01)
+def test_figures_are_about_the_reference_of_each_sample() -> None:
+    goal = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.0]])
+    x = [[0.1, 0.0], [0.5, 0.0], [0.45, 0.0]]
+    found = figures(msgspec.structs.replace(motion(x), goal=goal), "rate=1")
+    assert found.J == pytest.approx(0.01)
     assert found.deviation == pytest.approx(0.01)
-    assert (found.overshoot, found.settled_s) == ({"position": None, "speed": None}, None)
+    assert found.offset == {"position": pytest.approx(0.05)}
+    assert set(found.overshoot.values()) == {None}
+    assert figures(motion(x), "rate=1").offset == {}
+
+
+def test_the_input_may_have_a_goal_too() -> None:
+    given = motion([[0.1, 0.0], [0.2, 0.1], [0.9, 0.9]], [0.3, -0.3], 1.0)
+    given = msgspec.structs.replace(given, goal=np.array([[0.1, 0.0], [0.2, 0.0], [0.2, 0.0]]))
+    weights = ["rate=1", "controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
+    found = performance(given, OSCILLATOR, override(Config(), weights), OSCILLATOR, np.array([[0.3], [-0.3]]))
+    assert found.J == pytest.approx(3 * 0.01)
 
 
 def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:

@@ -113,11 +113,11 @@ def _cycles(run: Run, job: Job) -> list[Performance]:
     values = job.set_points or {}
     outputs = msgspec.structs.replace(job.config.reference, outputs=list(values))
     config = msgspec.structs.replace(job.config, reference=outputs)
-    rests = _rests(job, values)
+    x, u = _rests(job, values)
     firsts = range(0, len(motion.step) - job.steps, job.steps)
-    return [
-        performance(motion.part(first, first + job.steps), plant, config, truth, rests) for first in firsts
-    ]
+    parts = [motion.part(first, first + job.steps) for first in firsts]
+    goal = np.append(x, x[-1:], axis=0)
+    return [performance(msgspec.structs.replace(part, goal=goal), plant, config, truth, u) for part in parts]
 
 
 def _rests(job: Job, values: wave.Values) -> tuple[np.ndarray, np.ndarray]:
