@@ -81,7 +81,7 @@ def test_an_episode_is_a_cycle_and_the_plant_goes_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "why"),
     [
-        ("{ p = [1.65, 1.7] }", "is not known"),
+        ("{ p = [1.65, 1.7] }", "is no state; "),
         ("{ y = [1.65, 1.7], z = [0.5, 0.5] }", "as many states as the plant has inputs"),
         ("{ y = [] }", "as many states"),
         ("{ y = [1.65, 7.0] }", "not within its bounds"),
