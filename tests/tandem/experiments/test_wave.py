@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -76,6 +77,18 @@ def test_an_episode_is_a_cycle_and_the_plant_goes_on(tmp_path: Path) -> None:
         assert record.episodes[1].overshoot == {"y": None}
     # About the true plant's rests, nothing costs less for long than what knows h.
     assert found["perfect"][1] < 0.5 * found["linear"][1]
+
+
+def test_to_stay_where_the_true_plant_rests_costs_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "wave.toml"
+    (x,), _u = wave.rests({"y": [1.65]}, 1, true_motion(TRUE), PLANT, 0.05)
+    path.write_text(WAVE.replace("[1.65, 1.7]", "[1.65]").replace("[0.4, 1.6, 1.1547, 0.0]", str(x.tolist())))
+    job = msgspec.structs.replace(next(rows(cases(path))).job, steps=6, episodes=1)
+    work(job, job.key, tmp_path, False, [])
+    record = read(tmp_path / f"{job.key}.json", False)
+    assert record is not None
+    assert record.episodes[0].J < 1e-9
+    assert record.performance.J > 1e-5  # about (x_e, u_e) it is something
 
 
 @pytest.mark.parametrize(
