@@ -21,6 +21,16 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
     Raises:
         ConfigError: `invariant`, and there are no sets for it.
     """
+    said = _of_states_that_are_known(config, model, sets)
+    if config.estimator.kind == "none" or config.controller.tightening == "none" or model.plant.dead_time:
+        return said
+    return (
+        f"{said}. That is for states that are known exactly; here they are estimated, and the error of an estimate is "
+        "not in W: for the true state nothing is guaranteed"
+    )
+
+
+def _of_states_that_are_known(config: Config, model: Model, sets: CertifiedSets | None) -> str:
     if model.plant.dead_time and config.controller.tightening in ("first_step", "tube"):
         return (
             f"guaranteed: nothing; {config.controller.tightening} tightens by what W does in a period, and not in the "

@@ -122,6 +122,14 @@ def figures(names: Sequence[str], values: Sequence[float] | np.ndarray) -> str:
     return "  ".join(f"{name} {value:.4f}" for name, value in zip(names, values, strict=True))
 
 
+def clipped(u: np.ndarray, plant: Description) -> str:
+    """Which of these inputs the gateway will bring within U, in words; empty where none."""
+    acts = np.clip(u, plant.u_min, plant.u_max)
+    return "".join(
+        f"; outside of U, {plant.inputs[i]} is clipped to {acts[i]:g}" for i in np.flatnonzero(acts != u)
+    )
+
+
 def line(state: m.PlantState, plant: Description, seconds: float) -> str:
     """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
     x, acts = np.array(state.x), acting(state)

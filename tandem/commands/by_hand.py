@@ -163,7 +163,7 @@ class Manual(ByHand):
     ) -> int:
         from node_runtime.realtime import clock
         from protocol.messages import Override
-        from tandem.hand_session import Follower, acting, assignments, completed, figures, lease_of
+        from tandem.hand_session import Follower, acting, assignments, clipped, completed, figures, lease_of
 
         named = assignments(self.inputs, plant)
         follower, end = Follower(commander.run_id, Override), clock.now() + patience(config)
@@ -177,7 +177,7 @@ class Manual(ByHand):
         word = Override(
             run_id=commander.run_id, seq=0, mode="manual", u=u.tolist(), lease=lease_of(config.period)
         )
-        self.say(f"by hand: {figures(plant.inputs, u)}; Ctrl-C gives it back")
+        self.say(f"by hand: {figures(plant.inputs, u)}{clipped(u, plant)}; Ctrl-C gives it back")
         follower.told = ""
         why = self._stay(config, plant, commander, stopping, word, follower)
         if not (why and follower.begun):

@@ -43,6 +43,7 @@ class ModelCheck(Configured):
         """0, or 2 where something is wrong."""
         import numpy as np
 
+        from controller_node.build import build_estimator
         from lbmpc.model import ModelError, build_model
         from lbmpc.plants import Known, PlantDefinitionError, get_plant
         from node_runtime.config.plant import plant_of
@@ -65,7 +66,8 @@ class ModelCheck(Configured):
         try:
             Q, R = (None if weights is None else np.array(weights) for weights in (settings.Q, settings.R))
             model = build_model(plant, config.period, Q, R, settings.terminal)
-        except ModelError as error:
+            build_estimator(config, model)
+        except (ModelError, ConfigError) as error:
             return self._refuse(str(error))
         return self._look(config, model, plant)
 

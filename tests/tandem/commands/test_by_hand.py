@@ -22,7 +22,7 @@ from protocol import messages as m
 from protocol import topics
 from tandem import certificate_authority
 from tandem.cli import main
-from tandem.hand_session import Follower, assignments, completed, lease_of, line
+from tandem.hand_session import Follower, assignments, clipped, completed, lease_of, line
 from tandem.terminal import Refused
 from tests.helpers.live import BusListener, free_endpoint, live_config, wait_for
 
@@ -200,6 +200,11 @@ def test_inputs_are_named_and_the_others_stay() -> None:
     assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]  # type: ignore[arg-type]
     with pytest.raises(Refused, match="name a too"):
         completed({"b": 3.0}, two, None)  # type: ignore[arg-type]
+
+
+def test_what_the_gateway_clips_is_said() -> None:
+    assert clipped(np.array([2000.0]), PLANT) == f"; outside of U, u is clipped to {PLANT.u_max[0]:g}"
+    assert clipped(PLANT.u_max, PLANT) == ""
 
 
 def test_a_line_says_what_acts_and_the_nearest_bound() -> None:

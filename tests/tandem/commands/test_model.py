@@ -95,6 +95,18 @@ def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: 
     assert "poles, 1/s: 0, 0; by itself it does not come back" in said(capsys, "mine")[1]
 
 
+def test_a_state_of_which_no_sensor_tells_is_a_fault(mine: Any, capsys: Capture) -> None:
+    limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
+    mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
+    code, found = checked(
+        capsys, "mine", "--set", "estimator.kind=kalman", "--set", 'estimator.measured=["x2"]'
+    )
+    assert code == 2
+    assert found["faults"] == [
+        "estimator.measured = x2: what is measured never tells of x1, which would have to be measured too"
+    ]
+
+
 def test_the_numbers_of_the_json_are_those_of_the_model(mine: Any, capsys: Capture) -> None:
     mine(PENDULUM)
     code, found = checked(capsys, "mine", *TEN)

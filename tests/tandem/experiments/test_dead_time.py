@@ -154,3 +154,11 @@ def test_what_the_configuration_says_of_it() -> None:
     with pytest.raises(ConfigError, match=r"certified sets .* dead time of 0\.1 s"):
         ControllerCore(invariant, "controller-a")
     assert guarantee(both, build_model(both)).startswith("guaranteed: nothing; first_step")
+
+
+def test_what_is_guaranteed_is_not_so_of_an_estimate() -> None:
+    exact, estimated = compressor(), compressor("estimator.kind=kalman")
+    said = guarantee(exact, build_model(exact))
+    assert "estimate" not in said
+    assert guarantee(estimated, build_model(estimated)).startswith(said)
+    assert "for the true state nothing is guaranteed" in guarantee(estimated, build_model(estimated))
