@@ -98,9 +98,12 @@ def more(oracle: DnnOracle, state: OracleState, x: np.ndarray) -> OracleState:
     return oracle.learn(state, x, np.array([0.1]), 0.01 * np.array([x[0] + 0.3, x[1], 0.0, 0.2]))
 
 
-def offer(oracle: DnnOracle, state: OracleState, layers: Layers, version: int) -> tuple[OracleState, Verdict]:
+def offer(
+    oracle: DnnOracle, state: OracleState, layers: Layers, version: int, later: int | None = None
+) -> tuple[OracleState, Verdict]:
     layers = [layer.astype(np.float32).astype(float) for layer in layers]
-    return oracle.adopt(state, HiddenSet(version, layers, hash_layers(layers), oracle.description.sha256()))
+    offered = HiddenSet(version, layers, hash_layers(layers), oracle.description.sha256(), later)
+    return oracle.adopt(state, offered)
 
 
 def nudged(hidden: Layers) -> Layers:
@@ -146,6 +149,27 @@ def _worse_elsewhere(state: OracleState) -> Layers:
     hidden[1][0, :] += 0.5
     hidden[1][1, :] = 0.5
     return hidden
+
+
+def test_a_set_that_says_what_it_was_trained_on_must_be_as_good_on_what_came_after() -> None:
+    state = learned(60, spread=0.01)
+    rng = np.random.default_rng(1)
+    for _ in range(28):
+        # Labels so noisy that nothing can be seen on them.
+        h = 10.0 * ORACLE.output_scale * rng.normal(size=4)
+        state = {**ORACLE.learn(state, rng.normal(size=4) * 0.01, np.array([0.1]), h), "K": state["K"]}
+    for _ in range(12):
+        state = {**more(ORACLE, state, np.array([0.4, 0.0, 0.0, 0.0])), "K": state["K"]}
+    worse = _worse_elsewhere(state)
+    after, verdict = offer(ORACLE, state, worse, 1, later=12)
+    assert verdict.outcome == "refused"
+    assert "of 12 samples" in verdict.reason
+    assert_as_it_was(after, state)
+    # Too few say nothing, and neither does a set without a word.
+    assert offer(ORACLE, state, worse, 1, later=9)[1].outcome == "adopted"
+    assert offer(ORACLE, state, worse, 1)[1].outcome == "adopted"
+    # Later than all that is remembered is all of it.
+    assert offer(ORACLE, state, worse, 1, later=2**62)[1].outcome == "adopted"
 
 
 def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> None:
