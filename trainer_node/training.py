@@ -187,15 +187,17 @@ class Trainer:
         return 1.0 / np.sqrt(len(noise) * np.maximum(noise, LEAST_VARIANCE))
 
     def due(self, output: OutputWeights) -> bool:
-        """Whether enough new samples came since the last training began; where labels have a variance, as `Pace` has it.
+        """Whether enough new samples came since the last training began; `Pace` says it where labels have a variance.
 
         output: the newest; the loss on new samples is that under its K.
         """
         if self._fresh < self.config.train_every or len(self.buffer) < self.config.min_samples:
             return False
-        if self._weights is not None and not self._pace.over(self._fresh) and self._pace.must_look(self._fresh):
+        if self._weights is None or self._pace.over(self._fresh):
+            return True
+        if self._pace.must_look(self._fresh):
             self._pace.look(self._loss_on_latest(output))
-        return self._weights is None or self._pace.over(self._fresh)
+        return self._pace.over(self._fresh)
 
     def _loss_on_latest(self, output: OutputWeights) -> float:
         """Of the hidden layers that K belongs to; 0 where it cannot be used."""

@@ -22,12 +22,11 @@ from protocol.topics import Topic
 
 Json = dict[str, Any]
 Vector = list[float]
-NAMED_AFTER = dict.fromkeys(
-    ["x", "h", "h_hat", "oracle_norms", "column_norms", "target_x", "weight", "constant_weight", "deviation", "noise"],
-    "states",
-) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
-"""Of each vector, the plant's attribute that has the names of its entries."""
 VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation", "noise")
+NAMED_AFTER = dict.fromkeys((*VECTORS, "h", "h_hat", "column_norms"), "states") | dict.fromkeys(
+    ("u", "applied", "target_u"), "inputs"
+)
+"""Of each vector, the plant's attribute that has the names of its entries."""
 LACKING = (*VECTORS, "sensor_faults", "reference")
 """What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {

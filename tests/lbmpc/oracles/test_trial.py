@@ -19,7 +19,8 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import Summary, summarise
-from tandem.experiments.simulation.lockstep import simulate
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow, simulate
 from tests.helpers.science import compressor, describe
 from verification.attacks import Forge, Known, crude, drift, elsewhere, follow_attacked, noise
 
@@ -293,6 +294,22 @@ def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> N
         assert result.first_tick <= tick
     # Another rule is another run: the comparison sees it.
     assert not replay(run, None, ["adaptation.trial.floor=0.0"]).equal
+
+
+def test_a_tick_says_how_many_samples_came_after_those_of_its_set_and_replays() -> None:
+    noisy = ["estimator.kind=kalman", "estimator.noise=0.001", "plant.sensors.noise=0.001"]
+    config = override(Config(), [*SMALL, *noisy])
+    run = follow(config, 60, Faults(training_seconds=0.3)).run
+    core = ControllerCore(config, "controller-simulated")
+    offered = [(tick, core.translation.observation(tick).hidden) for tick in run.ticks if tick.weights]
+    assert offered
+    for tick, hidden in offered:
+        assert hidden is not None
+        # Trained in the tick that learned its last sample, six ticks before.
+        assert hidden.later == 6
+        assert tick.weights.newest == tick.seq - 7
+    assert replay(run).equal
+    assert replay(run, from_tick=45).equal
 
 
 def test_stale_sets_under_new_versions_are_refused_in_a_replay_from_a_keyframe_too() -> None:
