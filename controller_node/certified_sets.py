@@ -26,7 +26,7 @@ from lbmpc.model import Model
 from lbmpc.plants import PLANTS, Plant
 from lbmpc.sets.certificate import FORMAT, Certificate, CertificateError, decode, encode, hashes, model_of
 from lbmpc.sets.certificate import require_match as require_model
-from lbmpc.sets.motion import over_any_delay, require_no_dead_time
+from lbmpc.sets.motion import over_any_delay, require_certifiable
 from node_runtime.config.plant import initial_state
 from node_runtime.config.sections import Config
 from node_runtime.config.shipped import shipped
@@ -281,7 +281,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
         ConfigError: there is none, it was edited, it is about another model, or the plant has a dead time.
     """
     try:
-        require_no_dead_time(model)
+        require_certifiable(model)
     except CertificateError as error:
         raise ConfigError(f"controller.tightening = 'invariant': {error}") from error
     named = config.controller.sets

@@ -115,7 +115,7 @@ class Kept:
     seconds: float
     """How long it was followed: to the end, or until it left X."""
     left: str
-    """The state that left X first, or why the motion could not be followed; "": it stayed."""
+    """The state or row that left X first, or why the motion could not be followed; "": it stayed."""
 
 
 def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float) -> Kept:
@@ -127,9 +127,9 @@ def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float
     coming = [plant.safe_input] * math.ceil(plant.dead_time / model.period - 1e-9)
     steps = max(1, round(seconds / model.period))
     for k in range(steps + 1):
-        outside = np.flatnonzero((x < plant.x_min) | (x > plant.x_max))
+        outside = np.flatnonzero(plant.beyond_x(x) > 0.0)
         if outside.size:
-            return Kept(k * model.period, plant.states[int(outside[0])])
+            return Kept(k * model.period, plant.x_names[int(outside[0])])
         try:
             coming.append(plant.safe_input_at(x))
             x = step(x, coming.pop(0), model.period)

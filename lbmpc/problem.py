@@ -29,7 +29,7 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
 from lbmpc.sets.guard import Guard
 from lbmpc.sets.invariance.terminal import terminal_set
 from lbmpc.sets.invariance.tube import tighten, tube_margins
-from lbmpc.sets.motion import require_no_dead_time, require_prediction
+from lbmpc.sets.motion import require_certifiable, require_prediction
 
 Tightening = Literal["none", "first_step", "tube", "invariant"]
 
@@ -40,6 +40,7 @@ class Problem:
 
     `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty
     `penalty` times the model's `cost_scale` per half-width of violation, unless a set guarantees that they can be kept.
+    Those of less importance give way first, `priorities`.
     """
 
     model: Model
@@ -57,6 +58,11 @@ class Problem:
     def input_steps(self) -> np.ndarray:
         """By how much an input may change from stage to stage, (m,); infinite where it may step."""
         return self.model.plant.input_rates * self.model.period
+
+    @cached_property
+    def priorities(self) -> tuple[int, ...]:
+        """Of the rows that all `states` share, in whose order they give way: 0 last."""
+        return (0,) * self.model.d + self.model.plant.state_rows.priorities
 
     @cached_property
     def looks_back(self) -> bool:
@@ -85,15 +91,15 @@ def build_problem(
     Raises:
         ModelError: the plant runs away within the horizon.
         EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
-        CertificateError: `invariant` without a certificate, with that of another model, or with a dead time; `tube` or
-            `invariant` where an input has a rate limit.
+        CertificateError: `invariant` without a certificate, with that of another model, with a dead time or with rows
+            beside the boxes; `tube` with rows of inputs; either where an input has a rate limit.
     """
     require_horizon(model, horizon)
     if tightening in ("tube", "invariant"):
         _require_steps(model, tightening)
     guard = None
     if tightening == "invariant":
-        require_no_dead_time(model)
+        require_certifiable(model)
         if certificate is None:
             raise CertificateError(
                 "the tightening `invariant` needs certified sets: tandem sets compute makes them"
@@ -126,6 +132,11 @@ def build_problem(
 def _require_steps(model: Model, tightening: Tightening) -> None:
     """What these two claim, X for ever, they claim of inputs that may step. The actuator's rate is physics: it wins."""
     plant = model.plant
+    if plant.input_rows.names and tightening == "tube":
+        raise CertificateError(
+            "the tightening `tube` takes inputs in boxes, and there are rows of several "
+            f"({', '.join(plant.input_rows.names)}): leave these out, or take the tightening `first_step`"
+        )
     if limited := [
         name for name, rate in zip(plant.inputs, plant.input_rates, strict=True) if np.isfinite(rate)
     ]:

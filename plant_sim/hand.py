@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from lbmpc.plants import Description
-from plant_sim.orders import within
 from plant_sim.way_back import Ahead, WayBack
 from protocol.messages import Override
 
@@ -69,7 +68,7 @@ class Hand:
         if own and not self.acts:
             return "ended"
         self._said, self.ended, self._given_back = override, "", None
-        self._wanted, self.until = within(self._plant, override.u), t + override.lease
+        self._wanted, self.until = self._plant.within(override.u), t + override.lease
         return "ok"
 
     def end(self, why: str) -> None:

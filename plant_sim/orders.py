@@ -22,7 +22,7 @@ class Drive:
     """What acts from some moment on."""
 
     u: np.ndarray
-    """(m,), within the actuator's range."""
+    """(m,), in U."""
     source: InputSource
     until: float
     """When something else takes over if no command comes; infinite where nothing does."""
@@ -60,14 +60,14 @@ class Orders:
     """
 
     def __init__(self, plant: Description, command: Command, arrived: float, patience: float):
-        """`command` must have the plant's dimensions; what acts of it is clipped to [u_min, u_max]."""
+        """`command` must have the plant's dimensions; what acts of it is brought into U."""
         self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived
         self._period = command.period
         self._patience_ends = arrived + patience * command.period
         self._plant = plant
         self._plan = [command.u, *command.plan[1:]]
-        self._first = within(plant, command.u)
+        self._first = plant.within(command.u)
 
     def without_plan(self) -> Orders:
         """The same command, after which the safe input follows."""
@@ -80,27 +80,22 @@ class Orders:
         if self._patience_ends > _reached(t, self._period):
             return Drive(self._first, "command", self._patience_ends)
         if standby is not None and (backup := standby.drive(t, measure)) is not None:
-            return Drive(within(self._plant, backup[0]), "plan", backup[1])
+            return Drive(self._plant.within(backup[0]), "plan", backup[1])
         entry = _elapsed(self.arrived, t, self._period)
         ends = self.arrived + (entry + 1) * self._period
         if entry < len(self._plan):
             # Entry by entry, as they are needed: most plans are never followed beyond their first.
-            return Drive(within(self._plant, self._plan[entry]), "plan", ends)
+            return Drive(self._plant.within(self._plan[entry]), "plan", ends)
         return safe_drive(self._plant, measure, ends)
 
 
 def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
     """The safe input; of one that depends on the state: until `ends`, and without its feedback where none is known."""
     if plant.safe_gain is None:
-        return Drive(within(plant, plant.safe_input), "safe", math.inf)
+        return Drive(plant.within(plant.safe_input), "safe", math.inf)
     x = measure()
     u = plant.safe_input if x is None or not np.isfinite(x).all() else plant.safe_input_at(x)
-    return Drive(within(plant, u), "safe", ends)
-
-
-def within(plant: Description, u: list[float] | np.ndarray) -> np.ndarray:
-    """The nearest input, (m,), in the actuator's range."""
-    return np.minimum(np.maximum(u, plant.u_min), plant.u_max)
+    return Drive(plant.within(u), "safe", ends)
 
 
 def _reached(t: float, period: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lbmpc.plants import Description
 from plant_sim.hand import Hand, HandVerdict
-from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive, within
+from plant_sim.orders import Drive, Measure, Orders, Standby, safe_drive
 from plant_sim.rate_limit import RateLimit
 from plant_sim.way_back import WayBack
 from protocol.messages import Backup, Command, InputSource, Override, Piece, PlantState
@@ -83,7 +83,7 @@ class Shield:
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
         # Before anything acts, the actuator is where it is without anybody.
-        self._rate_limit = RateLimit(plant.input_rates, period, within(plant, plant.safe_input))
+        self._rate_limit = RateLimit(plant, period)
         self._first: float | None = None
         self._t = self._measured = self._acted = -math.inf
         self._seq = -1
@@ -198,11 +198,11 @@ class Shield:
     def acting(self) -> np.ndarray:
         """The input that acts, (m,); where nobody knows, what the actuator has without anybody."""
         u = self._tape[-1].u
-        return within(self.plant, self.plant.safe_input) if u is None else u
+        return self.plant.within(self.plant.safe_input) if u is None else u
 
     def rest(self) -> np.ndarray | None:
         """The input, (m,), to leave a machine with, at once; None: one that could stand still needs none."""
-        return None if self._held else within(self.plant, self.plant.safe_input)
+        return None if self._held else self.plant.within(self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
         if (u := self.hand.input(t)) is not None:

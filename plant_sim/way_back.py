@@ -1,7 +1,7 @@
 """Whether a plant under an input by hand can still be brought back inside X, one period later.
 
 A gateway knows the linear model and no h. So of the state after one more period under u it asks whether the feedback of
-the model, clipped to U and to the inputs' rates, keeps what the model predicts in X from there on,
+the model, brought into U and within the inputs' rates, keeps what the model predicts in X from there on,
 
     z_1 = A x + B u,    v_i = clip(K z_i, U and the rate after v_{i-1}),    z_{i+1} = A z_i + B v_i,
     z_i in (1 - margin_i) X - (A + BK)^{i-1} W                                            i = 1 .. N,
@@ -19,6 +19,8 @@ import numpy as np
 
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.plants import Known, Plant
+from lbmpc.plants.rows import together
+from lbmpc.sets.constraint_sets import state_set
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
@@ -48,14 +50,18 @@ class WayBack:
         self._w = plant.W * model.period
         self._absolute = np.abs(model.A)
         shares = np.minimum(np.arange(1, steps + 1) / RAMP, 1.0)[:, None]
-        inside = margin * shares * plant.x_scale
-        self._low, self._high = plant.x_min - plant.x_e + inside, plant.x_max - plant.x_e - inside
+        X, inside = state_set(model), margin * shares
+        # The box, then the rows beside it.
+        self._rows, self._names = plant.state_rows.F, X.names
+        widths = np.concatenate([plant.x_scale, plant.state_rows.ranges])
+        self._low, self._high = X.lower + inside * widths, X.upper - inside * widths
         self._u_low, self._u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
+        self._beside = plant.input_rows.about(plant.u_e)
         self._step = plant.input_rates * model.period
         powers = [np.eye(model.d)]
         for _ in range(steps - 1):
             powers.append(model.closed_loop @ powers[-1])
-        self._spread = np.abs(np.array(powers))
+        self._spread = np.abs(np.array([self._bounded(power) for power in powers]))
 
     def of(self, x: np.ndarray) -> Ahead:
         """Where a measured state, (d,), is."""
@@ -68,6 +74,8 @@ class WayBack:
 
     def reached(self, acting: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """The input, (m,), that acts in the next period where `wanted` is asked for: as far as its rate allows."""
+        if self._beside.names:
+            return together(wanted, acting, acting - self._step, acting + self._step)
         return np.minimum(np.maximum(wanted, acting - self._step), acting + self._step)
 
     def lost(self, there: Ahead, u: np.ndarray) -> str:
@@ -78,13 +86,19 @@ class WayBack:
             low, high = self._low + beside, self._high - beside
             for i in range(len(low)):
                 # A number that is none is not inside.
-                inside = (z >= low[i]) & (z <= high[i])
+                values = self._bounded(z)
+                inside = (values >= low[i]) & (values <= high[i])
                 if not inside.all():
-                    state = model.plant.states[int(np.argmin(inside))]
-                    return f"{state} would leave X within {(i + 1) * model.period:.3g} s"
-                v = self.reached(v, np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high))
+                    name = self._names[int(np.argmin(inside))]
+                    return f"{name} would leave X within {(i + 1) * model.period:.3g} s"
+                fed_back = np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high)
+                v = self.reached(v, self._beside.pulled(fed_back, 0.0))
                 z = model.step(z, v)
         return ""
+
+    def _bounded(self, z: np.ndarray) -> np.ndarray:
+        """What X bounds: z, (d, ...), and below it the values of its rows."""
+        return np.concatenate([z, self._rows @ z]) if len(self._rows) else z
 
 
 def way_back_of(config: Config, plant: Known | Plant) -> WayBack:

@@ -125,8 +125,8 @@ def figures(names: Sequence[str], values: Sequence[float] | np.ndarray) -> str:
 def line(state: m.PlantState, plant: Description, seconds: float) -> str:
     """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
     x, acts = np.array(state.x), acting(state)
-    room = np.minimum(x - plant.x_min, plant.x_max - x) / plant.x_scale
+    room = -plant.beyond_x(x)
     least = int(np.argmin(room))
     u = "not known" if acts is None else figures(plant.inputs, acts)
-    margin = f"margin {room[least]:.3f} ({plant.states[least]})"
+    margin = f"margin {room[least]:.3f} ({plant.x_names[least]})"
     return f"{seconds:6.1f} s  {state.source:7}  {figures(plant.states, x)}  |  {u}  |  {margin}"

@@ -84,7 +84,7 @@ def shared_fields(known: Known) -> dict[str, Any]:
         *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
     )
     fields = {key: getattr(known, key) for key in names}
-    fields |= {key: dict(getattr(known, key)) or None for key in ("scale", "names")}
+    fields |= {key: dict(getattr(known, key)) or None for key in ("scale", "names", "rows")}
     return fields | {"dead_time": known.dead_time or None}
 
 

@@ -61,14 +61,15 @@ def from_words(words: Sequence[str]) -> dict[str, float]:
 def from_file(path: Path, lease: float | None = None) -> m.Reference:
     """Of a CSV file, whose first line names its columns: time, and states. Raises `Refused`."""
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file.read(LARGEST).splitlines()) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise Refused(f"{path}: cannot be read ({error})") from error
     names = [name.strip() for name in rows[0]] if rows else []
     if len(names) < 2 or names[0] != TIME or len(set(names)) < len(names):
+        found = f", and it is {','.join(names)[:60]!r}" if names else ""
         raise Refused(
-            f"{path}: its first line names the columns: {TIME}, then states, each once, as in time,y"
+            f"{path}: its first line names the columns: {TIME}, then states, each once, as in time,y{found}"
         )
     if not 1 < len(rows) <= m.MOST_POINTS + 1:
         raise Refused(f"{path}: {len(rows) - 1} rows; 1 to {m.MOST_POINTS} below the names of the columns")

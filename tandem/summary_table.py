@@ -15,7 +15,7 @@ FOR_A_PERSON = ("skipped_slots",)
 
 MEANING = {
     "ticks": "control steps",
-    "late_ticks": "began later than they may",
+    "late_ticks": "began later than they may, or took longer than a period",
     "skipped_slots": "slots without a tick",
     "lost_ticks": "never reached the recorder",
     "weights_adopted": "sets of hidden weights",
@@ -28,12 +28,13 @@ MEANING = {
     "sensor_faults": "sensors that were not believed",
     "target_distance": "of the last target's outputs, of their half-widths",
     "J_by_episode": "the plant started so often; what follows is their mean or the worst of them",
-    "J": "sum of the stage costs, Q and R per second",
+    "J": "sum of the stage costs, Q and R per second, from the set-points and else from x_e, u_e",
     "deviation": "integral of the performance states' squared deviations",
     "overshoot": "share of the state's own initial deviation",
     "settled_s": "all performance states within 4 % of their half-widths",
     "settled_by_state_s": "each of them",
     "constraint_violations": "at samples: true state or applied input outside X or U",
+    "violated_rows": "of these, by row beside the boxes",
     "excess_between_samples": "largest distance of the true motion from X, of a half-width",
     "offset": "of the outputs in the last second, of their half-widths",
     "solve_ms": "p50 / p99 / max",
@@ -59,6 +60,7 @@ OF_EACH_STATE = {
 """Which figure of each performance state these are."""
 WHERE_THERE_IS_ONE = (
     "unreached_ticks",
+    "violated_rows",
     "target_distance",
     "offset",
     "sensor_faults",

@@ -1,13 +1,15 @@
 """Whether a rate limit of the input holds whoever commands: `python -m verification.input_rates`.
 
-In each seed the compressor begins elsewhere, commands come up to a fifth of a period early or late, and the controller
-falls silent again and again, for up to twice its horizon: the plan, the backup policy and the safe input act. Every
-input that is written is kept, with its time.
+Without a hand on the switch, in each seed: the compressor begins elsewhere, commands come up to a fifth of a period
+early or late, and the controller falls silent again and again, for up to twice its horizon: the plan, the backup policy
+and the safe input act. Every input that is written is kept, with its time. By hand, in lock-step: a person drives by
+random inputs now and then, until a random moment or until the plant would leave X; in the last row behind a dead time.
 """
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -23,10 +25,18 @@ from node_runtime.config.sections import Config
 from plant_sim.shield import Shield
 from plant_sim.simulator import Motion
 from protocol import messages as m
+from tandem.experiments.simulation.lockstep import LockStep
 
 SETTINGS = ["controller.horizon=20", "trainer.enabled=false", "network.hidden=[8,8]"]
 LATE = 0.2
 """Share of a period by which a command is early or late at most, about its usual time."""
+BY_HAND = [
+    "plant.x0=[0.4, 1.6, 1.1547, 0.0]",
+    "controller.oracle=constant",
+    "controller.solver.compile=never",
+]
+DEAD_TIME = 0.125
+"""Seconds, a broken number of periods: of one more row."""
 SILENT = 0.08
 """Of all ticks those at which a silence begins."""
 
@@ -89,6 +99,35 @@ def follow(config: Config, seed: int, ticks: int) -> Found:
     return Found(steps, samples, sources)
 
 
+def by_hand(config: Config, seed: int, ticks: int) -> Found:
+    """One seed, `ticks` long, with a person at the switch now and then; shares as of `Found`."""
+    rng, plant = np.random.default_rng(seed), MOORE_GREITZER
+    loop = LockStep(config)
+    states, until = [], int(rng.integers(5, 20))
+    for k in range(ticks):
+        if k == until:
+            if loop.by_hand is None:
+                loop.manual(rng.uniform(plant.u_min, plant.u_max))
+            else:
+                loop.auto()
+            until += int(rng.integers(2, 20))
+        try:
+            states.append(loop.step()[0])
+        except PlantError:
+            # Lost, with so slow an input; what was written until then counts.
+            break
+    rate, period = float(loop.core.plant.input_rates[0]), config.period
+    written, t = [(-np.inf, float(plant.safe_input[0]))], 0.0
+    for state in states[1:]:
+        for piece in state.pieces or [m.Piece(seconds=period, u=state.applied or [])]:
+            written.append((t, piece.u[0]))
+            t += piece.seconds
+    applied = [state.applied[0] for state in states if state.applied is not None]
+    counted = Counter[str](state.source for state in states)
+    samples = float(np.abs(np.diff(applied)).max()) / (rate * period)
+    return Found(_largest(written, rate, period), samples, dict(counted))
+
+
 def _tick(seq: int, t: float, state: m.PlantState) -> m.Tick:
     return m.Tick(
         run_id="controller",
@@ -114,7 +153,7 @@ def _largest(written: list[tuple[float, float]], rate: float, period: float) -> 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Whether a rate limit of the input holds, through jitter and silence of the controller."""
+    """Whether a rate limit of the input holds, through jitter, silence of the controller and manual hand-over."""
 
     seeds: int = 20
     ticks: int = 200
@@ -124,11 +163,21 @@ class Arguments:
 def main(chosen: Arguments) -> int:
     config = load("compressor", [*SETTINGS, f"plant.input_rate_max.u={chosen.rate}"])
     console = Console(width=120, highlight=False)
-    found = [follow(config, seed, chosen.ticks) for seed in range(chosen.seeds)]
+    hand = override(config, BY_HAND)
+    late = override(hand, [f"plant.dead_time={DEAD_TIME}"])
+    rows = [("", config, follow)] * chosen.seeds + [("by hand", hand, by_hand)] * chosen.seeds
+    seeds = [*range(chosen.seeds), *range(chosen.seeds), 0]
+    found = []
     console.print("seed | written | applied | samples by source")
-    for seed, one in enumerate(found):
+    for seed, (what, settings, run) in zip(
+        seeds, [*rows, ("by hand, dead time", late, by_hand)], strict=True
+    ):
+        one = run(settings, seed, chosen.ticks)
+        found.append(one)
         by_source = ", ".join(f"{count} {source}" for source, count in sorted(one.sources.items()))
-        console.print(f"{seed:4d} | {one.steps:7.4f} | {one.samples:7.4f} | {by_source}")
+        console.print(
+            f"{seed:4d} | {one.steps:7.4f} | {one.samples:7.4f} | {by_source}{what and f'; {what}'}"
+        )
     held = all(max(one.steps, one.samples) <= 1.0 + 1e-5 for one in found)
     console.print("the limit holds" if held else "THE LIMIT IS BROKEN")
     return 0 if held else 1

@@ -1,7 +1,8 @@
 """How set-points are followed where the model is wrong: `python -m verification.set_points`.
 
-Lock-step runs of the compressor with a slope of 1.4 in the place of its model's 1.5. How far y is from its set-point
-five seconds after each step; how far on a ramp, with a preview and without; and what a step costs.
+Lock-step runs of the compressor with a slope of 1.4 in the place of its model's 1.5, of the tanks and of the quadrotor
+in wind. How far an output is from its set-point some seconds after each step. And of the compressor: how far on a ramp,
+with a preview and without; and what a step costs.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import tyro
@@ -23,18 +25,42 @@ from tandem.set_points import set_point, trajectory
 
 HALF = 0.5
 """Half-width of y."""
-STEPS = (1.65, 1.7, 1.6, 1.68, 1.75, 1.65, 1.7)
-EACH, AFTER = 6.0, 5.0
-"""Seconds of each step, and when it is looked at."""
+EACH = 1.2
+"""How long a step lasts, as a share of the time after which it is looked at."""
 RAMP = ([0.0, 4.0, 8.0, 10.0], [1.65, 1.65, 1.75, 1.75])
 WARM = 40
 """Ticks that are not timed."""
 
 
 @dataclass(frozen=True)
+class Steps:
+    """Set-points of a plant, one after the other."""
+
+    config: str
+    """A shipped configuration, or a file."""
+    values: dict[str, tuple[float, ...]]
+    after: float = 5.0
+    """Seconds after each, when it is looked at."""
+
+
+START = ["plant.truth.slope=1.4", "plant.x0=[0.4, 1.6, 1.1547, 0.0]"]
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+STEPS = {
+    "compressor": Steps("compressor-cheap", {"y": (1.65, 1.7, 1.6, 1.68, 1.75, 1.65, 1.7)}),
+    # Five times the time constant of a tank.
+    "tanks": Steps(str(EXAMPLES / "tanks" / "tanks.toml"), {"h2": (10.0, 8.0, 11.0, 9.0, 10.0)}, 300.0),
+    "quadrotor": Steps(
+        str(EXAMPLES / "quadrotor" / "quadrotor.toml"),
+        {"y": (0.0, 0.5, 0.5, -0.5, 0.0), "z": (0.0, 0.0, 0.5, -0.5, 0.0)},
+    ),
+}
+
+
+@dataclass(frozen=True)
 class SetPoints:
     """What is measured."""
 
+    plants: list[str] = field(default_factory=lambda: list(STEPS))
     oracles: list[str] = field(default_factory=lambda: ["linear", "constant", "dnn", "perfect"])
     set: list[str] = field(default_factory=list)
     """Other settings, SECTION.KEY=VALUE."""
@@ -42,12 +68,15 @@ class SetPoints:
 
 def main(chosen: SetPoints) -> int:
     """Prints the tables."""
-    _say("| |", " | ".join(f"to {y:g}" for y in STEPS) + " |")
-    for oracle in chosen.oracles:
-        _say(
-            f"| `{oracle}` |",
-            " | ".join(f"{100 * off:.3f}" for off in _steps(_config(oracle, chosen))) + " |",
-        )
+    for plant in chosen.plants:
+        steps = STEPS[plant]
+        rows = [", ".join(f"{value:g}" for value in row) for row in zip(*steps.values.values(), strict=True)]
+        _say(f"| {plant}, {', '.join(steps.values)} |", " | ".join(f"to {row}" for row in rows) + " |")
+        for oracle in chosen.oracles:
+            found = _steps(_config(oracle, chosen, steps.config), steps)
+            _say(f"| `{oracle}` |", " | ".join(f"{100 * off:.3f}" for off in found) + " |")
+    if "compressor" not in chosen.plants:
+        return 0
     for oracle in chosen.oracles:
         before, now = (_ramp(_config(oracle, chosen), previewed) for previewed in (False, True))
         _say(f"| `{oracle}`, ramp |", f"{100 * before:.2f} | {100 * now:.2f} | {now / before:.2f} |")
@@ -58,17 +87,19 @@ def main(chosen: SetPoints) -> int:
 
 
 def _config(oracle: str, chosen: SetPoints, name: str = "compressor-cheap") -> Config:
-    start = ["plant.truth.slope=1.4", "plant.x0=[0.4, 1.6, 1.1547, 0.0]"]
+    start = START if name.startswith("compressor") else []
     return load(config_file(name), [*start, f"controller.oracle={oracle}", *chosen.set])
 
 
-def _steps(config: Config) -> Iterator[float]:
-    """|y - r| so many seconds after each, of the half-width; each is asked for when it begins."""
+def _steps(config: Config, steps: Steps) -> Iterator[float]:
+    """The largest |y - r| so many seconds after each, of the half-width; each is asked for when it begins."""
     loop = Loop(config=config)
-    for y in STEPS:
-        loop.set_point({"y": y})
-        states = [loop.step().x for _ in range(round(EACH * config.rate))]
-        yield abs(states[round(AFTER * config.rate)][1] - y) / HALF
+    own = [loop.plant.states.index(name) for name in steps.values]
+    for row in zip(*steps.values.values(), strict=True):
+        loop.set_point(dict(zip(steps.values, row, strict=True)))
+        states = [loop.step().x for _ in range(round(EACH * steps.after * config.rate))]
+        off = states[round(steps.after * config.rate)][own] - row
+        yield float((abs(off) / loop.plant.x_scale[own]).max())
 
 
 def _ramp(config: Config, previewed: bool) -> float:

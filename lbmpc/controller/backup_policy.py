@@ -26,7 +26,6 @@ the one that leaves X at once may end as near as the one that stays at its edge.
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -39,6 +38,7 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import remembered
 from lbmpc.problem import Problem
 from lbmpc.sets.constraint_sets import state_set
+from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.constraint_rows import Rows
 from lbmpc.solver.least_distance import NO_ROWS
 from lbmpc.solver.riccati import build_rows, build_sweep, with_input
@@ -117,7 +117,7 @@ class BackupPlanner:
             s: where the command that was just given leads, with its past where the oracle looks back.
             theta: the oracle's parameters.
             plan: the nominal plan from there on, (N, m).
-            xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`, the same at every step.
+            xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`.
             previous: that command, (m,), as for `Solver.solve`.
 
         Returns:
@@ -151,7 +151,7 @@ class BackupPlanner:
         return (0.0, free) if between is None else (share, between)
 
     def _end(self, rollout: Rollout) -> float:
-        """|z_N|_P of |z_0|_P, both from the target."""
+        """|z_N|_P of |z_0|_P, both from the last target."""
         inputs, d = self._subproblem.sweep.inputs, self.problem.model.d
         start, target = inputs["x"][:d, 0], inputs["xr"][:, -1]
         return self._norm(rollout.z[-1] - target) / max(self._norm(start - target), np.finfo(float).tiny)
@@ -190,7 +190,7 @@ class BackupPlanner:
 def _rows(problem: Problem, margin: float) -> Rows:
     """The rows of the learned states inside (1 - margin) X."""
     plain = state_set(problem.model)
-    inside = margin * problem.model.plant.x_scale
+    inside = margin * row_ranges(plain.F, problem.model.plant.x_scale)
     shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
     states = tuple(plain.minus(share * inside, share * inside) for share in shares)
     return Rows(replace(problem, states=states, soft=True, guard=None))
@@ -198,7 +198,7 @@ def _rows(problem: Problem, margin: float) -> Rows:
 
 def _between(plain: Rows, kept: Rows, share: float) -> Rows:
     """The rows with this share of the margin, in (0, 1)."""
-    rows = copy(kept)
+    rows = kept.fresh()
     both = (plain.lower, kept.lower), (plain.upper, kept.upper)
     rows.lower, rows.upper = ((1.0 - share) * without + share * with_it for without, with_it in both)
     return rows

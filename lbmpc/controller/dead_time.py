@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lbmpc.controller.signals import Observation
+from lbmpc.estimator.base import LAST
 from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, OracleState
 from lbmpc.plants.description import Description
@@ -27,8 +28,6 @@ A_PERIOD = 4
 """Inputs that are remembered of a period; of more, the older become their mean. A late command makes two."""
 SAME = 1e-9
 """Of a period: two moments that are so near are one."""
-LAST = 2**63 - 1
-"""Number of a sample, as 64 bits with a sign hold it."""
 REPORTED = 1e-3
 """Of a period: what is missing of it at most where a sample tells of all of it."""
 
@@ -98,7 +97,8 @@ class InputLine:
         else:
             periods = seen.sequence - sequence
             most = self._span / self._period
-            if sequence < 0 or seen.source != source or not 1.0 - most < periods <= most:
+            # One that comes so late that nothing from before it is remembered begins anew.
+            if sequence < 0 or seen.source != source or not 1.0 - most + REPORTED < periods <= most:
                 written = [_Written(self._span, self._before(seen), False)]
                 written += self._reported(seen, written)
             else:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbmpc.model import Model
+from lbmpc.plants.rows import together
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +40,15 @@ def feedback_plan(
     us: np.ndarray | float = 0.0,
     previous: np.ndarray | None = None,
 ) -> np.ndarray:
-    """us + K (x - xs) clipped to U, along the nominal prediction from x, (N, m); xs (d,) and us (m,): the target.
+    """us + K (x - xs) brought into U, along the nominal prediction from x, (N, m); xs (d,) and us (m,): the target.
 
     Where inputs have rate limits, each is brought within reach of the one before, the first of `previous`, (m,).
     """
     plant, inputs = model.plant, np.zeros((horizon, model.m))
+    beside = plant.input_rows.about(plant.u_e)
     for i in range(horizon):
-        inputs[i] = np.clip(us + model.K @ (x - xs), plant.u_min - plant.u_e, plant.u_max - plant.u_e)
+        fed_back = np.clip(us + model.K @ (x - xs), plant.u_min - plant.u_e, plant.u_max - plant.u_e)
+        inputs[i] = beside.pulled(fed_back, 0.0)
         if previous is not None:
             previous = inputs[i] = reachable(model, inputs[i], previous)
         x = model.A @ x + model.B @ inputs[i]
@@ -53,8 +56,13 @@ def feedback_plan(
 
 
 def reachable(model: Model, u: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,)."""
+    """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,).
+
+    Where U has rows beside its box, that on the straight way from there, which keeps them.
+    """
     step = model.plant.input_rates * model.period
+    if model.plant.input_rows.names:
+        return together(u, previous, previous - step, previous + step)
     return np.clip(u, previous - step, previous + step)
 
 

@@ -338,11 +338,15 @@ class Controller:
         return self._solver.feedback(s, first, previous)
 
     def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
-        """What was written before v_0, (m,): as the plant says, or as commanded; None: nothing depends on it."""
+        """What was written before v_0, (m,), in U: as the plant says, or as commanded; None: nothing depends on it."""
         if not self.problem.looks_back:
             return None
-        acts = acting(written)
-        return state.commanded if acts is None else acts
+        acts, plant = acting(written), self.model.plant
+        return (
+            state.commanded
+            if acts is None
+            else np.clip(acts, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
+        )
 
     def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
         """The plan within the rate limits from `previous` on."""

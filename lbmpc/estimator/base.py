@@ -14,6 +14,9 @@ from lbmpc.plants.linear_motion import Pieces
 
 EstimatorState = dict[str, np.ndarray]
 
+LAST = 2**63 - 1
+"""Number of a sample, as 64 bits with a sign hold it."""
+
 
 class Measured(NamedTuple):
     """One sample as it came, in deviation coordinates."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import schur
 
-from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured
+from lbmpc.estimator.base import LAST, Estimate, Estimator, EstimatorState, Measured
 from lbmpc.estimator.noise import NoiseFinder
 from lbmpc.model import Model
 from lbmpc.plants.linear_motion import Pieces, balanced
@@ -157,7 +157,7 @@ class KalmanEstimator(Estimator):
             return {**self._afresh(state), "sample": self.initial_state()["sample"]}
         if self._finder is not None:
             after = self._finder.begun(after, self._scaled(after))
-        return {**after, "sample": np.array([source, sequence + 1], dtype=np.int64)}
+        return {**after, "sample": np.array([source, min(sequence + 1, LAST)], dtype=np.int64)}
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}

@@ -9,6 +9,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from lbmpc.plants.rows import LinearRows, Row, rows_of
+
 STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
 INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
 TUPLES = ("states", "inputs", "performance", "kernel", "poles")
@@ -24,7 +26,7 @@ class PlantDefinitionError(LookupError):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Description:
-    """A plant in its own units, with box constraints, about a point at which it rests.
+    """A plant in its own units, with constraints, about a point at which it rests.
 
     Shapes: d states, m inputs; `x_*` are (d,), `u_*` are (m,), `W` is (d,). Lists are accepted for arrays and tuples.
     Nothing is checked here: `lbmpc.plants.get_plant` and `lbmpc.model.build_model` refuse a plant that cannot be used.
@@ -66,6 +68,9 @@ class Description:
     gateway. Of all inputs."""
     u_rate_max: np.ndarray | None = None
     """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
+    rows: Mapping[str, Row] = field(default_factory=dict)
+    """Constraints beside these boxes, by name, as {"surge": {"z": 1.0, "y": -0.5, "max": 0.3, "priority": 1}}: of
+    states, or of inputs. X and U are then what keeps boxes and rows."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain", "u_rate_max"):
@@ -80,6 +85,7 @@ class Description:
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
+        rows: Mapping[str, Row] | None = None,
     ) -> Self:
         """With other bounds, or about another point.
 
@@ -88,6 +94,7 @@ class Description:
             x_e, u_e: (d,) and (m,), where equations are linearised.
             dead_time: seconds; None: its own.
             input_rate_max: how fast an input may change, per second, by its name; others stay.
+            rows: beside the boxes, by name; others stay.
 
         Raises:
             KeyError: a bound of what is no state or input, a rate of what is no input.
@@ -116,6 +123,8 @@ class Description:
                     raise KeyError(name)
                 rates[self.inputs.index(name)] = rate
             new["u_rate_max"] = rates
+        if rows:
+            new["rows"] = {**self.rows, **rows}
         return replace(self, **new) if new else self
 
     def safe_input_at(self, x: np.ndarray) -> np.ndarray:
@@ -125,7 +134,31 @@ class Description:
             with np.errstate(over="ignore", invalid="ignore"):
                 fed_back = u + self.safe_gain @ (x - self.x_e)
             u = fed_back if np.isfinite(fed_back).all() else u
-        return np.minimum(np.maximum(u, self.u_min), self.u_max)
+        return self.within(u)
+
+    def within(self, u: Sequence[float] | np.ndarray) -> np.ndarray:
+        """An input of U near u, (m,): each in its bounds, and then as far to u_e as the rows need; u itself in U."""
+        return self.input_rows.pulled(np.minimum(np.maximum(u, self.u_min), self.u_max), self.u_e)
+
+    def beyond_x(self, x: np.ndarray) -> np.ndarray:
+        """How far x is beyond each bound of X, in half-widths, negative inside: (..., d) -> (..., d + rows)."""
+        boxes, rows = np.maximum(self.x_min - x, x - self.x_max) / self.x_scale, self.state_rows
+        return np.concatenate([boxes, rows.beyond(x)], axis=-1) if rows.names else boxes
+
+    @cached_property
+    def x_names(self) -> tuple[str, ...]:
+        """Of the bounds of X, (d + rows,): states, then rows."""
+        return (*self.states, *self.state_rows.names)
+
+    @cached_property
+    def state_rows(self) -> LinearRows:
+        """Of X, beside its box."""
+        return rows_of(self.rows, self.states, self.x_scale)
+
+    @cached_property
+    def input_rows(self) -> LinearRows:
+        """Of U, beside its box."""
+        return rows_of(self.rows, self.inputs, self.u_scale)
 
     @property
     def d(self) -> int:

@@ -25,6 +25,7 @@ from lbmpc.plants.faults import (
 )
 from lbmpc.plants.known import Known
 from lbmpc.plants.rest import nearest_rest
+from lbmpc.plants.rows import Row
 
 Rhs = Callable[[Any, Any], list[Any]]
 ROUNDS, STILL = 50, 1e-11
@@ -63,9 +64,10 @@ class Plant(Description):
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
+        rows: Mapping[str, Row] | None = None,
     ) -> Plant:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
-        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max)
+        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max, rows)
         if x_e is None or u_e is not None:
             return there
         rest = there.resting_near()

@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 
 from lbmpc.plants.description import INPUT_VECTORS, STATE_VECTORS, Description, PlantDefinitionError
+from lbmpc.plants.rows import PRIORITY, WORDS, coefficients
 
 TIME = "t"
 """The name of time in a plant's units."""
 SAME = 1e-5
 """Half-widths: a rest that is so near to what was asked for is that."""
+LEVELS = 10
+"""Priorities of rows: each may cost a QP."""
+INSIDE = 1e-6
+"""Of a row's range: how far inside a row of inputs u_e must be, since what breaks it is drawn to u_e."""
 W_IS = (
     "W is missing: give the half-widths of what the model does not know, per second, one for each of {names}. "
     "`tandem identify` finds them from a log; zeros claim that the model is exact"
@@ -87,6 +92,49 @@ def number_faults(plant: Description) -> Iterator[str]:
             f"u_rate_max is {shown(rates)}: give how fast each of {', '.join(plant.inputs)} may change, per second, "
             "a positive number or inf"
         )
+    yield from _rows(plant)
+
+
+def _rows(plant: Description) -> Iterator[str]:
+    """What is wrong with rows by themselves."""
+    rows: Any = plant.rows
+    known = (*plant.states, *plant.inputs)
+    if not isinstance(rows, Mapping):
+        yield f"rows is {rows!r}: give rows by name, as in {{'sum': {{{known[0]!r}: 1.0, 'max': 1.0}}}}"
+        return
+    if rows and (words := [name for name in known if name in WORDS]):
+        yield f"a state or input is called {words[0]!r}, which is a word of rows: call it something else"
+        return
+    for key, row in rows.items():
+        if not (isinstance(key, str) and key) or key in known:
+            yield f"a row is called {key!r}: give it a name that no state or input has"
+        elif not isinstance(row, Mapping) or not all(
+            isinstance(value, int | float) and np.isfinite(value) for value in row.values()
+        ):
+            yield f"row {key} is {row!r}: give finite numbers by name, and leave out a bound that it has not"
+        else:
+            yield from (f"row {key} {fault}" for fault in _one_row(plant, dict(row)))
+
+
+def _one_row(plant: Description, row: dict[str, float]) -> Iterator[str]:
+    parts, priority = coefficients(row), row.get(PRIORITY, 0)
+    known = (*plant.states, *plant.inputs)
+    if unknown := [name for name in parts if name not in known]:
+        yield f"has {unknown[0]!r}, which is no state or input: choose from {', '.join(known)}"
+        return
+    if not any(parts.values()):
+        yield f"has no coefficient but 0: give one for a state or an input, of {', '.join(known)}"
+    of_inputs = [name for name in parts if name in plant.inputs]
+    if of_inputs and len(of_inputs) < len(parts):
+        yield "has states and inputs: give one row for states, and one for inputs"
+    if of_inputs and PRIORITY in row:
+        yield "is of inputs and has a priority: an input is never outside of U, whatever it costs"
+    if "min" not in row and "max" not in row:
+        yield "has no bound: give min, max or both"
+    elif not row.get("min", -np.inf) < row.get("max", np.inf):
+        yield f"has min {row['min']:g} and max {row['max']:g}: min must be below max, or nothing keeps it"
+    if priority not in range(LEVELS):
+        yield f"has the priority {priority:g}: give a whole number from 0, that of the bounds, to {LEVELS - 1}"
 
 
 def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:
@@ -138,6 +186,25 @@ def bound_faults(plant: Description) -> Iterator[str]:
             f"safe_input of {plant.inputs[i]} is {plant.safe_input[i]:g}, outside u_min = {plant.u_min[i]:g} and "
             f"u_max = {plant.u_max[i]:g}: the plant cannot apply it"
         )
+    yield from _row_bounds(plant)
+
+
+def _row_bounds(plant: Description) -> Iterator[str]:
+    """Whether the equilibrium keeps all rows, and with it no polytope is empty; all widths are known."""
+    try:
+        states, inputs = plant.state_rows, plant.input_rows
+    except KeyError:
+        # A half-width that is missing is named above.
+        return
+    for rows, y, name, room in (
+        (states, plant.x_e, "x_e", 0.0),
+        (inputs, plant.u_e, "u_e", INSIDE),
+        (inputs, plant.safe_input, "safe_input", 0.0),
+    ):
+        for i in np.flatnonzero(rows.beyond(y) > -room).tolist():
+            low, high, value = rows.lower[i], rows.upper[i], float(rows.F[i] @ y)
+            must = "must lie between them" if not room else "must lie inside, off its edges"
+            yield f"row {rows.names[i]} is {value:g} at {name}, with min {low:g} and max {high:g}: {name} {must}"
 
 
 def pole_faults(plant: Description) -> Iterator[str]:

@@ -21,6 +21,7 @@ from lbmpc.plants.faults import (
 )
 from lbmpc.plants.matrices import matrix_faults, mode_faults, pair_faults
 from lbmpc.plants.rest import nearest_rest
+from lbmpc.plants.rows import Row
 from lbmpc.plants.written import read, written
 
 ROUNDING = 1e-12
@@ -71,9 +72,10 @@ class Known(Description):
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
+        rows: Mapping[str, Row] | None = None,
     ) -> Known:
         """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
-        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max)
+        there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max, rows)
         if x_e is None and u_e is None:
             return there
         refuse(self.name, all_faults(there))
@@ -126,6 +128,7 @@ class Known(Description):
         scale: Mapping[str, float] | None = None,
         names: Mapping[str, str] | None = None,
         dead_time: float = 0.0,
+        rows: Mapping[str, Row] | None = None,
     ) -> Known:
         """A plant of which a pair of matrices is known.
 
@@ -143,7 +146,7 @@ class Known(Description):
             safe_input: u_e by default.
             performance: all states by default.
             kernel: all states and inputs by default.
-            safe_gain, poles, scale, names, dead_time, u_rate_max: as the fields of these names.
+            safe_gain, poles, scale, names, dead_time, u_rate_max, rows: as the fields of these names.
 
         Raises:
             PlantDefinitionError: it cannot be used; the text names every fault.
@@ -176,6 +179,7 @@ class Known(Description):
             names=names or {},
             dead_time=dead_time,
             u_rate_max=u_rate_max,
+            rows=rows or {},
             A=A,
             B=B,
             period=period,

@@ -41,8 +41,9 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
     dead_time: float = 0.0
-    """Left out where there is none, as in what was written before there was such a field; so is the next."""
+    """Left out where there is none, as in what was written before there was such a field; so are the next."""
     u_rate_max: list[Number] | None = None
+    rows: dict[str, dict[str, float]] = {}
 
 
 FIELDS = Written.__struct_fields__

@@ -85,8 +85,16 @@ def require_prediction(model: Model) -> Continuous:
     return within
 
 
-def require_no_dead_time(model: Model) -> None:
-    """Raises `CertificateError`: there is one, and nothing here bounds what h adds up to until a command acts."""
+def require_certifiable(model: Model) -> None:
+    """Raises `CertificateError`: the plant has a dead time, or rows beside its boxes.
+
+    Nothing here bounds what h adds up to until a command acts, and a certificate knows X and U as boxes.
+    """
+    if model.plant.rows:
+        raise CertificateError(
+            f"{model.plant.name}: certified sets are made for X and U as boxes, and there are rows beside them "
+            f"({', '.join(model.plant.rows)}): leave these out, or take another controller.tightening"
+        )
     if model.plant.dead_time:
         raise CertificateError(
             f"{model.plant.name}: certified sets are about the state in which a command acts, and over a dead time of "

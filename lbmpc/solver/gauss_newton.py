@@ -193,7 +193,7 @@ class Solver:
                 subproblem.steered.copy(),
                 moved["U"].T.copy(),
                 moved["X"].T.copy(),
-                guess.shown if guess is not None else None,
+                guess.shown if guess is not None and not rows.ordered else None,
             )
 
     def feedback(

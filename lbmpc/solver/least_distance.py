@@ -13,7 +13,8 @@ import numpy as np
 # Of w, and of each row's scale. DAQP's own default, 1e-6, moves the first input by 5e-6.
 PRIMAL_TOLERANCE = 1e-9
 UNMOVED = 1e-12
-"""Of a row's scale: a row that w = 1 moves by less is not moved at all."""
+"""Of a row's scale: a row that w = 1 moves by less is not moved at all. Soft ones then are what they are: a position at
+the first step, say, of a model in which an input moves the speed."""
 SOFT = 8
 
 
@@ -57,9 +58,14 @@ class Shown:
         self.seen, self._free = seen, M.shape[1]
         rows = M[seen]
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
-        self._usable = bool((norms > UNMOVED * penalty.scale[seen]).all())
-        if not self._usable:
-            return
+        moved = norms > UNMOVED * penalty.scale[seen]
+        self._usable = not np.isnan(norms).any()
+        # Hard ones that are not moved are kept or not.
+        fixed = seen[~moved & ~penalty.soft[seen]]
+        self._fixed, self._low, self._high = fixed, lower[fixed], upper[fixed]
+        if not moved.all():
+            seen, rows, norms = seen[moved], rows[moved], norms[moved]
+        self._own = seen
         # Rows of length 1, so that DAQP's tolerances and weights mean distances.
         self._inverse = 1.0 / norms
         self._rows = rows * self._inverse[:, None]
@@ -72,12 +78,13 @@ class Shown:
 
     def solve(self, y: np.ndarray) -> np.ndarray | None:
         """w (n,) for the row values y (rows,) at w = 0; None when the shown rows contradict each other."""
-        if not self._usable:
+        fixed = y[self._fixed]
+        if not (self._usable and (fixed >= self._low).all() and (fixed <= self._high).all()):
             return None
-        if not len(self.seen):
+        if not len(self._own):
             # Rows may be outside by less than the tolerance: nothing holds w away from 0.
             return np.zeros(self._free)
-        offset = y[self.seen] * self._inverse
+        offset = y[self._own] * self._inverse
         if self._model is None:
             flag = self._set_up(offset)
         else:

@@ -59,7 +59,7 @@ def build_start(problem: Problem) -> ca.Function:
     lower, upper, steps = ca.MX.sym("lower", model.m), ca.MX.sym("upper", model.m), problem.input_steps
     state, inputs = x, list[ca.MX]()
     for entry, bounds in zip(ca.horzsplit(c), problem.inputs, strict=True):
-        low, high = bounds.lower, bounds.upper
+        low, high = bounds.lower[: model.m], bounds.upper[: model.m]
         if np.isfinite(steps).any():
             low = ca.fmax(low, inputs[-1] - steps) if inputs else lower
             high = ca.fmin(high, inputs[-1] + steps) if inputs else upper

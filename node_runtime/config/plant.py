@@ -15,6 +15,9 @@ from node_runtime.config.reference import is_reference, load, sha256_of
 from node_runtime.config.sections import DEAD_TIME, Config, ReferenceConfig, Shares
 from node_runtime.config.strict import ConfigError, did_you_mean
 
+Row = Mapping[str, float]
+"""As of `lbmpc.plants.description.Description.rows`."""
+
 
 class Described(Protocol):
     """What the checks need to know of a plant."""
@@ -40,6 +43,8 @@ class Described(Protocol):
     @property
     def input_rates(self) -> np.ndarray: ...
     @property
+    def rows(self) -> Mapping[str, Row]: ...
+    @property
     def W(self) -> np.ndarray: ...
     @property
     def x0(self) -> np.ndarray: ...
@@ -57,6 +62,7 @@ class Plant(Described, Protocol):
         u_e: Sequence[float] | None = None,
         dead_time: float | None = None,
         input_rate_max: Mapping[str, float] | None = None,
+        rows: Mapping[str, Row] | None = None,
     ) -> Self: ...
     def varied(self, **changes: float) -> Self: ...
 
@@ -187,6 +193,7 @@ def spelt_out(config: Config, plant: Described) -> Config:
             bounds=bounds,
             dead_time=plant.dead_time,
             input_rate_max=rates,
+            rows={name: dict(row) for name, row in plant.rows.items()},
         ),
         controller=msgspec.structs.replace(
             settings,
@@ -211,7 +218,7 @@ def _moves(value: Any) -> bool:
 
 
 def _as_configured(config: Config, plant: P) -> P:
-    """With the bounds and the equilibrium of the configuration."""
+    """With the bounds, the rows and the equilibrium of the configuration."""
     known = (*plant.states, *plant.inputs)
     for key, values, what, names in (
         ("plant.x0", config.plant.x0, "states", plant.states),
@@ -240,7 +247,7 @@ def _as_configured(config: Config, plant: P) -> P:
             hint = did_you_mean(name, plant.inputs, f"it has {', '.join(plant.inputs)}")
             raise ConfigError(f"plant.input_rate_max: {plant.name} has no input {name!r}; {hint}")
     there = config.plant
-    return plant.changed(there.bounds, there.x_e, there.u_e, there.dead_time, rates)
+    return plant.changed(there.bounds, there.x_e, there.u_e, there.dead_time, rates, there.rows)
 
 
 def _check_reference(reference: ReferenceConfig, plant: Described) -> None:

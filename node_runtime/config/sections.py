@@ -98,6 +98,10 @@ class PlantConfig(Section, frozen=True):
     part of the model, and another thing than `controller.input_delay_ms`, which ends at the gateway."""
     input_rate_max: dict[str, Positive] = msgspec.field(default_factory=dict)
     """How fast an input may change, in its unit per second, by its name, where that is not the plant's own."""
+    rows: dict[str, dict[str, float]] = msgspec.field(default_factory=dict)
+    """Constraints beside the bounds, by a name of their own: coefficients by the name of states, or of inputs, in plant
+    units, with `min`, `max` or both. Of states a `priority`: 0 is that of the bounds, and what has the higher number
+    gives way first. Those of the plant that are not named here stay."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """Parameters of the true plant where they differ from the model's, by name, `dead_time` among them: a model that is
     wrong. Or a reference to what moves in the plant's place: other equations, or an object with `step`."""

@@ -25,7 +25,7 @@ def excess(motion: Trajectory, plant: Description, truth: object) -> float | Non
 
     Args:
         motion: the samples, and what acted between them.
-        plant: its bounds are X.
+        plant: its bounds and rows are X.
         truth: the plant whose motion this is; it may differ from `plant`. None, or no equations: it is not known.
 
     Returns:
@@ -84,7 +84,7 @@ def behind(motion: Trajectory, dead_time: float) -> Trajectory:
 def _beyond(x: np.ndarray, plant: Description) -> float:
     """Of x, (..., d), in half-widths."""
     with np.errstate(over="ignore"):
-        return max(0.0, float((np.maximum(x - plant.x_max, plant.x_min - x) / plant.x_scale).max()))
+        return max(0.0, float(plant.beyond_x(x).max()))
 
 
 def _arrived(passed: np.ndarray, end: np.ndarray, truth: Plant) -> np.ndarray:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from lbmpc.plants import Description
+from node_runtime.config.sections import Config
 from protocol.messages import PlantState
 from run_log.errors import LogError
 from run_log.run import Run
@@ -36,6 +37,9 @@ class Trajectory(msgspec.Struct, frozen=True):
     """Where in these arrays the episodes begin."""
     by_hand: tuple[tuple[float, float], ...] = ()
     """(from, to) in seconds since the start: while a person drove it; not of a part."""
+    goal: np.ndarray | None = None
+    """(n, d) where the states should be, plant units, where somebody gave another reference than the configured one;
+    None: nobody did."""
 
     def part(self, first: int, last: int) -> Trajectory:
         """The motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
@@ -44,7 +48,9 @@ class Trajectory(msgspec.Struct, frozen=True):
         # What acted before the first sample is not of this part.
         applied[:1] = np.nan
         step, t = self.step[within], self.t[within]
-        return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, ((), *self.pieces[within][1:]))
+        pieces = ((), *self.pieces[within][1:])
+        goal = None if self.goal is None else self.goal[within]
+        return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, pieces, goal=goal)
 
     def episodes(self) -> list[Trajectory]:
         """Each of them as a trajectory of its own."""
@@ -71,7 +77,41 @@ def trajectory(run: Run, plant: Description) -> Trajectory:
         by_plant.setdefault(s.run_id, []).append(s)
     moved = [found for one in by_plant.values() if (found := _after_the_hold(one))]
     # Of a plant that never moved its last sample is all there is.
-    return motion(moved or [states[-1:]], plant, run.config.period)
+    starts = moved or [states[-1:]]
+    whole = motion(starts, plant, run.config.period)
+    return msgspec.structs.replace(whole, goal=_asked(run, [s for one in starts for s in one], plant))
+
+
+def goal(plant: Description, config: Config) -> np.ndarray:
+    """Where the states should be by the configuration, (d,), plant units: x_e, but for the outputs that the reference
+    gives a value."""
+    reference = config.reference
+    values = reference.values if reference.outputs else None
+    return _instead(plant, {} if values is None else dict(zip(reference.outputs or [], values, strict=True)))
+
+
+def _instead(plant: Description, values: dict[str, float]) -> np.ndarray:
+    wanted = plant.x_e.copy()
+    wanted[[plant.states.index(name) for name in values]] = [*values.values()]
+    return wanted
+
+
+def _asked(run: Run, states: list[PlantState], plant: Description) -> np.ndarray | None:
+    """(n, d) of `Trajectory.goal`. A sample that no tick of the log answers has the goal of the sample before."""
+    given = {(r.run_id, r.seq): r.reference for r in run.results if r.reference}
+    configured = goal(plant, run.config)
+    goals = {key: _instead(plant, values) for key, values in given.items()}
+    if all((one == configured).all() for one in goals.values()):
+        return None
+    of_sample = {
+        (tick.state.run_id, tick.state.seq): goals.get((tick.run_id, tick.seq), configured)
+        for tick in run.ticks
+        if tick.state is not None
+    }
+    found = [configured]
+    for s in states:
+        found.append(of_sample.get((s.run_id, s.seq), found[-1]))
+    return np.array(found[1:])
 
 
 def motion(episodes: list[list[PlantState]], plant: Description, period: float) -> Trajectory:

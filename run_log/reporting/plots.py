@@ -78,15 +78,16 @@ def _label(plant: Description, name: str, what: str = "") -> str:
     return words(f"{what}{name} ({'–' if unit in ('', '1') else unit})")
 
 
-def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, rest: float, scale: float) -> None:
+def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, aims: np.ndarray, scale: float) -> None:
     """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve.
 
-    scale: the half-width.
+    aims: what else is to be seen; scale: the half-width.
     """
     values = values[np.isfinite(values)]
     if not values.size:
         return
-    bottom, top = min(float(values.min()), rest), max(float(values.max()), rest)
+    shown = np.append(values, aims[np.isfinite(aims)])
+    bottom, top = float(shown.min()), float(shown.max())
     reach = 2 * max(top - bottom, 1e-9 * scale)
     drawn = [bound for bound in (low, high) if bottom - reach < bound < top + reach]
     bottom, top = min(bottom, *drawn, top), max(top, *drawn, bottom)
@@ -116,6 +117,16 @@ def _mark_by_hand(data: Traces, ax: Axes) -> None:
         ax.axvspan(began, ended, color=GREEN, alpha=0.12, linewidth=0, label=label)
 
 
+def _aim(data: Traces, ax: Axes, target: np.ndarray, rest: float) -> np.ndarray:
+    """Draws and gives back where the plan leads: the targets, or the equilibrium where there are none."""
+    if not np.isfinite(target).any():
+        ax.axhline(rest, color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+        return np.array([rest])
+    aims = np.where(np.isfinite(target), target, rest)
+    ax.step(data.t, aims, where="post", color=GREY, linestyle=":", linewidth=1.4, label="target of the plan")
+    return aims
+
+
 def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
     _mark_by_hand(data, ax)
@@ -124,11 +135,12 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     later = list(motion.starts[1:])
     t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
-    ax.axhline(plant.x_e[i], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    aims = _aim(data, ax, data.target_x[:, i], plant.x_e[i])
     if np.isfinite(data.reference[:, i]).any():
         r = data.reference[:, i]
         ax.step(data.t, r, where="post", color=GREEN, linestyle="--", linewidth=1.3, label="set-point")
-    _bounded(ax, plant.x_min[i], plant.x_max[i], x, plant.x_e[i], plant.x_scale[i])
+        aims = np.append(aims, r)
+    _bounded(ax, plant.x_min[i], plant.x_max[i], x, aims, plant.x_scale[i])
     ax.set_ylabel(_label(plant, plant.states[i]))
 
 
@@ -143,9 +155,9 @@ def _input(data: Traces, j: int, ax: Axes) -> None:
     )
     if data.fallback.any():
         ax.plot(data.t[data.fallback], u[data.fallback], "x", color=VERMILION, label="not from the solver")
-    ax.axhline(plant.u_e[j], color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
+    aims = _aim(data, ax, data.target_u[:, j], plant.u_e[j])
     values = np.concatenate([u, applied])
-    _bounded(ax, plant.u_min[j], plant.u_max[j], values, plant.u_e[j], plant.u_scale[j])
+    _bounded(ax, plant.u_min[j], plant.u_max[j], values, aims, plant.u_scale[j])
     ax.set_ylabel(_label(plant, plant.inputs[j]))
 
 

@@ -32,6 +32,9 @@ class Traces:
     """(n,) |h_hat - h|."""
     reference: np.ndarray
     """(n, d) where each state should be, NaN for what is no output, plant units."""
+    target_x: np.ndarray
+    target_u: np.ndarray
+    """(n, d) and (n, m) the rest that the plan leads to; NaN where that is the equilibrium."""
     weight: np.ndarray
     constant_weight: np.ndarray
     """(n, d) what counted of the network, and of a constant beside it."""
@@ -79,6 +82,8 @@ def traces(run: Run) -> Traces:
         h_hat=vectors([r.h_hat for r in results], plant.d),
         error=np.array([np.nan if r.prediction_error is None else r.prediction_error for r in results]),
         reference=np.array([[r.reference.get(name, np.nan) for name in plant.states] for r in results]),
+        target_x=vectors([r.target_x for r in results], plant.d),
+        target_u=vectors([r.target_u for r in results], plant.m),
         weight=vectors([r.weight for r in results], plant.d),
         constant_weight=vectors([r.constant_weight for r in results], plant.d),
         fallback=np.array([r.mode != "solver" for r in results]),

@@ -57,7 +57,7 @@ class SetPoint(Configured):
         results = ask(config, asked, self.seconds)
         if not results:
             text = f"no answer from a controller of {config.name} within {self.seconds:g} s"
-            terminal.complain(f"{text}: is it running, and does another commander speak?", self.json)
+            terminal.complain(f"{text}: is it running?", self.json)
             return 1
         verdict, _, why = results[0].reference_verdict.partition(": ")
         if verdict != "taken":

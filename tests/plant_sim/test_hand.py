@@ -262,6 +262,19 @@ def test_a_slow_actuator_needs_a_longer_way_back() -> None:
     assert ends[1] < ends[0] - 0.05
 
 
+def test_a_row_of_states_ends_it_by_name() -> None:
+    """The way back keeps rows too, where the box alone would let the hand go on."""
+    row = {"reach": {"place": 1.0, "speed": 0.1, "max": 0.25}}
+    narrow = replace(CART, rows=row)
+    there, u = np.array([0.2, 0.3]), np.array([0.3, 0.0])
+    reasons = []
+    for plant in (CART, narrow):
+        way_back = way_back_of(Config(rate=1.0 / PERIOD), plant)
+        reasons.append(way_back.lost(way_back.after(way_back.of(there), u), u))
+    assert reasons[0] == ""
+    assert reasons[1].startswith("reach would leave X within")
+
+
 def _braking(x: np.ndarray) -> list[float]:
     """What a controller does: to rest at the middle, within its range."""
     wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from lbmpc.plants import Known
+from node_runtime.config.sections import Config
+from plant_sim.shield import Shield
+from plant_sim.way_back import way_back_of
+from protocol import messages as m
 from tests.plant_sim.test_shield import PERIOD, PLANT, Bench, U
 
 RATE = 2.0
@@ -97,3 +103,67 @@ def test_before_the_first_command_the_actuator_is_at_the_safe_input() -> None:
     free.sample(0)
     free.command(0, 0.1, U + 0.7)
     assert free.writes[-1][1] == U + 0.7
+
+
+TWO = Known.from_matrices(
+    -np.eye(2),
+    np.eye(2),
+    W=[0.0, 0.0],
+    scale={"x1": 1.0, "x2": 1.0},
+    u_min=[-1.0, -1.0],
+    u_max=[1.0, 1.0],
+    u_rate_max=[2.0, 9.0],
+    rows={"supply": {"u1": 1.0, "u2": 1.0, "min": -1.5, "max": 0.7}},
+    safe_input=[0.5, 0.1],
+)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_of_inputs_hold_whoever_acts_and_with_them_the_rates(seed: int) -> None:
+    """Commands, plans behind them, the safe input, and one by hand; early and late."""
+    rng = np.random.default_rng(seed)
+    limited = replace(TWO, u_rate_max=None) if seed == 3 else TWO
+    shield = Shield(limited, PERIOD, 1.25, "plant-a", False, way_back_of(Config(rate=1.0 / PERIOD), limited))
+    machine, far = _Machine(), 0
+    for k in range(60):
+        t = k * PERIOD
+        shield.advance(t, machine)
+        shield.sample(t, machine.x)
+        if 20 <= k < 30:
+            u = rng.uniform(-2.0, 2.0, 2).tolist()
+            assert shield.override(m.Override(run_id="a", seq=k - 20, mode="manual", u=u), t) == "ok"
+        shield.renew(t, machine.x, machine)
+        for at in np.sort(rng.uniform(0.1, 0.9, int(rng.integers(0, 4)))) if k % 10 < 5 else ():
+            shield.advance(t + at * PERIOD, machine)
+            plan = rng.uniform(-2.0, 2.0, (3, 2)).tolist()
+            command = m.Command(
+                run_id="c",
+                seq=k,
+                state_run_id="plant-a",
+                state_seq=k,
+                period=PERIOD,
+                mode="solver",
+                u=plan[0],
+                plan=plan,
+            )
+            assert shield.command(command, t + at * PERIOD) == "ok"
+    times, inputs = np.array([t for t, _u in machine.writes]), np.array([u for _t, u in machine.writes])
+    assert (limited.input_rows.beyond(inputs) <= 0.0).all()
+    assert (np.abs(inputs) <= 1.0).all()
+    for i, t in enumerate(times):
+        recent = inputs[(times > t - (1 - 1e-6) * PERIOD) & (times <= t)]
+        far += int((np.abs(recent - inputs[i]) > TWO.input_rates * PERIOD * (1 + 1e-5)).any())
+    assert (far == 0) == (seed != 3)
+    assert np.ptp(inputs, axis=0).min() > 0.3
+
+
+class _Machine:
+    def __init__(self) -> None:
+        self.x, self.writes = np.zeros(2), list[tuple[float, np.ndarray]]()
+
+    def read(self, due: float) -> np.ndarray:
+        return self.x
+
+    def write(self, u: np.ndarray, due: float) -> float:
+        self.writes.append((due, np.array(u)))
+        return due

@@ -53,6 +53,17 @@ def figures(
     return performance(given, plant, override(Config(), list(settings)), truth or plant)
 
 
+def test_figures_are_about_the_reference_of_each_sample() -> None:
+    goal = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.0]])
+    x = [[0.1, 0.0], [0.5, 0.0], [0.45, 0.0]]
+    found = figures(msgspec.structs.replace(motion(x), goal=goal), "rate=1")
+    assert found.J == pytest.approx(0.01)
+    assert found.deviation == pytest.approx(0.01)
+    assert found.offset == {"position": pytest.approx(0.05)}
+    assert set(found.overshoot.values()) == {None}
+    assert figures(motion(x), "rate=1").offset == {}
+
+
 def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:
     x = [[0.5, 0.1], [-0.25, 0.2], [0.0, 0.0]]
     weights = ["controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
@@ -98,6 +109,18 @@ def test_a_violation_is_a_share_of_the_half_width() -> None:
     found = figures(motion([[1.26e-6, 0.0], [1.00001e-6, 0.0], [1e-6, 0.0]]), plant=small)
     assert found.constraint_violations == 2
     assert figures(motion(np.zeros((3, 2)), [1e3 + 5e-4, 1e3 + 2e-3]), plant=small).constraint_violations == 1
+
+
+def test_rows_beside_the_boxes_are_counted_by_name() -> None:
+    rows = {"sum": {"position": 1.0, "speed": 1.0, "max": 0.5}, "force": {"push": 2.0, "max": 1.0}}
+    plant = dataclasses.replace(OSCILLATOR, rows=rows)
+    given = motion([[0.3, 0.1], [0.3, 0.3], [0.4, 0.4], [0.0, 0.0]], [0.0, 0.6, 0.0])
+    found = figures(given, plant=plant)
+    assert found.violated_rows == {"sum": 2, "force": 1}
+    assert found.constraint_violations == 2
+    assert figures(given).violated_rows == {}
+    still = motion([[0.4, 0.4]] * 3, period=0.0)
+    assert figures(still, plant=plant).excess_between_samples == pytest.approx(0.3 / 1.5)
 
 
 def test_the_motion_between_samples_is_that_of_the_truth() -> None:

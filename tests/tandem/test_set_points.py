@@ -31,6 +31,7 @@ def test_a_table_is_a_sequence(tmp_path: Path) -> None:
     [
         ("", "its first line names the columns"),
         ("y,time\n1,2\n", "its first line names the columns"),
+        ("time;y\n1;2\n", "and it is 'time;y'"),
         ("time,y,y\n0,1,1\n", "each once"),
         ("time,y\n", "0 rows"),
         ("time,y\n" + "0,1.7\n" * 1001, "1001 rows"),
@@ -87,7 +88,9 @@ def test_a_simulation_follows_a_table(tmp_path: Path, capsys: pytest.CaptureFixt
     common = ["simulate", "--config", "compressor-cheap", "--oracle", "constant", "--steps", "3", "--json"]
     quick = ["--set", "controller.solver.compile=never", "--set", "controller.horizon=5"]
     assert main([*common, *quick, "--set-points", str(path)]) == 0
-    assert json.loads(capsys.readouterr().out)["unreached_ticks"] == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["unreached_ticks"] == 0
+    assert list(found["offset"]) == ["y"]
     path.write_text("time,y\n0,9\n")
     assert main([*common, *quick, "--set-points", str(path)]) == 2
     assert "outside X" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from verification.faults import holds
@@ -36,10 +36,13 @@ class Stage:
     settings: tuple[str, ...] = ()
     seconds: float = 10.0
     """How long a run is, counted from the first command."""
+    set_points: tuple[tuple[float, float], ...] = ()
+    """Where y shall go, from the first command on: seconds, and plant units."""
 
 
 USUAL = Stage("usual")
 FAR = Stage("trainer behind a link", trainer="wire")
+LED = Stage("moving reference", set_points=((0.0, 1.6875), (4.0, 1.75), (10.0, 1.65)))
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,12 @@ def _kill_row(*names: str) -> Fault:
     words = [f"kill -9 of {killed}"] if killed else []
     words += ["plant's link cut for 2 s"] if LINK in names else []
     return Fault(", ".join(words), "kill", _kill(*names), tuple(checks), span=3.5, after=2.0)
+
+
+def _led_row() -> Fault:
+    """The controller is away while the reference moves; it goes on along it."""
+    row = _kill_row("controller")
+    return replace(row, name=f"{row.name}, moving reference", holds=(*row.holds, holds.still_led), stage=LED)
 
 
 def _freeze_row(seconds: float) -> Fault:
@@ -208,6 +217,7 @@ def _door_row(kind: str) -> Fault:
 ALL: tuple[Fault, ...] = (
     *(_kill_row(name) for name in KILLABLE),
     *(_kill_row(*pair) for pair in combinations(KILLABLE, 2)),
+    _led_row(),
     *(_freeze_row(seconds) for seconds in (0.2, 1.0, 3.0)),
     *(_link_row(f"cut for {seconds:g} s", Shape(cut=True), seconds) for seconds in (1.0, 10.0, 60.0)),
     _link_row("5 % loss", Shape(loss=0.05), 6.0),

@@ -93,11 +93,17 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         counted=_counted(witness),
         said=_said(rig, witness),
         extra=extra,
+        not_led=_not_led(results),
     )
 
 
+def _not_led(results: list[m.TickResult]) -> int:
+    led = [bool(result.reference) for result in results]
+    return led[led.index(True) :].count(False) if True in led else 0
+
+
 def _deepest(x: np.ndarray, applied: np.ndarray, plant: Description) -> float:
-    state = np.maximum(plant.x_min - x, x - plant.x_max) / plant.x_scale
+    state = plant.beyond_x(x)
     given = np.maximum(plant.u_min - applied, applied - plant.u_max) / plant.u_scale
     return max(0.0, float(state.max()), float(np.nanmax(given, initial=0.0)))
 

@@ -79,3 +79,5 @@ class Facts(msgspec.Struct, kw_only=True):
     """Notes of the processes' health, each once."""
     extra: dict[str, float]
     """What the fault itself measured."""
+    not_led: int = 0
+    """Ticks without a reference, after the first that had one."""

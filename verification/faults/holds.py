@@ -53,6 +53,11 @@ def punctual(run: Facts, calm: Facts) -> str | None:
     return f"{late} late" if late > 0 else None
 
 
+def still_led(run: Facts, calm: Facts) -> str | None:
+    """The reference that was given is in force, also after the controller's return."""
+    return f"{run.not_led} ticks without the reference" if run.not_led else None
+
+
 def no_burst(run: Facts, calm: Facts) -> str | None:
     """Two steps within a period at most: the one that was late, and the next."""
     return f"{run.burst} steps of the controller within a period" if run.burst > 2 else None

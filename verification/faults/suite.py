@@ -14,6 +14,7 @@ from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
 from run_log.errors import LogError
+from tandem.set_points import trajectory
 from verification.faults.catalogue import Fault, Stage
 from verification.faults.evaluation import evaluate
 from verification.faults.facts import Facts
@@ -99,6 +100,9 @@ def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, f
     extra: dict[str, float] = {}
     with rig:
         assert rig.first_command is not None
+        if stage.set_points:
+            times, values = zip(*stage.set_points, strict=True)
+            rig.lead(trajectory(times, {"y": values}))
         if fault is not None:
             rig.run_until(rig.first_command + at)
             extra = fault.inflict(rig, rig.config.seed) or {}

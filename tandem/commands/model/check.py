@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
@@ -222,7 +223,7 @@ def _input_table(known: Known) -> Table:
 
     from tandem.model_tables import plain
 
-    limited = bool(np.isfinite(known.input_rates).any())
+    limited = any(map(isfinite, known.input_rates))
     names = ("half-width", "u_e", "u_min", "u_max", "safe input", *("most a second",) * limited)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, name in enumerate(known.inputs):

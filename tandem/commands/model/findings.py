@@ -56,6 +56,8 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
     yield _stability(model)
     yield _inputs(model, horizon)
     yield _horizon(model, horizon)
+    if model.plant.rows:
+        yield _rows(model.plant)
     if model.plant.dead_time:
         yield _dead_time(model)
     yield Finding(
@@ -172,11 +174,27 @@ def _power(factor: float) -> str:
     return f"{factor:.2g}" if factor < 1e3 else f"10^{math.log10(factor):.1f}"
 
 
+def _rows(plant: Known) -> Finding:
+    listed = [
+        f"{name} = {value:.4g} at rest, of {low:g} to {high:g}"
+        for rows, rest in ((plant.state_rows, plant.x_e), (plant.input_rows, plant.u_e))
+        for name, value, low, high in zip(
+            rows.names, (rows.F @ rest).tolist(), rows.lower.tolist(), rows.upper.tolist(), strict=True
+        )
+    ]
+    return Finding("ok", "rows", "; ".join(listed))
+
+
 def _start(model: Model, x0: np.ndarray) -> Finding:
     plant = model.plant
     outside = [
         f"{plant.states[i]} = {x0[i]:g}, X is [{plant.x_min[i]:g}, {plant.x_max[i]:g}]"
         for i in np.flatnonzero((x0 < plant.x_min) | (x0 > plant.x_max))
+    ]
+    rows = plant.state_rows
+    outside += [
+        f"{rows.names[i]} = {rows.F[i] @ x0:g}, the row is [{rows.lower[i]:g}, {rows.upper[i]:g}]"
+        for i in np.flatnonzero(rows.beyond(x0) > 0.0)
     ]
     if outside:
         return Finding("note", "x0", f"outside of X: {'; '.join(outside)}")

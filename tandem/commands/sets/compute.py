@@ -50,7 +50,7 @@ class SetsCompute(Configured):
         from lbmpc.sets.certificate import CertificateError
         from lbmpc.sets.enclosures.disturbance import DisturbanceError
         from lbmpc.sets.geometry.polytope import SetError
-        from lbmpc.sets.motion import require_no_dead_time
+        from lbmpc.sets.motion import require_certifiable
         from node_runtime.whole_file import require_regular
 
         if not 0.0 < self.slack < 1.0:
@@ -61,7 +61,7 @@ class SetsCompute(Configured):
             raise Refused(f"{self.out}: cannot be written: {error.strerror}") from error
         model = build_model(config)
         try:
-            require_no_dead_time(model)
+            require_certifiable(model)
         except CertificateError as error:
             raise Refused(str(error)) from error
         W = given_disturbance(config)

@@ -52,16 +52,20 @@ def episodes(results: list[CaseResult]) -> list[Picture]:
     for ax in axes[::columns]:
         ax.set_ylabel("J above the true h's (%)")
     for ax in axes[-columns:]:
-        ax.set_xlabel("episode")
+        ax.set_xlabel(_what(results))
     # One for all panels, outside of them.
     lines, labels = axes[0].get_legend_handles_labels()
     made.legend(lines, labels, loc="outside upper left", ncols=2, frameon=False, fontsize=8.5)
     caption = (
-        "Regret by episode: J above that of the true h from the same start, in percent of it; the axis is linear up to "
-        f"{LINEAR:g} % and logarithmic beyond. Line: median over the seeds; band: all of them. "
+        f"Regret by {_what(results)}: J above that of the true h from the same start, in percent of it; the axis is "
+        f"linear up to {LINEAR:g} % and logarithmic beyond. Line: median over the seeds; band: all of them. "
         "What was lost is not drawn."
     )
-    return [Picture(made, caption, "regret by episode and oracle")]
+    return [Picture(made, caption, f"regret by {_what(results)} and oracle")]
+
+
+def _what(results: list[CaseResult]) -> str:
+    return "episode" if results[0].case.set_points is None else "cycle"
 
 
 def _panel(result: CaseResult) -> str:

@@ -34,6 +34,7 @@ from protocol import topics
 from protocol.topics import Topic
 from run_log.run import Run, gather
 from tandem.experiments.simulation.faults import Faults
+from tandem.hand_session import lease_of
 
 if TYPE_CHECKING:
     from trainer_node.training import Trainer
@@ -42,7 +43,6 @@ Progress = Callable[[int], None]
 NO_FAULTS = Faults()
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
 COMMANDER = "commander-simulated"
-LEASE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,8 @@ class LockStep:
 
     def manual(self, u: np.ndarray) -> None:
         """From the next sample on u, (m,), plant units, acts by hand: until `auto`, or until X would be left."""
-        self._intend(m.Override(run_id=self._intention(), seq=0, mode="manual", u=u.tolist(), lease=LEASE_S))
+        lease = lease_of(self.config.period)
+        self._intend(m.Override(run_id=self._intention(), seq=0, mode="manual", u=u.tolist(), lease=lease))
 
     def auto(self) -> None:
         """From the next sample on the controller's commands act again."""
@@ -261,7 +262,7 @@ class LockStep:
             return
         while self.plant.hand.until <= t + self.config.period:
             said = msgspec.structs.replace(said, seq=said.seq + 1)
-            self._say(said, self.plant.hand.until - LEASE_S / 2.0)
+            self._say(said, self.plant.hand.until - said.lease / 2.0)
         self.by_hand = said
 
     def start_again(self, lost: bool = False) -> None:

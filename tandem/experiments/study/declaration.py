@@ -53,6 +53,9 @@ class Runs(Section, frozen=True, kw_only=True):
     episodes: Count | None = None
     """How often the plant starts, with all that was learned kept; 1 where nothing is said."""
     faults: Faults | None = None
+    set_points: dict[str, list[float]] | None = None
+    """By state name: values that follow each other within `steps` ticks, equally long, in every episode again. The
+    plant goes on from where it is, so that an episode is a cycle."""
 
 
 class Group(Runs, frozen=True, kw_only=True):
@@ -124,6 +127,7 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
     steps: int
     episodes: int
     faults: Faults
+    set_points: dict[str, list[float]] | None
     log: bool
 
     @property
@@ -208,7 +212,9 @@ def _resolve(
     seeds = named if isinstance(named, list) else list(range(named))
     x0s = _x0s(declared, case.x0s or group.x0s, plant, where)
     episodes = _said(levels, "episodes", 1)
-    faults = _said(levels, "faults", Faults())
+    faults, set_points = _said(levels, "faults", Faults()), _said(levels, "set_points", None)
+    if set_points is not None:
+        _require_set_points(set_points, plant, f"{where}: case {case.name!r}: set_points")
     vary = case.vary
     if quick:
         few = declared.quick
@@ -235,6 +241,7 @@ def _resolve(
                 steps=_said(levels, "steps", STEPS),
                 episodes=episodes,
                 faults=faults,
+                set_points=set_points,
                 log=case.log,
             )
         )
@@ -272,6 +279,23 @@ def _x0s(declared: Declaration, name: str, plant: Description, where: str) -> li
             x0[plant.states.index(name)] = value
         made.append(x0)
     return made
+
+
+def _require_set_points(values: dict[str, list[float]], plant: Description, where: str) -> None:
+    for name in values:
+        _known(Path(where), "a state", name, list(plant.states))
+    if (
+        len(values) != plant.m
+        or len({len(every) for every in values.values()}) != 1
+        or not all(values.values())
+    ):
+        raise ConfigError(
+            f"{where}: give as many states as the plant has inputs ({plant.m}), each with as many values as the others"
+        )
+    for name, every in values.items():
+        i = plant.states.index(name)
+        if not all(plant.x_min[i] <= value <= plant.x_max[i] for value in every):
+            raise ConfigError(f"{where}: {name} = {every} is not within its bounds")
 
 
 def _known(path: Path, key: str, name: str, names: list[str]) -> None:

@@ -27,6 +27,7 @@ CODE = (
     "run_log/reporting/between_samples.py",
     "run_log/reporting/performance.py",
     "tandem/experiments/simulation/lockstep.py",
+    "tandem/experiments/simulation/wave.py",
 )
 
 
@@ -37,6 +38,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     steps: int
     episodes: int
     faults: Faults
+    set_points: dict[str, list[float]] | None = None
 
     @property
     def key(self) -> str:
@@ -68,7 +70,13 @@ def _job(config: Config, case: Resolved) -> Job:
     faults = case.faults
     if config.controller.oracle != "dnn":
         faults = msgspec.structs.replace(faults, training_seconds=0.0, trainer_dies_at=None)
-    return Job(config=_what_counts(config), steps=case.steps, episodes=case.episodes, faults=faults)
+    return Job(
+        config=_what_counts(config),
+        steps=case.steps,
+        episodes=case.episodes,
+        faults=faults,
+        set_points=case.set_points,
+    )
 
 
 def _floor(config: Config, case: Resolved) -> Job:

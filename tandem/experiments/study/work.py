@@ -8,13 +8,16 @@ from pathlib import Path
 import msgspec
 
 from controller_node.build import build_model, build_network_oracle
+from lbmpc.plants import get_plant, get_truth, true_motion
+from node_runtime.config.plant import true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.whole_file import read_regular, require_regular, write_whole
 from run_log.reporting.motion import trajectory
-from run_log.reporting.performance import Performance
+from run_log.reporting.performance import Performance, performance
 from run_log.reporting.summary import summarise
 from run_log.run import Run, plant_of
 from run_log.writing.save import save
+from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
 from tandem.experiments.study.plan import Job
@@ -38,7 +41,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     lost: str | None
     """Why the true motion could not be followed to the end."""
     episodes: list[Performance]
-    """Those that could be followed to their end."""
+    """Those that could be followed to their end; of set-points by turns the cycles."""
     performance: Performance
     """Of all that could be followed."""
     iteration_limit_ticks: int
@@ -64,7 +67,7 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
         ConfigError: the job's configuration admits no controller.
         OSError: something else than a file has the name of a log.
     """
-    outcome = follow(job.config, job.steps, job.faults, episodes=job.episodes)
+    outcome = _outcome(job)
     for log in logs:
         require_regular(log)
         partial = log.with_suffix(".partial")
@@ -80,7 +83,7 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
     return Record(
         job=job,
         lost=outcome.lost,
-        episodes=summary.episodes[: outcome.episodes],
+        episodes=summary.episodes[: outcome.episodes] if job.set_points is None else _cycles(run, job),
         performance=Performance(**{name: getattr(summary, name) for name in Performance.__struct_fields__}),
         iteration_limit_ticks=summary.iteration_limit_ticks,
         soft_ticks=summary.soft_ticks,
@@ -91,6 +94,26 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
         traces=_traces(run) if detail else None,
         lemma=_lemma(run, job.config) if detail else None,
     )
+
+
+def _outcome(job: Job) -> Outcome:
+    if job.set_points is None:
+        return follow(job.config, job.steps, job.faults, episodes=job.episodes)
+    asked = wave.reference(job.set_points, job.steps * job.config.period, job.episodes)
+    return follow(job.config, job.steps * job.episodes, job.faults, set_points=asked)
+
+
+def _cycles(run: Run, job: Job) -> list[Performance]:
+    """Of each that could be followed to its end: dx and du are from where the true plant rests at the set-points."""
+    plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
+    motion = trajectory(run, plant)
+    outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))
+    config = msgspec.structs.replace(job.config, reference=outputs)
+    rests = wave.rests(job.set_points or {}, job.steps, true_motion(truth), plant, job.config.period)
+    firsts = range(0, len(motion.step) - job.steps, job.steps)
+    return [
+        performance(motion.part(first, first + job.steps), plant, config, truth, rests) for first in firsts
+    ]
 
 
 def _traces(run: Run) -> Traces:

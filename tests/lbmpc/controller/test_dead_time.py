@@ -190,6 +190,16 @@ def test_another_start_of_the_plant_and_a_long_gap_begin_afresh() -> None:
     assert told(after((held, 0.0)).ahead) == [(1.5, 0.0)]
 
 
+@pytest.mark.parametrize("periods", [1, 2, 11])
+def test_a_sample_that_is_as_late_as_the_memory_is_long_begins_afresh(periods: int) -> None:
+    # Of 2 and 11 periods of 0.1 s rounding puts the end of the memory behind the sample.
+    line = InputLine(replace(PLANT, dead_time=periods * T), T)
+    memory, _ = line.advance(line.initial_state(), sample(100, 0.4), 0.0)
+    memory, acted = line.advance(memory, sample(100 - periods, 0.7), 0.0)
+    assert told(acted.ahead) == [(periods, 0.7)]
+    assert not acted.known
+
+
 def test_more_inputs_than_are_remembered_become_a_mean() -> None:
     many = sample(1, *[0.1 * i for i in range(20)])
     memory, _ = LINE.advance(LINE.initial_state(), sample(0, 0.0), 0.0)

@@ -78,6 +78,14 @@ def test_what_stands_in_for_a_solution_keeps_the_rate_too() -> None:
     assert within(begun.plan, float(MODEL.plant.safe_input[0] - MODEL.plant.u_e[0]))
 
 
+def test_an_input_that_is_said_to_act_outside_u_leads_no_plan_out_of_it() -> None:
+    state, _ = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
+    _, other = LIMITED.step(state, seen(None, 1, 1e3))
+    assert other.mode == "shifted_plan"
+    low, high = MODEL.plant.u_min - MODEL.plant.u_e, MODEL.plant.u_max - MODEL.plant.u_e
+    assert ((other.plan >= low) & (other.plan <= high)).all()
+
+
 def test_a_backup_plan_goes_on_from_the_command() -> None:
     state, result = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
     policy = LIMITED.backup(BackupPlanner(PROBLEM, 0.0075), state)

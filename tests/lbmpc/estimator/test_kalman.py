@@ -127,6 +127,12 @@ def test_before_the_first_sample_nothing_is_predicted() -> None:
     assert kalman.missed(begin, 0.01) is begin
 
 
+def test_the_largest_number_of_a_sample_can_be_followed_by_a_missing_one() -> None:
+    kalman = estimator()
+    memory, _ = kalman.update(kalman.initial_state(), Measured(np.zeros(4), 7, 2**63 - 1, None, ()))
+    assert kalman.missed(memory, 0.0)["sample"].tolist() == [7, 2**63 - 1]
+
+
 def test_the_period_of_a_missing_sample_is_split_where_the_command_took_over() -> None:
     kalman, motion = estimator(), Motion(5, np.zeros(4), np.zeros(4))
     memory, _ = kalman.update(kalman.initial_state(), motion.sample(first=True))

@@ -253,6 +253,7 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
         "x_e",
         "u_e",
         "bounds",
+        "rows",
         "values",
         "truth",
         "options",

@@ -134,3 +134,61 @@ def test_a_plant_whose_rate_is_none():
     for rates in ([1.0, 2.0], [0.0], [float("nan")], "fast"):
         with pytest.raises(PlantDefinitionError, match="u_rate_max"):
             Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], u_rate_max=rates, scale={"x1": 1.0, "u1": 1.0})
+
+
+SURGE = "plant.rows.surge={z=1.0,y=-0.5,max=0.3,priority=1}"
+
+
+def test_rows_there_and_back(tmp_path: Path):
+    config = load(None, [SURGE])
+    found = plant_of(config, get_plant)
+    row = {"z": 1.0, "y": -0.5, "max": 0.3, "priority": 1}
+    assert found.rows == {"surge": row}
+    file = tmp_path / "rows.toml"
+    file.write_text(to_toml(config))
+    assert load(file) == config
+    known = found.known()
+    again = Known.from_builtins(msgspec.json.decode(msgspec.json.encode(known.to_builtins())))
+    assert again.rows == {"surge": row}
+    assert again.to_builtins() == known.to_builtins()
+    assert spelt_out(load(None), found).plant.rows == {"surge": row}
+    assert "rows" not in get_plant("moore_greitzer").known().to_builtins()
+    # Others stay, and one of the same name is another.
+    more = found.changed({}, rows={"slow": {"r": 1.0, "max": 1.5}, "surge": {"z": 1.0, "max": 0.5}})
+    assert [more.state_rows.names, more.state_rows.upper.tolist()] == [("surge", "slow"), [0.5, 1.5]]
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("{zz=1.0,max=0.3}", "row few has 'zz', which is no state or input"),
+        ("{z=0.0,max=0.3}", "no coefficient but 0"),
+        ("{max=0.3}", "no coefficient but 0"),
+        ("{z=1.0,u=1.0,max=3.0}", "states and inputs"),
+        ("{z=1.0}", "no bound"),
+        ("{z=1.0,min=0.5,max=0.3}", "min must be below max"),
+        ("{z=1.0,max=0.3,priority=0.5}", "whole number"),
+        ("{u=1.0,max=2.0,priority=1}", "an input is never outside of U"),
+        ("{z=1.0,y=-1.0,max=-3.0}", "at x_e"),
+        ("{u=1.0,max=1.0}", "at u_e"),
+        ("{z=1.0,max=inf}", "plant.rows.few.max is not a finite number"),
+    ],
+)
+def test_a_row_that_is_none(row: str, said: str):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        plant_of(load(None, [f"plant.rows.few={row}"]), get_plant)
+
+
+def test_a_plant_whose_rows_are_none():
+    for rows in (3, {"x1": {"x1": 1.0, "max": 1.0}}, {"r": [1.0]}, {"r": {"x1": "a", "max": 1.0}}):
+        with pytest.raises(PlantDefinitionError, match="row"):
+            Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], rows=rows, scale={"x1": 1.0, "u1": 1.0})
+    with pytest.raises(PlantDefinitionError, match="a word of rows"):
+        Known.from_matrices(
+            [[-1.0]],
+            [[1.0]],
+            W=[0.0],
+            states=["max"],
+            rows={"r": {"u1": 1.0, "max": 1.0}},
+            scale={"max": 1.0},
+        )

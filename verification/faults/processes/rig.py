@@ -45,6 +45,8 @@ RESTART_S = 0.5
 READY_S = 60.0
 STOP_S = 8.0
 LOOK_S = 0.01
+LED_AGAIN_S, HEARD = 0.25, 50
+"""From one saying of a reference to the next; messages among which the answer is looked for."""
 LISTENING = "router listening on"
 
 Place = Literal["loopback", "veth", "wire"]
@@ -246,6 +248,26 @@ class Rig:
                 dead = [f"{p.name}:\n{p.said()[-800:]}" for p in self.processes.values() if not p.alive]
                 raise RigError(f"not within {timeout_s:g} s: {what}. {' '.join(dead)}")
             self.look()
+
+    def lead(self, reference: m.Reference) -> None:
+        """Say where the plant shall go, as a commander does: until the controller has taken it up."""
+        bus = Bus(self.config, topics.COMMANDER, new_run_id(topics.COMMANDER))
+        bus.open()
+        self._stack.callback(bus.close, 0.5)
+        said, word = -math.inf, msgspec.structs.replace(reference, run_id=bus.run_id)
+
+        def taken() -> bool:
+            nonlocal said
+            if clock.now() > said + LED_AGAIN_S:
+                said = clock.now()
+                bus.publish(topics.REFERENCE, word)
+            newest = self.heard[-HEARD:]
+            results = [
+                codec.decode(topics.RESULT, h.payload) for h in newest if h.topic == topics.RESULT.name
+            ]
+            return any(isinstance(r, m.TickResult) and r.reference_from == bus.run_id for r in results)
+
+        self.wait(taken, READY_S, "the reference taken")
 
     # -- faults --------------------------------------------------------
 

@@ -1,0 +1,64 @@
+"""Set-points by turns, again and again, and what a run costs above the true plant's rests there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import root
+
+from lbmpc.plants import Description, PlantError, TrueMotion
+from protocol import messages as m
+from tandem.set_points import trajectory
+
+Values = Mapping[str, Sequence[float]]
+"""By the name of a state, plant units: those that follow each other within a cycle, equally long."""
+CLOSE = 1e-8
+"""Of a half-width: what a rest may move by in a period, and miss its set-point by."""
+
+
+def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
+    """`cycles` cycles of so many seconds, and one more: a plan at the end of the last one sees what it always saw."""
+    parts = len(next(iter(values.values())))
+    turns = np.arange((cycles + 1) * parts)
+    times = np.repeat(seconds / parts * np.append(turns, turns[-1] + 1), 2)[1:-1]
+    return trajectory(
+        times.tolist(),
+        {name: np.repeat(np.tile(every, cycles + 1), 2).tolist() for name, every in values.items()},
+    )
+
+
+def rests(
+    values: Values, steps: int, true: TrueMotion, plant: Description, period: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the true plant rests at each set-point: (steps, d) and (steps, m) of a cycle's `steps` ticks, plant units.
+
+    Raises:
+        PlantError: it does not rest there, or there are not as many outputs as inputs, which a rest is unique for.
+    """
+    own = [plant.states.index(name) for name in values]
+    if len(own) != plant.m:
+        raise PlantError(
+            f"a rest is known where as many states as inputs ({plant.m}) are given, not {len(own)}"
+        )
+    found = [_rest(np.array(row), own, true, plant, period) for row in zip(*values.values(), strict=True)]
+    turn = np.arange(steps) * len(found) // steps
+    x, u = (np.array(of) for of in zip(*found, strict=True))
+    return x[turn], u[turn]
+
+
+def _rest(
+    r: np.ndarray, own: list[int], true: TrueMotion, plant: Description, period: float
+) -> tuple[np.ndarray, np.ndarray]:
+    x_scale, u_scale = plant.x_scale, plant.u_scale
+
+    def off(v: np.ndarray) -> np.ndarray:
+        x, u = plant.x_e + v[: plant.d] * x_scale, plant.u_e + v[plant.d :] * u_scale
+        return np.append((true.step(x, u, period) - x) / x_scale, (x[own] - r) / x_scale[own])
+
+    found = root(off, np.zeros(plant.d + plant.m), tol=1e-12)
+    if not np.abs(off(found.x)).max() < CLOSE:
+        raise PlantError(
+            f"the true plant has no rest with {', '.join(plant.states[i] for i in own)} at {r.tolist()}"
+        )
+    return plant.x_e + found.x[: plant.d] * x_scale, plant.u_e + found.x[plant.d :] * u_scale
