@@ -55,6 +55,7 @@ KEYS = {
         "prediction_error",
         "weight",
         "constant_weight",
+        "noise",
         "sensor_faults",
         "outside_ticks",
         "smallest_set_margin",
