@@ -56,7 +56,10 @@ class Translation:
         hidden = None
         if tick.weights is not None:
             layers = [array.numpy().astype(float) for array in tick.weights.layers]
-            hidden = HiddenSet(tick.weights.seq, layers, tick.weights.sha256, tick.weights.network_sha256)
+            weights = tick.weights
+            # Of the sample before this tick's own the label is complete now.
+            later = None if weights.newest is UNSET else max(0, tick.seq - 1 - weights.newest)
+            hidden = HiddenSet(weights.seq, layers, weights.sha256, weights.network_sha256, later)
         asked = self._asked(tick)
         if state is None:
             return Observation(

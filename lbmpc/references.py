@@ -72,9 +72,18 @@ class Reference:
         outputs, times, values, count = (arrays[name] for name in expected)
         if outputs.dtype != np.int64 or len({*outputs.tolist()} & {*range(d)}) != len(outputs):
             raise ValueError("outputs")
-        if times.dtype != np.float64 or not len(times) or not (np.diff(times) >= 0).all():
+        if (
+            times.dtype != np.float64
+            or not len(times)
+            or not np.isfinite(times).all()
+            or (np.diff(times) < 0).any()
+        ):
             raise ValueError("times")
-        if values.dtype != np.float64 or values.shape != (len(times), len(outputs)):
+        if (
+            values.shape != (len(times), len(outputs))
+            or values.dtype != np.float64
+            or not np.isfinite(values).all()
+        ):
             raise ValueError("values")
         if count.dtype != np.int64 or count.shape != (4,) or count[0] < 0 or count[1] < FOR_EVER:
             raise ValueError("count")

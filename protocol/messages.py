@@ -141,11 +141,14 @@ class HiddenWeights(Message, frozen=True):
     """Hash of the hidden weights that the controller held at T_k."""
     samples: Count
     loss_before: float
+    """On what it was trained on; where labels have a variance on what was held out, in units of that variance."""
     loss_after: float
     network_sha256: Digest
     sha256: Digest
     layers: list[Array]
     """Hidden layer i as (1 + n_{i-1}, n_i); the first row is the bias."""
+    newest: Sequence | msgspec.UnsetType = msgspec.UNSET
+    """The last sample of that run that had a part in it, -1: none; unset, and no byte, where labels are exact."""
 
 
 MOST_POINTS = 1000
@@ -263,6 +266,10 @@ class TickResult(Message, frozen=True):
     noise: list[float] = []
     """Standard deviation of what is measured of each state as the estimator found it, its own units, 0 of those that
     are not measured; empty where it was told."""
+
+    def noise_of(self, states: tuple[str, ...]) -> dict[str, float] | None:
+        """`noise` by the names of those that are measured; None where none was found."""
+        return {name: one for name, one in zip(states, self.noise, strict=False) if one > 0.0} or None
 
     @property
     def weights_outcome(self) -> WeightsOutcome:

@@ -42,6 +42,7 @@ MEANING = {
     "prediction_error": "first / last second, or period if longer",
     "weight": "what of the network counted in the last second",
     "constant_weight": "what of a constant beside it",
+    "noise": "standard deviation of what is measured, as it was found",
     "outside_ticks": "outside of the certified sets",
     "smallest_set_margin": "to their boundary, of X's half-widths",
     "log": "",
@@ -54,6 +55,7 @@ OF_EACH_STATE = {
     "offset": "share",
     "weight": "share",
     "constant_weight": "share",
+    "noise": "",
 }
 """Which figure of each performance state these are."""
 WHERE_THERE_IS_ONE = (
@@ -64,6 +66,7 @@ WHERE_THERE_IS_ONE = (
     "sensor_faults",
     "weight",
     "constant_weight",
+    "noise",
 )
 """Rows that the table of another run has not: one without a reference, an estimator, or such a fault."""
 # Anything but zero is worth a look.

@@ -23,6 +23,7 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
 from trainer_node.descent import Descent
+from trainer_node.pace import Worth
 from trainer_node.questions import SAMPLES_ANSWER, Questions
 from trainer_node.training import Draw, Trainer
 
@@ -104,6 +105,7 @@ class TrainerNode:
         self._explained: deque[Judged] = deque(maxlen=SENT_KNOWN)
         self._train_at = 0.0
         self._waits_since: float | None = None
+        self._pays: bool | None = None
 
     @property
     def settings(self) -> TrainerConfig:
@@ -326,7 +328,7 @@ class TrainerNode:
             and output is not None
             and not self._must_join()
             and output.hidden_sha256 == trainer.sha256
-            and trainer.due()
+            and trainer.due(output)
         )
 
     def begin(self) -> Draw | None:
@@ -345,13 +347,22 @@ class TrainerNode:
         """Publish what the training found, if it is any good."""
         assert self._trainer is not None
         weights = self._trainer.finish(draw, descent)
+        self._say_worth(self._trainer.worth)
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)
         self._sent_at = clock.now()
         self._explained.append((weights.seq, weights.sha256))
         self._count("published")
-        self._health.set("running", f"following {self._run}")
+
+    def _say_worth(self, worth: Worth | None) -> None:
+        """What the last training was good for: in health, and in the log where that is new."""
+        words = f"following {self._run}" + ("" if worth is None else f"; {worth}")
+        pays = None if worth is None else worth.pays
+        if worth is not None and pays != self._pays:
+            log.info("%s", words)
+        self._pays = pays
+        self._health.set("running", words)
 
     def _count(self, name: str) -> None:
         self._counts[name] += 1

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from msgspec import UNSET
 
 from network_model.description import NetworkDescription, hash_layers, why_unacceptable
 from node_runtime.config.sections import TrainerConfig
 from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
 from trainer_node.descent import Descent, Problem, descend
-from trainer_node.network import Network
+from trainer_node.network import Network, build_loss
+from trainer_node.pace import GAIN, Pace, Worth
 from trainer_node.replay_buffer import ReplayBuffer
 
 BASES = 8
@@ -28,8 +30,8 @@ LEAP = 1000
 """From one version to the next where somebody else sends weights too: more than a stranger sends meanwhile."""
 HELD_OUT = 0.25
 """Share of the samples drawn that is not trained on, where labels are noisy."""
-GAIN = 0.05
-"""By how much of the labels' own variance the loss must fall."""
+LEAST_VARIANCE = 1e-4
+"""Of a label, in (output scale)^2: none counts as better known."""
 FARTHEST = 10**8
 """How far versions may run ahead of the adopted: a controller refuses those that are 1e9 ahead."""
 
@@ -61,6 +63,8 @@ class Draw:
     problem: Problem
     output: OutputWeights
     for_run: str
+    newest: int
+    """The last sample of that run that could be drawn, -1 where there is none."""
 
 
 class Trainer:
@@ -99,9 +103,13 @@ class Trainer:
         self._draws = np.random.default_rng([seed, 0xD8A3])
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
-        self._fresh = 0
-        # What the variance of the newest labels adds to the loss; 0: they are exact.
-        self._noise = 0.0
+        self.worth: Worth | None = None
+        """Of the last training; None where labels are exact."""
+        self._fresh = self._waited = 0
+        # 1 / (deviation of the newest labels in output scales), over sqrt d; None: they are exact.
+        self._weights: np.ndarray | None = None
+        self._latest: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=config.train_every)
+        self._pace = Pace(config.train_every, config.capacity)
         self._step = 1
         self.resume(hidden, version)
 
@@ -121,6 +129,7 @@ class Trainer:
         self._bases.clear()
         self._take(hidden)
         self.version = max(self.version, version)
+        self._pace.hurry()
 
     def leap(self, heard: int = 0) -> None:
         """From now on leave gaps between versions: somebody else sends weights under this trainer's name.
@@ -157,31 +166,61 @@ class Trainer:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
         windows, labels = np.array(rows, dtype=np.float64), np.array([sample.h for sample in samples])
-        noise = self._noise_of(np.array(samples[-1].variance)) if samples[-1].variance else 0.0
+        weights = self._weights_for(np.array(samples[-1].variance)) if samples[-1].variance else None
         new = self.buffer.add(run_id, [sample.seq for sample in samples], windows, labels)
-        self._noise = noise
+        if new:
+            self._latest.extend(zip(windows, labels, strict=True))
+        self._weights = weights
         return new
 
-    def _noise_of(self, variance: np.ndarray) -> float:
-        """What labels of this variance, (d,), add to the loss. Raises `ValueError` for what is none."""
-        with np.errstate(over="ignore"):
-            noise = float((variance / np.array(self.description.output_scale) ** 2).sum())
-        if variance.shape != (self.description.states,) or not (
-            (variance >= 0.0).all() and math.isfinite(noise)
-        ):
-            raise ValueError("no variance")
-        return noise
+    def _weights_for(self, variance: np.ndarray) -> np.ndarray:
+        """Of each state, (d,), so that labels of this variance, (d,), add 1 to the loss, and each state as much of it.
 
-    def due(self) -> bool:
-        """Whether enough new samples came since the last training began."""
-        return self._fresh >= self.config.train_every and len(self.buffer) >= self.config.min_samples
+        Raises `ValueError` for what is no variance.
+        """
+        if variance.shape != (self.description.states,):
+            raise ValueError("no variance")
+        with np.errstate(over="ignore"):
+            noise = variance / np.array(self.description.output_scale) ** 2
+        if not ((noise >= 0.0) & np.isfinite(noise)).all():
+            raise ValueError("no variance")
+        return 1.0 / np.sqrt(len(noise) * np.maximum(noise, LEAST_VARIANCE))
+
+    def due(self, output: OutputWeights) -> bool:
+        """Whether enough new samples came since the last training began; `Pace` says it where labels have a variance.
+
+        output: the newest; the loss on new samples is that under its K.
+        """
+        if self._fresh < self.config.train_every or len(self.buffer) < self.config.min_samples:
+            return False
+        if self._weights is None or self._pace.over(self._fresh):
+            return True
+        if self._pace.must_look(self._fresh):
+            self._pace.look(self._loss_on_latest(output))
+        return self._pace.over(self._fresh)
+
+    def _loss_on_latest(self, output: OutputWeights) -> float:
+        """Of the hidden layers that K belongs to; 0 where it cannot be used."""
+        K = output.K.numpy()
+        if self._unusable(K, output.hidden_sha256) is not None:
+            return 0.0
+        self._network.load(self._bases[output.hidden_sha256])
+        windows, h = (np.array(part) for part in zip(*self._latest, strict=True))
+        return build_loss(self._network, windows, *self._weighted(h, K)).value()
+
+    def _weighted(self, h: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Labels, (n, d), and output weights, (1 + n_L, d), each state as it counts in the loss."""
+        weights = 1.0 if self._weights is None else self._weights
+        with np.errstate(over="ignore"):
+            return h * weights, K * weights
 
     def train(self, output: OutputWeights, for_run: str) -> HiddenWeights | None:
         """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
 
         M samples are drawn from the buffer, and `steps` Adam steps taken on all of them, in float32. Adam
-        starts afresh each time. Where labels have a variance, a quarter of the samples is held out: the steps count up
-        to where these were predicted best, and the old layers stay where that is within the noise.
+        starts afresh each time. Where labels have a variance, states count in the loss by its inverse, and a quarter of
+        the samples is held out: the steps count up to where these were predicted best, and the old layers stay where
+        that is within the noise.
 
         Args:
             output: K_{T_k}, (1 + n_L, d), and the hash of the hidden layers it was adapted to.
@@ -200,7 +239,7 @@ class Trainer:
 
         The problem holds this trainer's own network: one draw at a time.
         """
-        self._fresh = 0
+        self._waited, self._fresh = self._fresh, 0
         self.counters["trainings"] += 1
         K = output.K.numpy()
         if (why := self._unusable(K, output.hidden_sha256)) is not None:
@@ -208,16 +247,23 @@ class Trainer:
             return None
         xu, h = self.buffer.sample(self.config.batch, self._draws)
         self._network.load(self._bases[output.hidden_sha256])
-        if self._noise == 0.0:
-            return Draw(Problem(self._network, xu, h, K), output, for_run)
+        newest = self.buffer.last(for_run)
+        if self._weights is None:
+            return Draw(Problem(self._network, xu, h, K), output, for_run, newest)
+        h, K = self._weighted(h, K)
         kept = len(xu) - max(1, round(HELD_OUT * len(xu)))
         held_out = xu[kept:], h[kept:]
-        return Draw(Problem(self._network, xu[:kept], h[:kept], K, held_out), output, for_run)
+        return Draw(Problem(self._network, xu[:kept], h[:kept], K, held_out), output, for_run, newest)
 
     def finish(self, draw: Draw, descent: Descent) -> HiddenWeights | None:
         """The last part of `train`: judge what the Adam steps found, and take it over or leave it."""
         output, trained = draw.output, descent.hidden
-        if (why := self._unwanted(descent)) is not None:
+        noisy = draw.problem.held_out is not None
+        why = self._unwanted(descent, GAIN if noisy else 0.0)
+        self.worth = Worth(descent.before - descent.after, why is None) if noisy else None
+        if self.worth is not None:
+            self._pace.trained(self._waited, descent.before, self.worth)
+        if why is not None:
             self.counters[f"kept: {why}"] += 1
             return None
         self._bases.move_to_end(output.hidden_sha256)
@@ -237,6 +283,7 @@ class Trainer:
             network_sha256=self.description.sha256(),
             sha256=self.sha256,
             layers=[Array.of(layer, "<f4") for layer in trained],
+            newest=draw.newest if noisy else UNSET,
         )
 
     def _unusable(self, K: np.ndarray, base_sha256: str) -> str | None:
@@ -251,8 +298,8 @@ class Trainer:
             return "K belongs to unknown hidden weights"
         return None if len(self.buffer) else "no samples"
 
-    def _unwanted(self, descent: Descent) -> str | None:
-        """Why the old hidden layers are kept; None: those that were found are better."""
+    def _unwanted(self, descent: Descent, least: float) -> str | None:
+        """Why the old hidden layers are kept; None: those that were found lower the loss by more than `least`."""
         if not all(np.isfinite(layer).all() for layer in descent.hidden):
             return "not finite"
         if why_unacceptable(self.description, descent.hidden) is not None:
@@ -261,8 +308,7 @@ class Trainer:
         if not math.isfinite(descent.after):
             return "not finite"
         # Within what the labels' noise alone comes to there is nothing to gain, and its fit would cost.
-        gain = descent.before - descent.after
-        return None if gain > GAIN * self._noise else "loss not lower"
+        return None if descent.before - descent.after > least else "loss not lower"
 
     def _take(self, hidden: list[np.ndarray]) -> None:
         self.hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]

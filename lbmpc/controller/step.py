@@ -101,7 +101,11 @@ class Controller:
         self._motion = None if guard is None else motion_of(self.model, guard.certificate)
         self.oracle = problem.oracle
         self.estimator = Samples(self.model.d) if estimator is None else estimator
-        self._absurd = ABSURD * self.model.plant.x_scale, ABSURD * self.model.plant.u_scale
+        plant = self.model.plant
+        self._absurd = ABSURD * plant.x_scale, ABSURD * plant.u_scale
+        # U about the equilibrium: its box, and the rows beside it.
+        self._box = plant.u_min - plant.u_e, plant.u_max - plant.u_e
+        self._beside = plant.input_rows.about(plant.u_e)
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -178,6 +182,8 @@ class Controller:
         )
         x, u = s[: self.model.d], plan.u[0]
         after = follow(s, u, self.model.step(x, u) + self.oracle.estimate(there, x, u))
+        if not np.isfinite(after).all():
+            after = s
         estimator, line = self.estimator.commanded(estimator, u), self.line.commanded(line, u)
         memory = ControllerState(
             shift(plan),
@@ -265,7 +271,8 @@ class Controller:
         acts: np.ndarray | None,
         delay: float,
     ) -> tuple[np.ndarray | None, OracleState]:
-        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there.
+        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there; None:
+        it is not known.
 
         Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
         which the model knows; without this every millisecond between sample and command would be a disturbance. With
@@ -279,7 +286,10 @@ class Controller:
             there = self._motion.after(x, acts, delay)
             if there is not None:
                 return there, oracle
-        return predicted(self.model, self.oracle, oracle, x, inputs)
+        with np.errstate(all="ignore"):
+            there, after = predicted(self.model, self.oracle, oracle, x, inputs)
+        # Where an oracle has no numbers, nobody knows where the plant will be.
+        return (there, after) if np.isfinite(there).all() else (None, oracle)
 
     def _aim(
         self,
@@ -341,12 +351,8 @@ class Controller:
         """What was written before v_0, (m,), in U: as the plant says, or as commanded; None: nothing depends on it."""
         if not self.problem.looks_back:
             return None
-        acts, plant = acting(written), self.model.plant
-        return (
-            state.commanded
-            if acts is None
-            else np.clip(acts, plant.u_min - plant.u_e, plant.u_max - plant.u_e)
-        )
+        acts = acting(written)
+        return state.commanded if acts is None else self._beside.pulled(np.clip(acts, *self._box), 0.0)
 
     def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
         """The plan within the rate limits from `previous` on."""

@@ -44,6 +44,8 @@ class HiddenSet:
     """Of the layers."""
     network_sha256: str
     """Of the description that they were trained for."""
+    later: int | None = None
+    """Samples, at most, since the newest that had a part in the training; None: nobody says."""
 
 
 class Verdict(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lbmpc.plants.rows import LinearRows, Row, rows_of
+from lbmpc.plants.rows import LinearRows, Row, no_rows, rows_of
 
 STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
 INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
@@ -153,12 +153,12 @@ class Description:
     @cached_property
     def state_rows(self) -> LinearRows:
         """Of X, beside its box."""
-        return rows_of(self.rows, self.states, self.x_scale)
+        return rows_of(self.rows, self.states, self.x_scale) if self.rows else no_rows(self.d)
 
     @cached_property
     def input_rows(self) -> LinearRows:
         """Of U, beside its box."""
-        return rows_of(self.rows, self.inputs, self.u_scale)
+        return rows_of(self.rows, self.inputs, self.u_scale) if self.rows else no_rows(self.m)
 
     @property
     def d(self) -> int:

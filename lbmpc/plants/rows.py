@@ -69,6 +69,12 @@ def rows_of(rows: Mapping[str, Row], names: Sequence[str], scale: np.ndarray) ->
     )
 
 
+def no_rows(n: int) -> LinearRows:
+    """Of n variables, whose half-widths need not be known."""
+    none = np.zeros(0)
+    return LinearRows((), np.zeros((0, n)), none, none, (), none)
+
+
 def coefficients(row: Row) -> dict[str, float]:
     """By the name of a state or input."""
     return {name: value for name, value in row.items() if name not in WORDS}

@@ -189,8 +189,7 @@ class Rows:
                 nearest = least_distance(values, slopes, self.lower, self.upper, self.penalty, hint)
             if nearest is None or not self._in_order or not self._contradicts(nearest):
                 return nearest, feasible
-            hint = nearest.shown.seen
-            ordered = in_order(values, slopes, self.lower, self.upper, self.penalty, self._levels, hint)
+            ordered = in_order(values, slopes, self.lower, self.upper, self.penalty, self._levels)
             if ordered is None:
                 return nearest, feasible
             self._eased = ordered[1]

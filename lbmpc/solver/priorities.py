@@ -46,20 +46,19 @@ def in_order(
     upper: np.ndarray,
     penalty: Penalty,
     levels: np.ndarray,
-    hint: np.ndarray = NO_ROWS,
 ) -> tuple[Nearest, Eased] | None:
     """The minimiser, and the bounds with what it grants; None where the numbers are unusable.
 
     Arguments as for `least_distance`. levels: (rows,), the priority of soft rows, -1 of hard ones.
     """
-    lower, upper, found = lower.copy(), upper.copy(), None
+    found, hint = None, NO_ROWS
     for level in sorted(set(levels[levels >= 0].tolist())):
         own, later = levels == level, levels > level
         low, high = np.where(later, -np.inf, lower), np.where(later, np.inf, upper)
-        found = least_distance(y, M, low, high, replace(penalty, soft=own), hint[levels[hint] <= level])
+        found = least_distance(y, M, low, high, replace(penalty, soft=own), hint)
         if found is None:
             return None
-        hint = np.union1d(hint, found.shown.seen)
+        hint = found.shown.seen
         outside = violation(found.values, low, high)
         granted = np.where(own & (outside > 0.0), outside + GRANTED * penalty.scale, 0.0)
         beyond = found.values > upper

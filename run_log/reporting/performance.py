@@ -62,7 +62,7 @@ def performance(
     plant: Description,
     config: Config,
     truth: object,
-    rests: tuple[np.ndarray, np.ndarray] | None = None,
+    u_goal: np.ndarray | None = None,
 ) -> Performance:
     """Figures of `motion`, which may be a part of a run (`Trajectory.part`).
 
@@ -71,19 +71,16 @@ def performance(
         plant: its equilibrium, bounds and half-widths.
         config: the weights and the rate.
         truth: the plant whose motion this is, as of `excess`.
-        rests: where states and input should be at each sample but the last, (n - 1, d) and (n - 1, m), plant units,
-            where they move: overshoot and settling are then none. None: where the motion has its goal, and u_e.
+        u_goal: where the input should be in each period, (n - 1, m), plant units; None: at u_e.
     """
     names = config.reference.outputs or [plant.states[i] for i in plant.performance]
     own = [plant.states.index(name) for name in names]
     given = goal(plant, config) if motion.goal is None else motion.goal
-    moves = rests is not None or (motion.goal is not None and bool((motion.goal != motion.goal[0]).any()))
-    x_goal, u_goal = (given, plant.u_e) if rests is None else rests
-    if rests is not None:
-        x_goal = np.append(x_goal, x_goal[-1:], axis=0)
+    moves = motion.goal is not None and bool((motion.goal != motion.goal[0]).any())
+    aim = plant.u_e if u_goal is None else u_goal
     dx, du = (
         np.clip(off, -FARTHEST, FARTHEST)
-        for off in (motion.x - x_goal, np.nan_to_num(motion.applied[1:] - u_goal))
+        for off in (motion.x - given, np.nan_to_num(motion.applied[1:] - aim))
     )
     q, r = (
         np.ones(n) if w is None else np.array(w)
@@ -95,8 +92,7 @@ def performance(
     stages = squares @ q + du**2 @ r
     off = np.abs(dx) > SETTLED * plant.x_scale
     settled = {
-        name: _settled(off[:, i], motion.step, config.rate) if rests is None else None
-        for name, i in zip(names, own, strict=True)
+        name: _settled(off[:, i], motion.step, config.rate) for name, i in zip(names, own, strict=True)
     }
     times = [time for time in settled.values() if time is not None]
     return Performance(

@@ -71,6 +71,9 @@ class Summary(Performance, frozen=True, kw_only=True):
     longer; null where nothing weighs it."""
     constant_weight: dict[str, float] | None
     """What counted of the constant beside it, likewise."""
+    noise: dict[str, float] | None
+    """Standard deviation of what is measured of each state as the estimator had found it at the end, plant units; null
+    where it was told, or where there is no estimator."""
     outside_ticks: int | None
     """Ticks in a state outside the certified sets, where nothing is guaranteed; null where none are in force."""
     smallest_set_margin: float | None
@@ -109,6 +112,7 @@ def summarise(run: Run) -> Summary:
         prediction_error=_prediction_error(run.config.period, ticks, results),
         weight=_weight(run, plant.states, [r.weight for r in results]),
         constant_weight=_weight(run, plant.states, [r.constant_weight for r in results]),
+        noise=results[-1].noise_of(plant.states) if results else None,
         outside_ticks=sum(margin < 0.0 for margin in margins) if margins else None,
         smallest_set_margin=min(margins, default=None),
         log=str(run.path) if run.path.name else None,

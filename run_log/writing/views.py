@@ -22,12 +22,11 @@ from protocol.topics import Topic
 
 Json = dict[str, Any]
 Vector = list[float]
-NAMED_AFTER = dict.fromkeys(
-    ["x", "h", "h_hat", "oracle_norms", "column_norms", "target_x", "weight", "constant_weight", "deviation"],
-    "states",
-) | dict.fromkeys(("u", "applied", "target_u"), "inputs")
+VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation", "noise")
+NAMED_AFTER = dict.fromkeys((*VECTORS, "h", "h_hat", "column_norms"), "states") | dict.fromkeys(
+    ("u", "applied", "target_u"), "inputs"
+)
 """Of each vector, the plant's attribute that has the names of its entries."""
-VECTORS = ("x", "oracle_norms", "target_x", "target_u", "weight", "constant_weight", "deviation")
 LACKING = (*VECTORS, "sensor_faults", "reference")
 """What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
@@ -72,7 +71,8 @@ def _of_output_weights(weights: m.OutputWeights) -> Json:
 
 def _of_hidden_weights(weights: m.HiddenWeights) -> Json:
     norms = [float(np.linalg.norm(layer.numpy())) for layer in weights.layers]
-    return {"layer_norms": {f"W_{i}": norm for i, norm in enumerate(norms, 1)}}
+    newest = None if weights.newest is msgspec.UNSET else weights.newest
+    return {"newest": newest, "layer_norms": {f"W_{i}": norm for i, norm in enumerate(norms, 1)}}
 
 
 class Shown(NamedTuple):
@@ -97,7 +97,7 @@ SHOWN: dict[type[m.Message], Shown] = {
     m.TickResult: Shown(
         "x u mode status iterations slack slack_row h h_hat prediction_error oracle_norms hidden_version "
         "hidden_sha256 weights_verdict set_margin set_piece target_status target_x target_u target_distance "
-        "sensor_faults reference reference_verdict weight constant_weight deviation",
+        "sensor_faults reference reference_verdict weight constant_weight deviation noise",
         _of_result,
         {
             **dict.fromkeys(VECTORS, Vector | None),
@@ -118,9 +118,9 @@ SHOWN: dict[type[m.Message], Shown] = {
         {"norm": float, "column_norms": Vector},
     ),
     m.HiddenWeights: Shown(
-        "for_run trained_on base_sha256 samples loss_before loss_after sha256 layer_norms",
+        "for_run trained_on newest base_sha256 samples loss_before loss_after sha256 layer_norms",
         _of_hidden_weights,
-        {"layer_norms": dict[str, float]},
+        {"newest": int | None, "layer_norms": dict[str, float]},
     ),
     m.Override: Shown("mode u lease", lambda override: {"u": override.u or None}, {"u": Vector | None}),
     m.CertifiedSets: Shown("kind sha256"),

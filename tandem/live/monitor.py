@@ -113,6 +113,9 @@ class Snapshot:
     nothing weighs it."""
     adds_nothing: bool = False
     """Whether it has been nearly nothing for seconds."""
+    noise: dict[str, float] | None = None
+    """Standard deviation of what is measured as the estimator found it, by the names of states; None where it was
+    told."""
     trend: tuple[float, ...] = ()
     """Mean prediction error of each second so far, the newest last."""
     weights_version: int = -1
@@ -263,6 +266,7 @@ class Monitor:
         self._asked_by = result.reference_from or self._asked_by
         if result.weight:
             self._take_weight(max(result.weight + result.constant_weight), tick, now)
+        seen.noise = result.noise_of(self.plant.states)
         seen.weights_version = result.hidden_version
         if result.weights_rolled_back:
             seen.rolled_back += 1

@@ -76,6 +76,8 @@ def line(now: Snapshot) -> str:
         parts.append(f"error {now.prediction_error:.1e}")
     if now.adds_nothing:
         parts.append(ADDS_NOTHING)
+    if now.noise is not None:
+        parts.append(f"noise {_noise(now.noise)}")
     parts.append(
         f"weights {_version(now)} ({now.adopted} adopted, {now.refused} refused, {now.rolled_back} rolled back)"
     )
@@ -255,8 +257,13 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("loss", Text(loss)),
             ("buffer", Text(f"{now.samples} samples")),
             ("bad messages", _counted(now.bad_messages, "not obeyed")),
+            *([] if now.noise is None else [("noise found", Text(_noise(now.noise)))]),
         ]
     )
+
+
+def _noise(found: Mapping[str, float]) -> str:
+    return " ".join(f"{name} {one:.2g}" for name, one in found.items())
 
 
 def _weight(now: Snapshot) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -25,7 +26,9 @@ from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
+from trainer_node.descent import descend
 from trainer_node.node import COUNTERS, TRAIN_EVERY, TrainerNode
+from trainer_node.training import Trainer
 
 
 class BusThatWritesDown:
@@ -199,6 +202,44 @@ def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
     assert min(np.diff(began)) >= TRAIN_EVERY - 1e-9
     # At 20 Hz, ten samples take longer than that: nothing is held back there.
     assert Config().trainer.train_every * Config().period > TRAIN_EVERY
+
+
+class Notes:
+    """In place of a health publisher: what was said, in order."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, str]] = []
+
+    def set(self, status: str, note: str = "") -> None:
+        self.said.append((status, note))
+
+
+def test_health_and_log_say_what_a_training_was_good_for(caplog: pytest.LogCaptureFixture) -> None:
+    config = override(Config(), ["trainer.steps=3"])
+    bus, counts, notes = cast(Bus, BusThatWritesDown(config)), dict.fromkeys(COUNTERS, 0), Notes()
+    node = TrainerNode(config, bus, cast(HealthPublisher, notes), counts, cast(Executor, None))
+    core = ControllerCore(config, "controller-a")
+    description = core.controller.oracle.description
+    assert description is not None
+    hidden = [layer.numpy().astype(float) for layer in core.memory.hidden_snapshot(-1).layers]
+    node._trainer = trainer = Trainer(description, config.trainer, 0, "trainer-a", hidden)
+    scale = np.array(description.output_scale)
+    K = m.Array.of(np.zeros((description.features, 4)))
+    output = m.OutputWeights(
+        run_id="controller-a", seq=0, hidden_version=0, hidden_sha256=trainer.sha256, K=K
+    )
+    with caplog.at_level(logging.INFO, "trainer_node.node"):
+        for variance in ([], (scale**2).tolist(), (scale**2).tolist()):
+            first = len(trainer.buffer)
+            new = [m.Sample(first + k, [0.1] * 4, [0.1], [0.0] * 4, variance=variance) for k in range(20)]
+            trainer.add("controller-a", new)
+            draw = trainer.begin(output, "controller-a")
+            assert draw is not None
+            node.finish(draw, descend(draw.problem, 3, 1e-3))
+    nothing = "following ; training has nothing to gain (0.0% of the labels' variance)"
+    assert notes.said == [("running", "following "), ("running", nothing), ("running", nothing)]
+    # Said once, not after every training.
+    assert [record.getMessage() for record in caplog.records] == [nothing]
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,14 @@ def test_figures_are_about_the_reference_of_each_sample() -> None:
     assert figures(motion(x), "rate=1").offset == {}
 
 
+def test_the_input_may_have_a_goal_too() -> None:
+    given = motion([[0.1, 0.0], [0.2, 0.1], [0.9, 0.9]], [0.3, -0.3], 1.0)
+    given = msgspec.structs.replace(given, goal=np.array([[0.1, 0.0], [0.2, 0.0], [0.2, 0.0]]))
+    weights = ["rate=1", "controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]
+    found = performance(given, OSCILLATOR, override(Config(), weights), OSCILLATOR, np.array([[0.3], [-0.3]]))
+    assert found.J == pytest.approx(3 * 0.01)
+
+
 def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:
     x = [[0.5, 0.1], [-0.25, 0.2], [0.0, 0.0]]
     weights = ["controller.Q=[2.0, 3.0]", "controller.R=[0.5]"]

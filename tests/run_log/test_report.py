@@ -29,7 +29,7 @@ from run_log.reporting.canvas import save
 from run_log.reporting.motion import trajectory
 from run_log.reporting.report import picture, report
 from run_log.reporting.summary import PredictionError, summarise
-from run_log.reporting.traces import traces
+from run_log.reporting.traces import Traces, traces
 from run_log.run import gather
 from tests.helpers.run_log_samples import STEPS, Logged
 
@@ -139,6 +139,28 @@ def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: 
     assert motion.x[motion.starts[1]] == pytest.approx(PLANT.x0)
     line = plots.pictures(traces(run))["states"]().axes[0].lines[0]
     assert np.isnan(line.get_ydata()).sum() == 1
+
+
+def test_pictures_show_where_a_plan_leads_and_not_the_equilibrium_instead(
+    config: Config, messages: list[Logged]
+) -> None:
+    data = traces(gather(config, messages))
+
+    def lines(data: Traces, what: str) -> dict[str, np.ndarray]:
+        (ax, *_) = plots.pictures(data)[what]().axes
+        return {str(line.get_label()): np.array(line.get_ydata()) for line in ax.lines}
+
+    assert "equilibrium" in lines(data, "states")
+    n = len(data.t)
+    led = np.arange(n) >= n // 2
+    target_x, target_u = (
+        np.where(led[:, None], rest + 0.01, np.nan) * np.ones((n, 1)) for rest in (PLANT.x_e, PLANT.u_e)
+    )
+    data = dataclasses.replace(data, target_x=target_x, target_u=target_u)
+    for what, rest in (("states", PLANT.x_e[0]), ("input", PLANT.u_e[0])):
+        shown = lines(data, what)
+        assert "equilibrium" not in shown
+        assert shown["target of the plan"] == pytest.approx(np.where(led, rest + 0.01, rest))
 
 
 def test_summary_of_applied_input_and_settled_states(config: Config, messages: list[Logged]) -> None:

@@ -29,6 +29,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
     weights = m.HiddenWeights(
         run_id="t-1", seq=3, for_run="c-1", trained_on=5, base_sha256="ab", samples=40, loss_before=0.1,
         loss_after=1e-9, network_sha256="cd", sha256="ef", layers=[K, m.Array.of(np.ones((5, 2)), "<f4")],
+        newest=6,
     )  # fmt: skip
     tick = m.Tick(
         **who, slot=8, t=0.35, skipped=1, lateness=-0.0, late=True, state_verdict="fresh", state=state, weights=weights
@@ -39,7 +40,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
         input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
         sensor_faults={"y": "stuck; what it measures is estimated from the others"},
-        weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x,
+        weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x, noise=x,
     )  # fmt: skip
     absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
     absent |= {"target_status": "none", "target_distance": None}
@@ -61,6 +62,7 @@ def messages() -> list[tuple[Topic, m.Message]]:
         (topics.SAMPLES, m.Samples(**who, samples=[])),
         (topics.OUTPUT_WEIGHTS, m.OutputWeights(**who, hidden_version=3, hidden_sha256="ef", K=K)),
         (topics.HIDDEN_WEIGHTS, weights),
+        (topics.HIDDEN_WEIGHTS, replaced(weights, newest=msgspec.UNSET)),
         (topics.OVERRIDE, m.Override(run_id="h-1", seq=0, mode="manual", u=u, lease=1.5)),
         (topics.OVERRIDE, m.Override(run_id="h-1", seq=1, mode="auto")),
         (topics.SETS, m.CertifiedSets(**who, kind="invariant", sha256="01", content=b"x")),

@@ -42,6 +42,7 @@ KEYS = {
     *(
         "episodes",
         "constraint_violations",
+        "violated_rows",
         "excess_between_samples",
         "J",
         "deviation",
@@ -54,6 +55,7 @@ KEYS = {
         "prediction_error",
         "weight",
         "constant_weight",
+        "noise",
         "sensor_faults",
         "outside_ticks",
         "smallest_set_margin",

@@ -20,6 +20,7 @@ from tests.helpers.paths import ROOT
 from tests.helpers.torch_network import h_hat_of
 from trainer_node import training
 from trainer_node.network import DenseLoss, Network
+from trainer_node.pace import Worth
 from trainer_node.training import Trainer, TrainerError, pick_device
 
 DESCRIPTION = NetworkDescription(
@@ -153,17 +154,17 @@ def test_it_is_due_after_enough_new_samples_and_not_before() -> None:
     trainer = make(number=0, train_every=20, min_samples=50)
     for first in range(0, 40, 20):
         trainer.add("controller-1", samples(first, 20))
-        assert not trainer.due()
+        assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(40, 10))
-    assert trainer.due()
+    assert trainer.due(output(trainer))
     trained(trainer)
-    assert not trainer.due()
+    assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(30, 20))
     assert trainer.counters["samples met before"] == 20
     trainer.add("controller-1", samples(50, 19))
-    assert not trainer.due()
+    assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(69, 1))
-    assert trainer.due()
+    assert trainer.due(output(trainer))
 
 
 def test_samples_that_cannot_be_right_never_reach_the_buffer() -> None:
@@ -349,12 +350,14 @@ def test_what_is_held_out_says_where_to_stop() -> None:
     draw = trainer.begin(output(trainer), "controller-1")
     assert draw is not None
     assert draw.problem.held_out is not None
-    window, h = draw.problem.held_out
+    window, _ = draw.problem.held_out
     network = Network(DESCRIPTION)
     network.load([layer.numpy().astype(float) for layer in learned.layers])
     h_hat = h_hat_of(network, network.tensor(window), network.tensor(K)).numpy(force=True)
-    error = (h_hat - h) / DESCRIPTION.output_scale
-    np.testing.assert_allclose(learned.loss_after, (error**2).sum() / len(h), rtol=1e-4)
+    labels = {tuple(sample.x + sample.u): sample.h for sample in noisy(60, 0.3)}
+    error = (h_hat - [labels[tuple(row)] for row in window]) / DESCRIPTION.output_scale
+    # As a share of the labels' variance.
+    np.testing.assert_allclose(learned.loss_after, np.mean((error / 0.3) ** 2), rtol=1e-4)
 
 
 def test_of_a_few_steps_the_last_one_counts_too() -> None:
@@ -390,3 +393,72 @@ def test_a_variance_that_is_none_is_a_bad_sample(variance: list[float]) -> None:
     (bad,) = samples(50, 1)
     assert trainer.add("controller-1", [msgspec.structs.replace(bad, variance=variance)]) == 0
     assert trainer.counters["bad samples"] == 1
+
+
+def test_a_set_says_the_newest_sample_that_it_was_trained_on_where_labels_are_noisy() -> None:
+    trainer, learned = trained_on(noisy(300, 0.1), K)
+    assert learned is not None
+    assert learned.newest == 299
+    trainer.add("controller-2", noisy(10, 0.1))
+    again = trainer.train(output(trainer), "controller-2")
+    assert again is None or again.newest == 9
+    exact = trained(make())
+    assert exact.newest is msgspec.UNSET
+    assert b"newest" not in msgspec.msgpack.encode(exact)
+
+
+def test_a_state_that_nobody_measures_does_not_keep_others_from_being_learned() -> None:
+    scale = np.array(DESCRIPTION.output_scale)
+    blind = [
+        msgspec.structs.replace(
+            sample,
+            h=(np.array(sample.h) + np.array([0.0, 0.0, 0.0, 30.0]) * scale * (-1) ** sample.seq).tolist(),
+            variance=[*sample.variance[:3], float(1e3 * scale[3] ** 2)],
+        )
+        for sample in noisy(300, 0.1)
+    ]
+    _, learned = trained_on(blind, K)
+    assert learned is not None
+    assert learned.loss_after < 0.9 * learned.loss_before
+
+
+def trainings(trainer: Trainer, first: int, number: int, share: float) -> list[int]:
+    """The samples, all of them labels of `share` h with as much noise as h, at which a training began."""
+    began = []
+    rng, scale = np.random.default_rng(first), np.array(DESCRIPTION.output_scale)
+    for sample in samples(first, number):
+        h = share * np.array(sample.h) + 0.3 * scale * rng.normal(size=4)
+        noise = ((0.3 * scale) ** 2).tolist()
+        trainer.add("controller-1", [msgspec.structs.replace(sample, h=h.tolist(), variance=noise)])
+        if trainer.due(output(trainer, weights=np.zeros_like(K))):
+            trainer.train(output(trainer, weights=np.zeros_like(K)), "controller-1")
+            began.append(sample.seq)
+    return began
+
+
+def test_it_trains_less_where_there_is_nothing_to_gain_and_at_once_where_h_changes() -> None:
+    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
+    # K = 0: no hidden layers predict anything.
+    calm = np.diff(trainings(trainer, 0, 600, share=0.0))
+    assert list(calm[:3]) == [40, 80, 150]
+    # A quarter of the buffer, at most.
+    assert set(calm[2:]) == {150}
+    assert trainer.worth == Worth(0.0, pays=False)
+    assert str(trainer.worth) == "training has nothing to gain (0.0% of the labels' variance)"
+    risen = trainings(trainer, 600, 40, share=3.0)
+    assert risen[0] < 625
+    # Of another controller's layers nothing is known.
+    trainer.resume(HIDDEN)
+    assert trainings(trainer, 700, 30, share=0.0)[0] <= 709
+
+
+def test_labels_without_a_variance_are_trained_on_as_often_as_ever() -> None:
+    trainer = make(number=0)
+    began = []
+    for sample in samples(0, 100):
+        trainer.add("controller-1", [msgspec.structs.replace(sample, h=[0.0] * 4)])
+        if trainer.due(output(trainer, weights=np.zeros_like(K))):
+            trainer.train(output(trainer, weights=np.zeros_like(K)), "controller-1")
+            began.append(sample.seq)
+    assert began == list(range(19, 100, 10))
+    assert trainer.worth is None

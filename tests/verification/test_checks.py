@@ -25,6 +25,7 @@ from verification.faults.facts import Replayed
         (holds.control_kept, {"plan_s": 0.1}),
         (holds.punctual, {"late": 3, "late_by_machine": 2}),
         (holds.no_burst, {"burst": 3}),
+        (holds.still_led, {"not_led": 2}),
         (holds.plan_then_safe, {"sources": ["command", "safe", "command"]}),
         (holds.merged, {"samples_held": 198}),
         (holds.merged, {"samples_held": 200}),

@@ -64,9 +64,12 @@ class Adoption:
                 return state, Verdict("refused", "stale: these layers were in use or on trial before")
             state = {**state, **had(state, offered.sha256)}
             in_use = self.net.hidden(state)
-            found = self._compare(samples, (hidden, K), (in_use, state["K"]))
-            if self.trial.refuses(found):
-                return state, Verdict("refused", f"trial: {found}")
+            # What a set was trained on it predicts in any case. Who says nothing of that has the first trial alone.
+            later = self._later(state, offered)
+            for tried_on in (samples, later) if len(later) else (samples,):
+                found = self._compare(tried_on, (hidden, K), (in_use, state["K"]))
+                if self.trial.refuses(found):
+                    return state, Verdict("refused", f"trial: {found}")
             watched = rollback.adopted(self.trial, state, in_use, K)
         version = np.array([offered.version, offered.version], dtype=np.int64)
         return {**state, **self.net.named(hidden), "version": version, **watched, "K": K}, Verdict("adopted")
@@ -94,6 +97,14 @@ class Adoption:
                 **rollback.over(state),
             }, text
         return (state if not rollback.ends(state) else {**state, **rollback.over(state)}), ""
+
+    def _later(self, state: OracleState, offered: HiddenSet) -> np.ndarray:
+        """Samples that came after the last one that the set was trained on, (n, row); none where they are too few."""
+        assert self.trial is not None
+        if offered.later is None:
+            return state["recent"][:0]
+        later = newest(self.trial, state, int(state["seen"][0]) - offered.later)
+        return later if len(later) >= self.trial.least else later[:0]
 
     def _why_not_of_this_network(self, state: OracleState, offered: HiddenSet) -> str | None:
         """What is wrong with a set before anybody asks how well it predicts, or None."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
@@ -225,7 +224,7 @@ def _input_table(known: Known) -> Table:
 
     from tandem.model_tables import plain
 
-    limited = any(map(isfinite, known.input_rates))
+    limited = bool(np.isfinite(known.input_rates).any())
     names = ("half-width", "u_e", "u_min", "u_max", "safe input", *("most a second",) * limited)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, name in enumerate(known.inputs):

@@ -208,6 +208,8 @@ def _survival_table(results: list[CaseResult]) -> Table:
 
 
 def _settled(result: CaseResult) -> str:
+    if result.case.set_points is not None:
+        return "–"
     median = result.median("settled_s")
     if np.isinf(median):
         return "lost" if np.isinf(result.median("J")) else "not settled"

@@ -59,7 +59,7 @@ def episodes(results: list[CaseResult]) -> list[Picture]:
     caption = (
         f"Regret by {_what(results)}: J above that of the true h from the same start, in percent of it; the axis is "
         f"linear up to {LINEAR:g} % and logarithmic beyond. Line: median over the seeds; band: all of them. "
-        "What was lost is not drawn."
+        f"What is above {LARGEST:g} % is drawn there, and what was lost is not drawn."
     )
     return [Picture(made, caption, f"regret by {_what(results)} and oracle")]
 

@@ -377,7 +377,7 @@ class LockStep:
             return
         if outputs.sample is not None:
             self.trainer.add(CONTROLLER, [outputs.sample])
-        if self.trainer.due() and not self.on_the_way:
+        if self.trainer.due(outputs.output_weights) and not self.on_the_way:
             weights = self.trainer.train(outputs.output_weights, CONTROLLER)
             if weights is not None:
                 takes = max(1, math.ceil(self.faults.training_seconds / self.config.period - 1e-9))

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import root
 
 from lbmpc.plants import Description, PlantError, TrueMotion
+from node_runtime.config.strict import ConfigError, did_you_mean
 from protocol import messages as m
 from tandem.set_points import trajectory
 
@@ -15,6 +16,28 @@ Values = Mapping[str, Sequence[float]]
 """By the name of a state, plant units: those that follow each other within a cycle, equally long."""
 CLOSE = 1e-8
 """Of a half-width: what a rest may move by in a period, and miss its set-point by."""
+
+
+def require_fit(values: Values, plant: Description, where: str) -> None:
+    """Raises `ConfigError` for what is no wave of this plant; the text begins with `where`."""
+    states = plant.states
+    for name in values:
+        if name not in states:
+            raise ConfigError(
+                f"{where}: {name!r} is no state; {did_you_mean(name, states, ', '.join(states))}"
+            )
+    if (
+        len(values) != plant.m
+        or len({len(every) for every in values.values()}) != 1
+        or not all(values.values())
+    ):
+        raise ConfigError(
+            f"{where}: give as many states as the plant has inputs ({plant.m}), each with as many values as the others"
+        )
+    for name, every in values.items():
+        i = states.index(name)
+        if not all(plant.x_min[i] <= value <= plant.x_max[i] for value in every):
+            raise ConfigError(f"{where}: {name} = {[*every]} is not within its bounds")
 
 
 def reference(values: Values, seconds: float, cycles: int) -> m.Reference:

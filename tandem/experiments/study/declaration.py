@@ -14,6 +14,7 @@ from node_runtime.config.loading import from_tree
 from node_runtime.config.sections import Config, Count, Section
 from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
+from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.faults import Faults
 
 Picture = Literal["episodes", "trajectories", "states", "survival", "lemma", "recovery", "rows"]
@@ -214,7 +215,7 @@ def _resolve(
     episodes = _said(levels, "episodes", 1)
     faults, set_points = _said(levels, "faults", Faults()), _said(levels, "set_points", None)
     if set_points is not None:
-        _require_set_points(set_points, plant, f"{where}: case {case.name!r}: set_points")
+        wave.require_fit(set_points, plant, f"{where}: case {case.name!r}: set_points")
     vary = case.vary
     if quick:
         few = declared.quick
@@ -279,23 +280,6 @@ def _x0s(declared: Declaration, name: str, plant: Description, where: str) -> li
             x0[plant.states.index(name)] = value
         made.append(x0)
     return made
-
-
-def _require_set_points(values: dict[str, list[float]], plant: Description, where: str) -> None:
-    for name in values:
-        _known(Path(where), "a state", name, list(plant.states))
-    if (
-        len(values) != plant.m
-        or len({len(every) for every in values.values()}) != 1
-        or not all(values.values())
-    ):
-        raise ConfigError(
-            f"{where}: give as many states as the plant has inputs ({plant.m}), each with as many values as the others"
-        )
-    for name, every in values.items():
-        i = plant.states.index(name)
-        if not all(plant.x_min[i] <= value <= plant.x_max[i] for value in every):
-            raise ConfigError(f"{where}: {name} = {every} is not within its bounds")
 
 
 def _known(path: Path, key: str, name: str, names: list[str]) -> None:

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
-from controller_node.build import build_model, build_network_oracle
-from lbmpc.plants import get_plant, get_truth, true_motion
+from controller_node.build import build_model, build_network_oracle, build_plant
+from lbmpc.plants import PlantError, get_plant, get_truth, true_motion
 from node_runtime.config.plant import true_plant_of
 from node_runtime.config.sections import Config
+from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import read_regular, require_regular, write_whole
 from run_log.reporting.motion import trajectory
 from run_log.reporting.performance import Performance, performance
@@ -99,6 +101,7 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
 def _outcome(job: Job) -> Outcome:
     if job.set_points is None:
         return follow(job.config, job.steps, job.faults, episodes=job.episodes)
+    _rests(job, job.set_points)  # before anything runs in vain
     asked = wave.reference(job.set_points, job.steps * job.config.period, job.episodes)
     return follow(job.config, job.steps * job.episodes, job.faults, set_points=asked)
 
@@ -107,13 +110,22 @@ def _cycles(run: Run, job: Job) -> list[Performance]:
     """Of each that could be followed to its end: dx and du are from where the true plant rests at the set-points."""
     plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
     motion = trajectory(run, plant)
-    outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))
+    values = job.set_points or {}
+    outputs = msgspec.structs.replace(job.config.reference, outputs=list(values))
     config = msgspec.structs.replace(job.config, reference=outputs)
-    rests = wave.rests(job.set_points or {}, job.steps, true_motion(truth), plant, job.config.period)
+    x, u = _rests(job, values)
     firsts = range(0, len(motion.step) - job.steps, job.steps)
-    return [
-        performance(motion.part(first, first + job.steps), plant, config, truth, rests) for first in firsts
-    ]
+    parts = [motion.part(first, first + job.steps) for first in firsts]
+    goal = np.append(x, x[-1:], axis=0)
+    return [performance(msgspec.structs.replace(part, goal=goal), plant, config, truth, u) for part in parts]
+
+
+def _rests(job: Job, values: wave.Values) -> tuple[np.ndarray, np.ndarray]:
+    true = true_motion(true_plant_of(job.config, get_plant, get_truth))
+    try:
+        return wave.rests(values, job.steps, true, build_plant(job.config), job.config.period)
+    except PlantError as error:
+        raise ConfigError(f"set_points: {error}") from error
 
 
 def _traces(run: Run) -> Traces:

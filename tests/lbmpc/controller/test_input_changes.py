@@ -66,7 +66,7 @@ def test_what_stands_in_for_a_solution_keeps_the_rate_too() -> None:
     assert without.mode == "shifted_plan"
     assert within(without.plan, result.plan[0, 0])
     # Something else acts than was planned, and there are no numbers to solve with.
-    broken = dataclasses.replace(state, oracle={**state.oracle, "h": np.full(4, np.nan)})
+    broken = dataclasses.replace(state, oracle={**state.oracle, "h_hat": np.full(4, np.nan)})
     _, other = LIMITED.step(broken, seen(np.full(4, 1e5), 1, -0.5))
     assert within(other.plan, -0.5)
     nothing = dataclasses.replace(lost, plan=empty_plan(15, 1))
@@ -84,6 +84,16 @@ def test_an_input_that_is_said_to_act_outside_u_leads_no_plan_out_of_it() -> Non
     assert other.mode == "shifted_plan"
     low, high = MODEL.plant.u_min - MODEL.plant.u_e, MODEL.plant.u_max - MODEL.plant.u_e
     assert ((other.plan >= low) & (other.plan <= high)).all()
+
+
+def test_an_oracle_without_numbers_leads_to_no_command_that_is_none() -> None:
+    state, _ = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
+    broken = {**state.oracle, "h_hat": np.full(4, np.nan)}
+    for plan in (state.plan, empty_plan(15, 1)):
+        blind = dataclasses.replace(state, plan=plan, oracle=broken, delay=0.01)
+        after, result = LIMITED.step(blind, seen(FAR, 5, 0.1))
+        assert within(result.plan, 0.1)
+        assert np.isfinite(after.predicted).all()
 
 
 def test_a_backup_plan_goes_on_from_the_command() -> None:

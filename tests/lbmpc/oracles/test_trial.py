@@ -19,7 +19,8 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from run_log.replaying.replay import replay
 from run_log.reporting.summary import Summary, summarise
-from tandem.experiments.simulation.lockstep import simulate
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow, simulate
 from tests.helpers.science import compressor, describe
 from verification.attacks import Forge, Known, crude, drift, elsewhere, follow_attacked, noise
 
@@ -98,9 +99,12 @@ def more(oracle: DnnOracle, state: OracleState, x: np.ndarray) -> OracleState:
     return oracle.learn(state, x, np.array([0.1]), 0.01 * np.array([x[0] + 0.3, x[1], 0.0, 0.2]))
 
 
-def offer(oracle: DnnOracle, state: OracleState, layers: Layers, version: int) -> tuple[OracleState, Verdict]:
+def offer(
+    oracle: DnnOracle, state: OracleState, layers: Layers, version: int, later: int | None = None
+) -> tuple[OracleState, Verdict]:
     layers = [layer.astype(np.float32).astype(float) for layer in layers]
-    return oracle.adopt(state, HiddenSet(version, layers, hash_layers(layers), oracle.description.sha256()))
+    offered = HiddenSet(version, layers, hash_layers(layers), oracle.description.sha256(), later)
+    return oracle.adopt(state, offered)
 
 
 def nudged(hidden: Layers) -> Layers:
@@ -146,6 +150,27 @@ def _worse_elsewhere(state: OracleState) -> Layers:
     hidden[1][0, :] += 0.5
     hidden[1][1, :] = 0.5
     return hidden
+
+
+def test_a_set_that_says_what_it_was_trained_on_must_be_as_good_on_what_came_after() -> None:
+    state = learned(60, spread=0.01)
+    rng = np.random.default_rng(1)
+    for _ in range(28):
+        # Labels so noisy that nothing can be seen on them.
+        h = 10.0 * ORACLE.output_scale * rng.normal(size=4)
+        state = {**ORACLE.learn(state, rng.normal(size=4) * 0.01, np.array([0.1]), h), "K": state["K"]}
+    for _ in range(12):
+        state = {**more(ORACLE, state, np.array([0.4, 0.0, 0.0, 0.0])), "K": state["K"]}
+    worse = _worse_elsewhere(state)
+    after, verdict = offer(ORACLE, state, worse, 1, later=12)
+    assert verdict.outcome == "refused"
+    assert "of 12 samples" in verdict.reason
+    assert_as_it_was(after, state)
+    # Too few say nothing, and neither does a set without a word.
+    assert offer(ORACLE, state, worse, 1, later=9)[1].outcome == "adopted"
+    assert offer(ORACLE, state, worse, 1)[1].outcome == "adopted"
+    # Later than all that is remembered is all of it.
+    assert offer(ORACLE, state, worse, 1, later=2**62)[1].outcome == "adopted"
 
 
 def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> None:
@@ -269,6 +294,22 @@ def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> N
         assert result.first_tick <= tick
     # Another rule is another run: the comparison sees it.
     assert not replay(run, None, ["adaptation.trial.floor=0.0"]).equal
+
+
+def test_a_tick_says_how_many_samples_came_after_those_of_its_set_and_replays() -> None:
+    noisy = ["estimator.kind=kalman", "estimator.noise=0.001", "plant.sensors.noise=0.001"]
+    config = override(Config(), [*SMALL, *noisy])
+    run = follow(config, 60, Faults(training_seconds=0.3)).run
+    core = ControllerCore(config, "controller-simulated")
+    offered = [(tick, core.translation.observation(tick).hidden) for tick in run.ticks if tick.weights]
+    assert offered
+    for tick, hidden in offered:
+        assert hidden is not None
+        # Trained in the tick that learned its last sample, six ticks before.
+        assert hidden.later == 6
+        assert tick.weights.newest == tick.seq - 7
+    assert replay(run).equal
+    assert replay(run, from_tick=45).equal
 
 
 def test_stale_sets_under_new_versions_are_refused_in_a_replay_from_a_keyframe_too() -> None:

@@ -188,6 +188,18 @@ def test_an_input_on_its_way_does_not_stop_at_a_row() -> None:
     assert not np.allclose(there[8], end, atol=1e-3)
 
 
+def test_a_violated_row_that_no_input_moves_is_in_the_slack_alone() -> None:
+    """In discrete time an input moves the speed first: where the place is one step later is settled."""
+    limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
+    cart = Known.from_matrices([[1, 0.1], [0, 1]], [[0.0], [0.1]], period=0.1, W=[0, 0], **limits)
+    for rows in ({}, {"left": {"x1": 1.0, "max": 0.5, "priority": 2}}):
+        model = build_model(replace(cart, rows=rows), 0.1)
+        problem = build_problem(model, LinearOracle(2, 1), 10, "none")
+        found = Solver(problem).solve(np.array([1.2, 0.1]), NOTHING, np.zeros((10, 1)))
+        assert found.status is Status.INFEASIBLE
+        np.testing.assert_allclose(found.v[:3], -1.0)
+
+
 def test_targets_are_inside_the_rows() -> None:
     model = with_rows(build_model(CART, 0.2), {"left": {"p": 1.0, "v": 0.1, "max": 0.7}})
     selector = TargetSelector(build_problem(model, LinearOracle(2, 2), 5, "none"))

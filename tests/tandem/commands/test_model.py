@@ -76,6 +76,19 @@ def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> 
         assert word not in text
 
 
+def test_rows_are_said_and_one_that_rest_does_not_keep_is_a_fault(mine: Any, capsys: Capture) -> None:
+    limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
+    rows = {"stop": {"x1": 1.0, "x2": 0.5, "max": 0.7, "priority": 1}}
+    mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], rows=rows, **limits))
+    code, text = said(capsys, "mine")
+    assert "stop = 0 at rest, of -inf to 0.7" in text
+    code, text = said(capsys, "mine", "--set", "plant.x0=[0.5,0.5]")
+    assert "stop = 0.75, the row is [-inf, 0.7]" in text
+    code, found = checked(capsys, "mine", "--set", "plant.rows.stop={x1=1.0,max=-0.1}")
+    assert code == 2
+    assert "row stop is 0 at x_e" in found["faults"][0]
+
+
 def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))

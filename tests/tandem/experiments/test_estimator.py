@@ -113,6 +113,7 @@ def test_noise_that_is_found_is_in_every_tick_in_keyframes_and_in_checkpoints() 
     first, last = np.array(run.results[5].noise), np.array(run.results[-1].noise)
     np.testing.assert_allclose(first, 0.01 * PLANT.x_scale)
     np.testing.assert_allclose(last / PLANT.x_scale, 0.002, rtol=0.5)
+    assert summarise(run).noise == dict(zip(PLANT.states, last, strict=True))
     assert replay(run).equal
     # In the middle of finding.
     assert replay(run, from_tick=45).equal

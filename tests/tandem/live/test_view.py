@@ -269,6 +269,19 @@ def test_it_is_said_when_learning_adds_nothing_for_seconds_and_when_it_counts_ag
     assert "learning counts again" in events
 
 
+def test_noise_that_was_found_is_shown_of_the_states_that_are_measured() -> None:
+    seen = Monitor(CONFIG, PLANT, 20.0)
+    seen.feed(delivery(topics.COMMAND, command(0), START))
+    seen.feed(delivery(topics.RESULT, result(0), START))
+    assert "noise" not in view.line(seen.snapshot(START))
+    seen.feed(
+        delivery(topics.RESULT, msgspec.structs.replace(result(1), noise=[0.0051, 0.02, 0.0, 0.0]), START)
+    )
+    now = seen.snapshot(START)
+    assert "noise z 0.0051 y 0.02 |" in view.line(now)
+    assert "noise found z 0.0051 y 0.02" in " ".join("".join(drawn(now, 100, 30)).split())
+
+
 def test_one_line(monitor: Monitor):
     text = view.line(monitor.snapshot(START + 2.5))
     assert "\n" not in text

@@ -23,6 +23,7 @@ from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
+from tandem.commander import commanding
 from tandem.live.processes import command_line
 from verification.faults.processes import link as links
 from verification.faults.processes.running import Event, Heard, Running
@@ -45,8 +46,8 @@ RESTART_S = 0.5
 READY_S = 60.0
 STOP_S = 8.0
 LOOK_S = 0.01
-LED_AGAIN_S, HEARD = 0.25, 50
-"""From one saying of a reference to the next; messages among which the answer is looked for."""
+LED_AGAIN_S = 0.25
+"""From one saying of a reference to the next."""
 LISTENING = "router listening on"
 
 Place = Literal["loopback", "veth", "wire"]
@@ -251,21 +252,13 @@ class Rig:
 
     def lead(self, reference: m.Reference) -> None:
         """Say where the plant shall go, as a commander does: until the controller has taken it up."""
-        bus = Bus(self.config, topics.COMMANDER, new_run_id(topics.COMMANDER))
-        bus.open()
-        self._stack.callback(bus.close, 0.5)
-        said, word = -math.inf, msgspec.structs.replace(reference, run_id=bus.run_id)
+        commander = self._stack.enter_context(commanding(self.config))
+        name = commander.run_id.encode()
 
         def taken() -> bool:
-            nonlocal said
-            if clock.now() > said + LED_AGAIN_S:
-                said = clock.now()
-                bus.publish(topics.REFERENCE, word)
-            newest = self.heard[-HEARD:]
-            results = [
-                codec.decode(topics.RESULT, h.payload) for h in newest if h.topic == topics.RESULT.name
-            ]
-            return any(isinstance(r, m.TickResult) and r.reference_from == bus.run_id for r in results)
+            commander.say(topics.REFERENCE, reference)
+            self.run_for(LED_AGAIN_S)
+            return any(name in one.payload for one in self.heard if one.topic == topics.RESULT.name)
 
         self.wait(taken, READY_S, "the reference taken")
 

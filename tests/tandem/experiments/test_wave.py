@@ -1,0 +1,116 @@
+"""Set-points by turns: what is asked, where the true plant rests, and what a cycle costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from lbmpc.plants import PlantError, true_motion
+from node_runtime.config.strict import ConfigError
+from tandem.experiments.simulation import wave
+from tandem.experiments.study.plan import rows
+from tandem.experiments.study.work import read, work
+from tests.helpers.experiments import PLANT, SHIPPED, cases
+
+TRUE = PLANT.varied(slope=1.4)  # type: ignore[union-attr]
+STEPS, CYCLES = 24, 2
+WAVE = f"""
+name = "wave"
+title = "A wave"
+steps = {STEPS}
+episodes = {CYCLES}
+set_points = {{ y = [1.65, 1.7] }}
+[set]
+controller = {{ horizon = 15, solver = {{ compile = "never" }}, Q = [1.0, 1.0, 1e-3, 1e-5], R = [0.1] }}
+plant = {{ truth = {{ slope = 1.4 }}, x0 = [0.4, 1.6, 1.1547, 0.0] }}
+[[group]]
+name = "g"
+title = "g"
+[[case]]
+name = "wave"
+group = "g"
+vary."controller.oracle" = ["perfect", "linear"]
+"""
+
+
+def test_a_wave_goes_on_for_one_cycle_more_than_is_counted() -> None:
+    asked = wave.reference({"y": [1.65, 1.75]}, 10.0, 1)
+    assert asked.times == [0.0, 5.0, 5.0, 10.0, 10.0, 15.0, 15.0, 20.0]
+    assert asked.values == [[1.65], [1.65], [1.75], [1.75]] * 2
+
+
+def test_a_rest_is_one_of_the_true_plant_with_the_outputs_there() -> None:
+    x, u = wave.rests({"y": [1.65, 1.75]}, 4, true_motion(TRUE), PLANT, 0.05)
+    assert x[:, 1] == pytest.approx([1.65, 1.65, 1.75, 1.75])
+    for at, under in zip(x, u, strict=True):
+        assert true_motion(TRUE).step(at, under, 0.05) == pytest.approx(at, abs=1e-9)
+    assert np.abs(true_motion(PLANT).step(x[0], u[0], 0.05) - x[0]).max() > 1e-4
+    with pytest.raises(PlantError):
+        wave.rests({"rdot": [1.0]}, 4, true_motion(TRUE), PLANT, 0.05)
+
+
+def test_values_where_the_true_plant_has_no_rest_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "wave.toml"
+    path.write_text(WAVE.replace("{ y = [1.65, 1.7] }", "{ rdot = [1.0, 0.0] }"))
+    job = next(rows(cases(path))).job
+    with pytest.raises(ConfigError, match="set_points"):
+        work(job, job.key, tmp_path, False, [])
+
+
+def test_an_episode_is_a_cycle_and_the_plant_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "wave.toml"
+    path.write_text(WAVE)
+    found = {}
+    for plan in rows(cases(path)):
+        work(plan.job, plan.job.key, tmp_path, True, [])
+        record = read(tmp_path / f"{plan.job.key}.json", True)
+        assert record is not None
+        assert record.traces is not None
+        assert len(record.episodes) == CYCLES
+        assert len(record.traces.x) == STEPS * CYCLES + 1
+        y = np.array(record.traces.x)[:, 1]
+        assert np.abs(np.diff(y)).max() < 0.1  # it is not put back to x0
+        found[plan.case.config.controller.oracle] = [one.J for one in record.episodes]
+        assert record.episodes[1].overshoot == {"y": None}
+    # About the true plant's rests, nothing costs less for long than what knows h.
+    assert found["perfect"][1] < 0.5 * found["linear"][1]
+
+
+def test_to_stay_where_the_true_plant_rests_costs_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "wave.toml"
+    (x,), _u = wave.rests({"y": [1.65]}, 1, true_motion(TRUE), PLANT, 0.05)
+    path.write_text(WAVE.replace("[1.65, 1.7]", "[1.65]").replace("[0.4, 1.6, 1.1547, 0.0]", str(x.tolist())))
+    job = msgspec.structs.replace(next(rows(cases(path))).job, steps=6, episodes=1)
+    work(job, job.key, tmp_path, False, [])
+    record = read(tmp_path / f"{job.key}.json", False)
+    assert record is not None
+    assert record.episodes[0].J < 1e-9
+    assert record.performance.J > 1e-5  # about (x_e, u_e) it is something
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ("{ p = [1.65, 1.7] }", "is no state; "),
+        ("{ y = [1.65, 1.7], z = [0.5, 0.5] }", "as many states as the plant has inputs"),
+        ("{ y = [] }", "as many states"),
+        ("{ y = [1.65, 7.0] }", "not within its bounds"),
+    ],
+)
+def test_what_is_no_wave_of_this_plant_is_refused(tmp_path: Path, values: str, why: str) -> None:
+    path = tmp_path / "wave.toml"
+    path.write_text(WAVE.replace("{ y = [1.65, 1.7] }", values))
+    with pytest.raises(ConfigError, match=why):
+        cases(path)
+
+
+def test_the_shipped_one_is_valid() -> None:
+    found = cases(SHIPPED.with_name("set-points.toml"))
+    assert [case.config.controller.oracle for case in found] == [
+        *("linear", "constant", "l2nw", "dnn", "perfect"),
+        "dnn",
+    ]
+    assert {case.steps * case.episodes * case.config.period for case in found} == {120.0}
