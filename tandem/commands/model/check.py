@@ -220,6 +220,7 @@ def _state_table(
 
 
 def _input_table(known: Known) -> Table:
+    import numpy as np
     from rich.table import Column
 
     from tandem.model_tables import plain
