@@ -34,6 +34,8 @@ ABSENT = 3
 """Samples in a row without a number of it, before a sensor is named dead."""
 MOVED = 3.0
 """Deviations: of the noise, by which the state must have moved; of an innovation, for a quantised sensor."""
+SAME_INPUT = 1e-6
+"""Half-widths, by which the inputs of a plant that rests may differ."""
 FINE = 0.25
 """Of the deviation of the noise: a sensor with a smaller step does not repeat honestly."""
 ROUNDING, TINY = 1e-6, 1e-300
@@ -116,8 +118,8 @@ class SupervisedEstimator(Estimator):
         # Of a plant that was held, or started again, nobody knows that it moved.
         same = numbers & (seen.y == state["reading"]) & (seen.applied is not None)
         step, fine = self._steps(state["reading"], state["step"], seen.y, numbers & ~same, noise)
-        if (same == numbers).all():
-            # A plant that rests, or a frozen line: a repetition alone proves nothing.
+        if (same == numbers).all() and self._rests(state):
+            # A plant that rests: a repetition alone proves nothing.
             fine[:] = False
         usable = numbers & (counts[FAULT] == 0)
         if trusted is not None:
@@ -173,6 +175,11 @@ class SupervisedEstimator(Estimator):
         judged[[AGREED, MOVING]] = np.where(new, 0, counts[[AGREED, MOVING]])
         judged[FAULT] = fault
         return judged
+
+    def _rests(self, state: EstimatorState) -> bool:
+        """Whether the last two inputs that were commanded are the same."""
+        before, last = state["inputs"]
+        return bool((np.abs(last - before) <= SAME_INPUT * self._model.plant.u_scale).all())
 
     def _steps(
         self, reading: np.ndarray, step: np.ndarray, y: np.ndarray, changed: np.ndarray, noise: np.ndarray

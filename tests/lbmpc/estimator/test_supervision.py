@@ -102,6 +102,12 @@ def test_a_stuck_sensor_is_named_and_not_followed(i: int) -> None:
     assert np.abs(np.array(ran.errors)[:, i]).max() < 0.1
 
 
+def test_the_only_sensor_that_is_stuck_is_named_too() -> None:
+    ran = Ran(stuck(Z, 40), 100, one=supervised(measured=(Z,)))
+    assert 40 < ran.first("z") <= 40 + SECOND
+    assert np.abs(np.array(ran.errors)[:, Z]).max() < 0.1
+
+
 def test_a_constant_of_zero_is_named_and_never_believed() -> None:
     ran = Ran(replaced(Y, 30, 1000, -MODEL.plant.x_e[Y]), 70)
     assert ran.named == {"y"}
