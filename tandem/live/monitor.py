@@ -53,7 +53,7 @@ class ProcessRow:
 
     name: str
     status: str
-    """Of its Health; "not heard of", "silent" or "ended" where there is none."""
+    """Of its Health; "not heard of", "not configured", "silent" or "ended" where there is none."""
     note: str
     counters: dict[str, int]
 
@@ -402,6 +402,8 @@ class Monitor:
         if name == "plant" and not self._plant.silent(now):
             return ProcessRow(name, "running", "says only its states", {})
         known = health is not None or (name == "plant" and self._plant.known)
+        if name == "trainer" and not known and not self.config.trainer.enabled:
+            return ProcessRow(name, "not configured", note, counters)
         return ProcessRow(name, "silent" if known else "not heard of", note, counters)
 
 

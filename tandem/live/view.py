@@ -28,6 +28,7 @@ STATUS_STYLE = {
     "stopping": "yellow",
     "silent": "bold yellow",
     "not heard of": "dim",
+    "not configured": "dim",
     "failed": "bold red",
     "ended": "bold red",
 }
@@ -102,6 +103,10 @@ def _sets(now: Snapshot) -> tuple[str, str]:
     return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
 
 
+RESTS = {"nearest": "; out of reach, at the nearest rest", "no rest": "; no rest was found"}
+"""What is said of a target that is not one where the outputs are as they should be."""
+
+
 def _set_point(now: Snapshot) -> str:
     """Where outputs should be, how far off they are, and whether the plant can rest there."""
     if not now.reference:
@@ -111,7 +116,7 @@ def _set_point(now: Snapshot) -> str:
     for name, r in now.reference.items():
         x = at.get(name)
         parts.append(f"{name} {r:.4g}" + ("" if x is None else f", off by {abs(x - r):.2g}"))
-    return f"{'; '.join(parts)}, {now.target_status}"
+    return f"{'; '.join(parts)}{RESTS.get(now.target_status, '')}"
 
 
 def _panel(title: str, body: RenderableType) -> Panel:
