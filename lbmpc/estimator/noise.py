@@ -22,7 +22,6 @@ states that nobody measures. Noise that is coloured is slow too, and only its wh
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import nnls
 
 from lbmpc.estimator.base import EstimatorState
 
@@ -51,7 +50,10 @@ class NoiseFinder:
     """
 
     def __init__(self, F: np.ndarray, Q: np.ndarray, P: np.ndarray, R: np.ndarray, measured: np.ndarray):
-        self._F, self._measured = F, measured
+        # Slow to load, and most controllers are told their noise; but not within the loop.
+        from scipy.optimize import nnls
+
+        self._F, self._measured, self._nnls = F, measured, nnls
         for _ in range(SETTLED):
             L = np.linalg.solve(P[np.ix_(measured, measured)] + np.diag(R), P[measured]).T
             left = np.eye(len(F))
@@ -122,4 +124,4 @@ class NoiseFinder:
         sizes = np.sort(differences**2, axis=0)[:kept].mean(axis=0) / OF_THOSE
         # Each equation by its own size: a quiet sensor counts as much as a noisy one.
         sizes = np.maximum(sizes, np.finfo(float).tiny)
-        return nnls(self._G / sizes[:, None], np.ones(len(sizes)))[0]
+        return self._nnls(self._G / sizes[:, None], np.ones(len(sizes)))[0]
