@@ -14,7 +14,7 @@ NOT_COMPILED = {"controller": {"solver": {"compile": "never"}}}
 def costs(name: str, steps: int, *oracles: str) -> tuple[dict[str, float], dict[str, float]]:
     """J of each oracle, and how far the first performance state is off at the end."""
     folder = EXAMPLES / name
-    (config,) = folder.glob("*.toml")
+    (config,) = (path for path in folder.glob("*.toml") if path.stem in name)
     rows = compare(config, steps, oracles, **NOT_COMPILED)
     assert all(row.violations == 0 for row in rows)
     first = rows[0].result.traces.plant.performance[0]

@@ -15,7 +15,7 @@ from run_log.run import Run
 from tandem.experiments.simulation.lockstep import simulate
 
 STEPS = 200
-SEEDS = range(6)
+SEEDS = range(3)
 
 
 def run_summary(case: tuple[str, int, bool]) -> Summary:
