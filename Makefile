@@ -6,7 +6,7 @@ READY := .venv/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run simulate paper examples bench test compose-test wheel-test remote-test
+.PHONY: help setup run simulate paper examples bench test test-long compose-test wheel-test remote-test
 .PHONY: faults fuzz soak lint format clean
 
 help:  ## this list
@@ -49,10 +49,13 @@ examples: $(READY)  ## every example, one of them live, with pictures into runs/
 bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
 	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)
 
-test: $(READY)  ## all tests; for some, .venv/bin/pytest PATH
-	$(BIN)/pytest -n auto --dist loadfile -m "not live"
+test: $(READY)  ## the tests; for some, .venv/bin/pytest PATH
+	$(BIN)/pytest -n auto --dist loadfile -m "not live and not long"
 # Real processes run apart from these: what they show depends on when they get a core. They wait most of the time.
 	$(BIN)/pytest -n 2 --dist loadfile -m live
+
+test-long: $(READY)  ## those that take long for what make test shows in part: 2 minutes
+	$(BIN)/pytest -n auto -m long $(ARGS)
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine
 	$(BIN)/pytest -x -s tests/compose/live_compose.py $(ARGS)

@@ -241,7 +241,7 @@ def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) 
         assert after.past == [*before.past[1:], before.x + before.u]
 
 
-@pytest.mark.parametrize("name", ["rnn", "cnn"])
+@pytest.mark.parametrize("name", ["rnn", pytest.param("cnn", marks=pytest.mark.long)])
 def test_the_loop_learns(name: str) -> None:
     settings = [f"network.architecture={name}", "network.hidden=[32, 32]", "controller.solver.compile=never"]
     summary = summarise(simulate(load(None, settings), 160))

@@ -188,6 +188,7 @@ def test_what_is_wrong_with_it_is_said(
 
 
 @pytest.mark.usefixtures("optimising")
+@pytest.mark.long
 def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions and CasADi's virtual machine round otherwise; far apart they are not."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

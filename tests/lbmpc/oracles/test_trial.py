@@ -254,11 +254,11 @@ def calm() -> Summary:
 @pytest.mark.parametrize(
     ("forge", "every", "instead"),
     [
-        (crude, 1, False),
+        pytest.param(crude, 1, False, marks=pytest.mark.long),
         (noise(0.1), 1, False),
-        (noise(0.1), 1, True),
+        pytest.param(noise(0.1), 1, True, marks=pytest.mark.long),
         (drift, 7, False),
-        (elsewhere(1.0), 1, False),
+        pytest.param(elsewhere(1.0), 1, False, marks=pytest.mark.long),
     ],
     ids=["crude", "10 % noise", "10 % noise on every trained set", "drift", "right here and wrong elsewhere"],
 )

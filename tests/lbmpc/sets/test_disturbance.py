@@ -98,6 +98,7 @@ def test_box_holds_all_samples_and_is_tight(case):
     assert excess(small, p, h) > 0.0
 
 
+@pytest.mark.long
 def test_hull_holds_all_samples_and_lies_in_the_box(case):
     model, p, h = case
     box, hull = bound_box(model, whole(model)), bound_hull(model, whole(model))
@@ -147,6 +148,7 @@ def test_affine_remainder_is_of_second_order():
     np.testing.assert_allclose(wide / narrow, 4.0, rtol=0.15)
 
 
+@pytest.mark.long
 def test_stopped_early_the_bound_is_wider_and_still_holds():
     model = build_model(MOORE_GREITZER, 0.05)
     p = draw(whole(model), 300, 8)
@@ -171,6 +173,7 @@ def test_given_box_refuses(half):
         given_box(model, np.array(half), whole(model))
 
 
+@pytest.mark.long
 def test_a_region_where_the_equations_do_not_hold_is_named():
     model = build_model(MOORE_GREITZER, 0.05)
     region = whole(model)

@@ -108,7 +108,13 @@ UNBOUNDED: dict[str, Plant] = {
 }
 
 
-@pytest.mark.parametrize("case", UNBOUNDED)
+@pytest.mark.parametrize(
+    "case",
+    [
+        name if name == "a speed with one bound" else pytest.param(name, marks=pytest.mark.long)
+        for name in UNBOUNDED
+    ],
+)
 def test_without_bounds_it_learns_plans_for_silence_and_replays(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

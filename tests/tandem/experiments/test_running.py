@@ -141,6 +141,7 @@ def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
     assert len(list(runs.iterdir())) == len(wants)
 
 
+@pytest.mark.long
 def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: Path) -> None:
     small.write_text(SMALL.replace("steps = 30", "steps = 3", 1))
     here = tmp_path / "here"
