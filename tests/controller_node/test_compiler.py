@@ -21,7 +21,6 @@ from lbmpc.solver.gauss_newton import Solver
 from tests.helpers.paths import ROOT
 from tests.helpers.science import compressor, function, oracle_named, trained_theta
 
-pytestmark = pytest.mark.usefixtures("optimising")
 MODEL = compressor()
 
 

@@ -187,7 +187,6 @@ def test_what_is_wrong_with_it_is_said(
         simulate(load(None, [*QUICK, *settings, f"network.architecture={reference}"]), 1)
 
 
-@pytest.mark.usefixtures("optimising")
 @pytest.mark.long
 def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions and CasADi's virtual machine round otherwise; far apart they are not."""
