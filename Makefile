@@ -52,7 +52,7 @@ bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.
 test: $(READY)  ## the tests; for some, .venv/bin/pytest PATH
 	$(BIN)/pytest -n auto --dist loadfile -m "not live and not long"
 # Real processes run apart from these: what they show depends on when they get a core. They wait most of the time.
-	$(BIN)/pytest -n 2 --dist loadfile -m live --ignore tests/verification
+	$(BIN)/pytest -n 2 --dist loadfile -m "live and not long" --ignore tests/verification
 # Faults on real processes count every message: they run alone.
 	$(BIN)/pytest -m live tests/verification
 

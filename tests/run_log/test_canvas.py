@@ -43,6 +43,7 @@ def drawn(folder: Path, **environment: str) -> bytes:
     return (folder / "x.png").read_bytes()
 
 
+@pytest.mark.long
 def test_a_picture_is_the_same_under_any_settings(tmp_path: Path) -> None:
     plain = drawn(tmp_path / "plain")
     (tmp_path / "own").mkdir()

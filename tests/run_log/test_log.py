@@ -306,6 +306,7 @@ def test_a_cut_file_is_read_up_to_the_cut(whole: Path, messages: list[Logged], t
     assert counts[-1] == len(messages)
 
 
+@pytest.mark.long
 def test_any_flipped_bit_is_found(whole: Path, tmp_path: Path) -> None:
     data = whole.read_bytes()
     edited = tmp_path / "edited.mcap"

@@ -45,6 +45,7 @@ def test_a_mistake_keeps_its_own_exit_code_when_nothing_can_be_written() -> None
     assert shell(f"{TANDEM} config show --set zzz=1 > /dev/full 2> /dev/full").returncode == 2
 
 
+@pytest.mark.long
 def test_closed_streams_do_not_become_the_log(tmp_path: Path) -> None:
     log = tmp_path / "sim.mcap"
     made = shell(f"{TANDEM} simulate --steps 3 --oracle linear --log '{log}' >&- 2>&- <&-")
@@ -52,6 +53,7 @@ def test_closed_streams_do_not_become_the_log(tmp_path: Path) -> None:
     assert shell(f"{TANDEM} replay '{log}'").returncode == 0
 
 
+@pytest.mark.long
 def test_a_terminal_that_is_not_utf8_still_shows_the_figures(tmp_path: Path) -> None:
     log = tmp_path / "試験.mcap"
     made = shell(

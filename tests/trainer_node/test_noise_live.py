@@ -26,6 +26,7 @@ SETTINGS = (
 
 
 @pytest.mark.live
+@pytest.mark.long
 def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
     config = live_config(*SETTINGS)
     with (

@@ -16,6 +16,7 @@ GRU = f"{ROOT / 'examples' / 'architecture' / 'gru.py'}:GRU"
 
 
 @pytest.mark.live
+@pytest.mark.long
 def test_a_recurrent_network_learns_live_and_its_log_replays(tmp_path: Path) -> None:
     with launched(tmp_path, "--seconds", "5", *small(**{"network.architecture": GRU})) as run:
         code, result = run.ends()

@@ -113,6 +113,7 @@ def test_hull_holds_all_samples_and_lies_in_the_box(case):
         assert (hull.support(diagonal) < 0.95 * box.support(diagonal)).any()
 
 
+@pytest.mark.long
 def test_affine_bounds_hold_the_samples_of_their_regions(case):
     model, _, _ = case
     generator = np.random.default_rng(6)

@@ -74,6 +74,7 @@ def every_operation(x, u):
     ids=["pendulum", "every"],
 )
 @pytest.mark.parametrize("radius", [0.0, 0.02, 0.2])
+@pytest.mark.long
 def test_flow_against_a_numerical_integration(rhs, radius):
     generator = np.random.default_rng(3)
     flow = flow_of(rhs, 2, 1, 0.2, 2)

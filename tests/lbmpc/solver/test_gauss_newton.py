@@ -186,6 +186,7 @@ print(hashlib.sha256(solution.v.tobytes() + solution.zbar.tobytes()).hexdigest()
 """
 
 
+@pytest.mark.long
 def test_the_same_bytes_in_fresh_and_reused_processes() -> None:
     answers = {
         subprocess.run(

@@ -90,6 +90,7 @@ def test_a_run_is_bit_identical_for_a_seed_and_differs_for_another() -> None:
     assert payloads(first)["controller/command"] != payloads(other)["controller/command"]
 
 
+@pytest.mark.long
 def test_another_rate_settles_too() -> None:
     # To compile a solver that nothing else uses takes longer than the run without.
     settings = ["rate=30", "controller.horizon=90", "controller.solver.compile=never"]

@@ -108,6 +108,7 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
     assert {path.name: path.read_bytes() for path in runs.iterdir()} == whole
 
 
+@pytest.mark.long
 def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
     # The other process reads the code anew; so must this one, where somebody edits while tests run.
     code_version.cache_clear()
