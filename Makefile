@@ -54,9 +54,9 @@ test: $(READY)  ## the tests; for some, .venv/bin/pytest PATH
 # Real processes run apart from these: what they show depends on when they get a core. They wait most of the time.
 	$(BIN)/pytest -n 2 --dist loadfile -m "live and not long" --ignore tests/verification
 # Faults on real processes count every message: they run alone.
-	$(BIN)/pytest -m live tests/verification
+	$(BIN)/pytest -m "live and not long" tests/verification
 
-test-long: $(READY)  ## those that take long for what make test shows in part: 2 minutes
+test-long: $(READY)  ## those that take long for what make test shows in part: 3 minutes
 	$(BIN)/pytest -n auto -m long $(ARGS)
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine

@@ -142,6 +142,7 @@ def driven_since(rig: Rig, moment: float | None) -> bool:
 
 
 @pytest.mark.live
+@pytest.mark.long
 def test_three_faults_on_real_processes(tmp_path: Path) -> None:
     """A quick run of what `make faults` does at length: a frozen controller, garbage, a killed controller."""
 
