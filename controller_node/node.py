@@ -17,11 +17,12 @@ from controller_node.core import ControllerCore, Outputs
 from controller_node.guarantee import guarantee
 from controller_node.keyframes import Keyframes
 from controller_node.outbox import Outbox
+from controller_node.phase import check_phase, phase, with_input_delay
+from controller_node.tally import COUNTS, Tally
 from node_runtime.bus.inbox import Inbox, Received
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.architecture import register_architecture
 from node_runtime.config.sections import Config
-from node_runtime.config.strict import ConfigError
 from node_runtime.health import HealthPublisher
 from node_runtime.lifecycle import new_run_id, run_process
 from node_runtime.realtime import clock
@@ -49,25 +50,8 @@ OLDEST_STATE = 0.8
 FORGIVES_S = 5.0
 # How long a slot waits for its state, as a share of a period.
 STATE_PATIENCE = 0.25
-LONGEST_PHASE = 0.5
 # Seconds; in a shorter period there is no time for a backup policy, which takes a few milliseconds.
 BACKUP_FROM = 0.01
-# Seconds, and share of a period at most.
-USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.25
-USUAL_ANSWER, USUAL_ANSWER_SHARE = 4e-3, 0.1
-COUNTS = (
-    "ticks",
-    "late ticks",
-    "skipped slots",
-    "states missing",
-    "states stale",
-    "weights adopted",
-    "weights refused",
-    "weights rolled back",
-    "references taken",
-    "checkpoints written",
-    "checkpoints failed",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +84,7 @@ class ControllerNode:
         self._core = core
         self._bus = bus
         self._health = health
-        self._counts = counts
+        self._tally = Tally(counts, health, bus.bad)
         self._settings = core.config.controller
         self._period = core.config.period
         self._phase = phase(core.config)
@@ -134,7 +118,6 @@ class ControllerNode:
         self._outbox = Outbox(core.run_id) if outbox is None else outbox
         self._checkpoint = checkpoint
         self._unsent: list[m.Sample] = []
-        self._faults: dict[str, str] = {}
         self._hidden = core.memory.hidden_snapshot(-1)
         self._keyframes = Keyframes(bus, core.memory, self._settings.keyframe_every)
         bus.serve(topics.OUTBOX_QUERY, self._outbox.answer)
@@ -189,7 +172,7 @@ class ControllerNode:
                 self._missing = 0
                 self._followed = self._first.message.run_id
                 self._grid.reanchor(self._states.undelayed(self._first) + self._phase)
-                self._health.set("running", "; ".join(self._faults.values()))
+                self._health.set("running", self._tally.note)
                 return True
             self._health.set("ready", "no plant: its states come too late to act on")
             old_since = now if old_since is None else old_since
@@ -302,7 +285,8 @@ class ControllerNode:
         self._bus.publish(topics.RESULT, outputs.result)
         self._bus.publish(topics.TIMING, timing)
         self._publish_learning(tick.weights, outputs)
-        self._count(tick, outputs, overrun=sent > slot.time + self._period)
+        self._missing = 0 if latched.verdict == "fresh" else self._missing + 1
+        self._tally.add(tick, outputs.result, overrun=sent > slot.time + self._period)
 
     def _publish_learning(self, judged: m.HiddenWeights | None, outputs: Outputs) -> None:
         """Everything else that a tick leaves: samples, output weights, keyframes.
@@ -322,48 +306,13 @@ class ControllerNode:
             self._bus.publish(topics.OUTPUT_WEIGHTS, outputs.output_weights)
         self._keyframes.send_due(self._seq)
 
-    def _count(self, tick: m.Tick, outputs: Outputs, overrun: bool) -> None:
-        self._missing = 0 if tick.state_verdict == "fresh" else self._missing + 1
-        counts = self._counts
-        counts["ticks"] += 1
-        counts["late ticks"] += tick.late or overrun
-        counts["skipped slots"] += tick.skipped
-        counts["states missing"] += tick.state_verdict == "missing"
-        counts["states stale"] += tick.state_verdict == "stale"
-        result = outputs.result
-        counts["weights adopted"] += result.weights_outcome == "adopted"
-        if result.weights_outcome == "refused":
-            counts["weights refused"] += 1
-            self._bus.bad.count(topics.HIDDEN_WEIGHTS.name, "refused", result.weights_verdict)
-        if (verdict := result.reference_verdict).startswith("refused"):
-            self._bus.bad.count(topics.REFERENCE.name, "refused", f"{verdict} (of {result.reference_from})")
-        counts["references taken"] += verdict == "taken"
-        if rolled_back := result.weights_rolled_back:
-            counts["weights rolled back"] += 1
-            log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
-        if result.sensor_faults or self._faults:
-            self._say_faults(tick, result.sensor_faults)
-
-    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
-        """In health and in this process's log, where sensors are believed no longer, or again."""
-        before = self._faults
-        words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}
-        self._faults = {name: before.get(name, text) for name, text in words.items()}
-        if self._faults.keys() == before.keys():
-            return
-        for name in faults.keys() - before.keys():
-            log.warning("tick %d: %s", tick.seq, self._faults[name])
-        for name in before.keys() - faults.keys():
-            log.info("tick %d: sensor %s is believed again", tick.seq, name)
-        self._health.set("running", "; ".join(self._faults.values()))
-
     def _send_samples(self) -> None:
         for batch in self._outbox.batches(self._unsent):
             self._bus.publish(topics.SAMPLES, batch)
         self._unsent = []
 
     def _save(self, checkpoint: CheckpointWriter) -> None:
-        checkpoint.offer(Snapshot(self._seq, self._core.memory.lasting(), dict(self._counts)))
+        checkpoint.offer(Snapshot(self._seq, self._core.memory.lasting(), dict(self._tally.counts)))
 
     def _remember_hidden(self, judged: m.HiddenWeights | None, new_network: bool) -> None:
         before = self._hidden
@@ -390,7 +339,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 def _live(config: Config, stopping: threading.Event) -> int:
     run_id = new_run_id("controller")
     counts = dict.fromkeys(COUNTS, 0)
-    _check_phase(config)
+    check_phase(config)
     config = with_input_delay(config)
     place = core_for(config, "controller", os.sched_getaffinity(0))
     register_architecture(config)
@@ -415,28 +364,3 @@ def _live(config: Config, stopping: threading.Event) -> int:
             with saving or nullcontext(), on_core(place):
                 node.run(stopping)
     return 0
-
-
-def with_input_delay(config: Config) -> Config:
-    """The configuration with `controller.input_delay_ms` settled, so that the log says what was in force."""
-    if config.controller.input_delay_ms is not None:
-        return config
-    usual = phase(config) + min(USUAL_ANSWER, USUAL_ANSWER_SHARE * config.period)
-    delay_ms = min(usual, 0.5 * config.period) * 1e3
-    settled = msgspec.structs.replace(config.controller, input_delay_ms=delay_ms)
-    return msgspec.structs.replace(config, controller=settled)
-
-
-def phase(config: Config) -> float:
-    """How far, in seconds, the slots lie behind the arrival of the plant's states."""
-    given = config.controller.phase_ms
-    return min(USUAL_PHASE, USUAL_PHASE_SHARE * config.period) if given is None else given * 1e-3
-
-
-def _check_phase(config: Config) -> None:
-    longest = LONGEST_PHASE * config.period * 1e3
-    if phase(config) * 1e3 > longest:
-        raise ConfigError(
-            f"controller.phase_ms = {config.controller.phase_ms} is more than {LONGEST_PHASE} of a period; "
-            f"at rate = {config.rate} Hz at most {longest:g} ms"
-        )

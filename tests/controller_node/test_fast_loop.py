@@ -13,7 +13,9 @@ import pytest
 
 from benchmarks.live.wakeups import Wakeups, measure
 from controller_node.core import ControllerCore
-from controller_node.node import COUNTS, ControllerNode, Latched, phase, with_input_delay
+from controller_node.node import ControllerNode, Latched
+from controller_node.phase import phase, with_input_delay
+from controller_node.tally import COUNTS
 from network_model.description import hash_layers
 from node_runtime.bus.inbox import Received
 from node_runtime.bus.mailbox import Mailbox

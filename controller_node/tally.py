@@ -1,0 +1,79 @@
+"""What a controller has counted since it began, and what of that a person is told at once."""
+
+from __future__ import annotations
+
+import logging
+
+from node_runtime.health import HealthPublisher
+from node_runtime.rejected import RejectedMessages
+from protocol import messages as m
+from protocol import topics
+
+log = logging.getLogger(__name__)
+
+COUNTS = (
+    "ticks",
+    "late ticks",
+    "skipped slots",
+    "states missing",
+    "states stale",
+    "weights adopted",
+    "weights refused",
+    "weights rolled back",
+    "references taken",
+    "checkpoints written",
+    "checkpoints failed",
+)
+
+
+class Tally:
+    """Of one controller.
+
+    Args:
+        counts: the figures of `COUNTS`, kept up to date here.
+        health: which sensors are not believed is said there.
+        bad: messages that were refused.
+    """
+
+    def __init__(self, counts: dict[str, int], health: HealthPublisher, bad: RejectedMessages):
+        self.counts, self._health, self._bad = counts, health, bad
+        self._faults: dict[str, str] = {}
+
+    @property
+    def note(self) -> str:
+        """Which sensors are not believed, for a person; empty where all are."""
+        return "; ".join(self._faults.values())
+
+    def add(self, tick: m.Tick, result: m.TickResult, overrun: bool) -> None:
+        """One more tick; `overrun`: its command came after the next slot's time."""
+        counts = self.counts
+        counts["ticks"] += 1
+        counts["late ticks"] += tick.late or overrun
+        counts["skipped slots"] += tick.skipped
+        counts["states missing"] += tick.state_verdict == "missing"
+        counts["states stale"] += tick.state_verdict == "stale"
+        counts["weights adopted"] += result.weights_outcome == "adopted"
+        if result.weights_outcome == "refused":
+            counts["weights refused"] += 1
+            self._bad.count(topics.HIDDEN_WEIGHTS.name, "refused", result.weights_verdict)
+        if (verdict := result.reference_verdict).startswith("refused"):
+            self._bad.count(topics.REFERENCE.name, "refused", f"{verdict} (of {result.reference_from})")
+        counts["references taken"] += verdict == "taken"
+        if rolled_back := result.weights_rolled_back:
+            counts["weights rolled back"] += 1
+            log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
+        if result.sensor_faults or self._faults:
+            self._say_faults(tick, result.sensor_faults)
+
+    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
+        """In health and in this process's log, where sensors are believed no longer, or again."""
+        before = self._faults
+        words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}
+        self._faults = {name: before.get(name, text) for name, text in words.items()}
+        if self._faults.keys() == before.keys():
+            return
+        for name in faults.keys() - before.keys():
+            log.warning("tick %d: %s", tick.seq, self._faults[name])
+        for name in before.keys() - faults.keys():
+            log.info("tick %d: sensor %s is believed again", tick.seq, name)
+        self._health.set("running", self.note)
