@@ -19,7 +19,6 @@ import numpy as np
 
 from lbmpc.model import Model, ModelError, build_model
 from lbmpc.plants import Known, Plant
-from lbmpc.plants.rows import together
 from lbmpc.sets.constraint_sets import state_set
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
@@ -55,9 +54,6 @@ class WayBack:
         self._rows, self._names = plant.state_rows.F, X.names
         widths = np.concatenate([plant.x_scale, plant.state_rows.ranges])
         self._low, self._high = X.lower + inside * widths, X.upper - inside * widths
-        self._u_low, self._u_high = plant.u_min - plant.u_e, plant.u_max - plant.u_e
-        self._beside = plant.input_rows.about(plant.u_e)
-        self._step = plant.input_rates * model.period
         powers = [np.eye(model.d)]
         for _ in range(steps - 1):
             powers.append(model.closed_loop @ powers[-1])
@@ -74,9 +70,7 @@ class WayBack:
 
     def reached(self, acting: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """The input, (m,), that acts in the next period where `wanted` is asked for: as far as its rate allows."""
-        if self._beside.names:
-            return together(wanted, acting, acting - self._step, acting + self._step)
-        return np.minimum(np.maximum(wanted, acting - self._step), acting + self._step)
+        return self._model.plant.reachable(wanted, acting, self._model.period)
 
     def lost(self, there: Ahead, u: np.ndarray) -> str:
         """What leaves X on the way back from there, after the input u, (m,), for a person; empty where nothing does."""
@@ -91,8 +85,7 @@ class WayBack:
                 if not inside.all():
                     name = self._names[int(np.argmin(inside))]
                     return f"{name} would leave X within {(i + 1) * model.period:.3g} s"
-                fed_back = np.minimum(np.maximum(model.K.dot(z), self._u_low), self._u_high)
-                v = self.reached(v, self._beside.pulled(fed_back, 0.0))
+                v = self.reached(v, model.plant.within_about(model.K.dot(z)))
                 z = model.step(z, v)
         return ""
 

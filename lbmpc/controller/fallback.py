@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbmpc.controller.signals import Mode
 from lbmpc.model import Model
-from lbmpc.plants.rows import together
+from lbmpc.solver.constraint_rows import Box
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,36 @@ def shift(plan: Plan) -> Plan:
     return Plan(np.concatenate([plan.u[1:], plan.u[-1:]]), c, max(plan.left - 1, 0))
 
 
+def without_solution(
+    model: Model,
+    plan: Plan,
+    x: np.ndarray | None,
+    xu: np.ndarray,
+    first: Box | None,
+    previous: np.ndarray | None,
+) -> tuple[Plan, Mode]:
+    """What is followed in this period and after it.
+
+    Args:
+        model: the nominal model.
+        plan: the last one, shifted.
+        x: the state when it acts, (d,); None: it is not known.
+        xu: x and u of the target, (d + m,); (0,) for the equilibrium.
+        first: bounds on the first input: what is certified holds without a solution too.
+        previous: what acts before it, (m,), where inputs have rate limits.
+    """
+    if plan.left > 0:
+        return _kept(model, _begun_within(plan, first), previous), "shifted_plan"
+    horizon, d = len(plan.u), model.d
+    nothing = empty_plan(horizon, model.m)
+    xs, us = (xu[:d], xu[d:]) if xu.size else (0.0, 0.0)
+    if x is None:
+        # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
+        return _kept(model, replace(nothing, u=nothing.u + us), previous), "feedback"
+    fed_back = replace(nothing, u=feedback_plan(model, x, horizon, xs, us, previous))
+    return _begun_within(fed_back, first), "feedback"
+
+
 def feedback_plan(
     model: Model,
     x: np.ndarray,
@@ -44,31 +75,30 @@ def feedback_plan(
 
     Where inputs have rate limits, each is brought within reach of the one before, the first of `previous`, (m,).
     """
-    plant, inputs = model.plant, np.zeros((horizon, model.m))
-    beside = plant.input_rows.about(plant.u_e)
+    inputs = np.zeros((horizon, model.m))
     for i in range(horizon):
-        fed_back = np.clip(us + model.K @ (x - xs), plant.u_min - plant.u_e, plant.u_max - plant.u_e)
-        inputs[i] = beside.pulled(fed_back, 0.0)
+        inputs[i] = model.plant.within_about(us + model.K @ (x - xs))
         if previous is not None:
-            previous = inputs[i] = reachable(model, inputs[i], previous)
+            previous = inputs[i] = model.plant.reachable(inputs[i], previous, model.period)
         x = model.A @ x + model.B @ inputs[i]
     return inputs
 
 
-def reachable(model: Model, u: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,).
-
-    Where U has rows beside its box, that on the straight way from there, which keeps them.
-    """
-    step = model.plant.input_rates * model.period
-    if model.plant.input_rows.names:
-        return together(u, previous, previous - step, previous + step)
-    return np.clip(u, previous - step, previous + step)
-
-
 def all_reachable(model: Model, inputs: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """`reachable` for one input of (N, m) after the other."""
+    """`Description.reachable` for one input of (N, m) after the other."""
     kept = np.empty_like(inputs)
     for i, u in enumerate(inputs):
-        previous = kept[i] = reachable(model, u, previous)
+        previous = kept[i] = model.plant.reachable(u, previous, model.period)
     return kept
+
+
+def _kept(model: Model, plan: Plan, previous: np.ndarray | None) -> Plan:
+    """The plan within the rate limits from `previous` on."""
+    return plan if previous is None else replace(plan, u=all_reachable(model, plan.u, previous))
+
+
+def _begun_within(plan: Plan, first: Box | None) -> Plan:
+    """The plan with its first input brought inside the bounds."""
+    if first is None:
+        return plan
+    return replace(plan, u=np.vstack([np.clip(plan.u[:1], *first), plan.u[1:]]))

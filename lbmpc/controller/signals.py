@@ -78,9 +78,9 @@ class StepResult:
     """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; (0, d) where nothing weighs it."""
     deviation: np.ndarray
     """Standard deviation of the state that is known, (d,); (0,) where a sample is the state."""
-    sensor_faults: dict[str, str] = field(default_factory=dict)
+    sensor_faults: dict[str, str]
     """Which sensors are not believed, by the names of their states, and in words what is wrong."""
-    noise: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    noise: np.ndarray
     """Standard deviation of what is measured as the estimator found it, (d,); (0,) where it had not to."""
 
     @property

@@ -15,7 +15,7 @@ import numpy as np
 from lbmpc.controller.aims import Aim, Aims
 from lbmpc.controller.backup_policy import BackupPlanner, Policy
 from lbmpc.controller.dead_time import Acted, InputLine, acting, predicted
-from lbmpc.controller.fallback import Plan, all_reachable, empty_plan, feedback_plan, shift
+from lbmpc.controller.fallback import Plan, empty_plan, shift, without_solution
 from lbmpc.controller.signals import Label, Mode, Observation, StepResult
 from lbmpc.controller.state import ControllerState
 from lbmpc.estimator.base import Estimate, Estimator, EstimatorState, Measured, Samples
@@ -103,9 +103,6 @@ class Controller:
         self.estimator = Samples(self.model.d) if estimator is None else estimator
         plant = self.model.plant
         self._absurd = ABSURD * plant.x_scale, ABSURD * plant.u_scale
-        # U about the equilibrium: its box, and the rows beside it.
-        self._box = plant.u_min - plant.u_e, plant.u_max - plant.u_e
-        self._beside = plant.input_rows.about(plant.u_e)
 
     def initial_state(self, seed: int) -> ControllerState:
         """Nothing known, nothing planned; the oracle's random start from the seed."""
@@ -198,14 +195,20 @@ class Controller:
             line,
             None if reference is None else reference.advanced(1),
         )
-        known = (
-            self.oracle.weights(oracle),
-            self.estimator.deviation(estimator),
-            self.estimator.faults(estimator),
-            self.estimator.found_noise(estimator),
-        )
         return memory, StepResult(
-            plan.u, mode, solution, label, verdict, rolled_back, delay, first, aim.target, *known
+            plan.u,
+            mode,
+            solution,
+            label,
+            verdict,
+            rolled_back,
+            delay,
+            first,
+            aim.target,
+            weights=self.oracle.weights(oracle),
+            deviation=self.estimator.deviation(estimator),
+            sensor_faults=self.estimator.faults(estimator),
+            noise=self.estimator.found_noise(estimator),
         )
 
     def _without_absurd(self, seen: Observation) -> Observation:
@@ -315,22 +318,15 @@ class Controller:
         aim: Aim,
         previous: np.ndarray | None,
     ) -> tuple[Plan, Mode, Solution | None]:
-        horizon, plan = self.problem.horizon, state.plan
-        first = _box(certified)
+        first = None if certified is None else (certified.lower, certified.upper)
         solution = None
         if s is not None:
             solution = self._solve(state, theta, s, first, aim, previous)
             if solution.usable:
-                return Plan(solution.u, solution.c, horizon), "solver", solution
-        if plan.left > 0:
-            return self._kept(_begun_within(plan, first), previous), "shifted_plan", solution
-        nothing, d = empty_plan(horizon, self.model.m), self.model.d
-        xs, us = (aim.xu[:d], aim.xu[d:]) if aim.xu.size else (0.0, 0.0)
-        if s is None:
-            # Neither a plan nor a state: the input of the target, or of the equilibrium, is all that is left.
-            return self._kept(replace(nothing, u=nothing.u + us), previous), "feedback", solution
-        fed_back = replace(nothing, u=feedback_plan(self.model, s[:d], horizon, xs, us, previous))
-        return _begun_within(fed_back, first), "feedback", solution
+                return Plan(solution.u, solution.c, self.problem.horizon), "solver", solution
+        x = None if s is None else s[: self.model.d]
+        plan, mode = without_solution(self.model, state.plan, x, aim.xu, first, previous)
+        return plan, mode, solution
 
     def _solve(
         self,
@@ -352,11 +348,7 @@ class Controller:
         if not self.problem.looks_back:
             return None
         acts = acting(written)
-        return state.commanded if acts is None else self._beside.pulled(np.clip(acts, *self._box), 0.0)
-
-    def _kept(self, plan: Plan, previous: np.ndarray | None) -> Plan:
-        """The plan within the rate limits from `previous` on."""
-        return plan if previous is None else replace(plan, u=all_reachable(self.model, plan.u, previous))
+        return state.commanded if acts is None else self.model.plant.within_about(acts)
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
         """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
@@ -365,14 +357,3 @@ class Controller:
 
 def _known(commanded: np.ndarray) -> np.ndarray | None:
     return commanded if commanded.size else None
-
-
-def _box(first: FirstInputs | None) -> Box | None:
-    return None if first is None else (first.lower, first.upper)
-
-
-def _begun_within(plan: Plan, first: Box | None) -> Plan:
-    """The plan with its first input brought inside the bounds: what is certified holds without a solution too."""
-    if first is None:
-        return plan
-    return replace(plan, u=np.vstack([np.clip(plan.u[:1], *first), plan.u[1:]]))

@@ -54,14 +54,8 @@ class Estimator(ABC):
     """Whether every state is measured."""
 
     @abstractmethod
-    def update(
-        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
-    ) -> tuple[EstimatorState, Estimate]:
-        """The memory and the estimate after one more sample.
-
-        trusted: of which states, (d,) of booleans, the measurement counts, of those that are measured; None: of all.
-            Others have an innovation all the same.
-        """
+    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
+        """The memory and the estimate after one more sample."""
 
     def initial_state(self) -> EstimatorState:
         """The memory before the first sample."""
@@ -101,7 +95,5 @@ class Samples(Estimator):
     def __init__(self, d: int):
         self._exact, self._none = np.zeros(d), np.full(d, np.nan)
 
-    def update(
-        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
-    ) -> tuple[EstimatorState, Estimate]:
+    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
         return state, Estimate(seen.y, seen.y, self._exact, self._none, self._none)

@@ -18,6 +18,8 @@ neighbouring labels say the same.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import schur
 
@@ -41,6 +43,22 @@ RANK, PART = 1e-9, 1e-6
 """What counts as nothing: of the largest singular value, and of a mode."""
 LASTS = 1.0 - 1e-6
 """|eigenvalue| from which on a mode does not fade."""
+
+
+class Expected(NamedTuple):
+    """What is known of a sample before it counts."""
+
+    state: EstimatorState
+    """The memory, predicted to the sample's time."""
+    nominal: np.ndarray | None
+    """Where the nominal model led in the period before it, (d,); None: there is no label of that period."""
+    before: np.ndarray | None
+    """The covariance where that period began, (2d, 2d); None likewise."""
+    innovation: np.ndarray
+    """As that of an `Estimate`, and so the next."""
+    innovation_variance: np.ndarray
+    begins: bool = False
+    """Whether nothing is known: what is measured is then where the state begins."""
 
 
 class KalmanEstimator(Estimator):
@@ -111,20 +129,56 @@ class KalmanEstimator(Estimator):
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
+        """As an `Estimator`; trusted: as for `corrected`."""
+        return self.corrected(self.expected(state, seen), seen, trusted)
+
+    def expected(self, state: EstimatorState, seen: Measured) -> Expected:
+        """What is known before the sample counts."""
         source, sequence = state["sample"].tolist()
-        measured = self._measured if trusted is None else self._measured[trusted[self._measured]]
         periods, u = seen.sequence - sequence, seen.applied
         if u is None or sequence < 0 or seen.source != source or periods > LONGEST_GAP:
-            after, estimate = self._begun(state, seen, measured)
-        elif periods <= 0:
+            return self._begun(state)
+        if periods <= 0:
             # The period was counted as missed, and its sample comes late.
-            after, estimate = self._unlabelled(state, seen, measured)
-        else:
-            after, estimate = self._followed(state, seen, measured, u, periods)
+            return Expected(state, None, None, *self._innovation(state, seen.y))
+        for _ in range(periods - 1):
+            # What acted then is not known.
+            state = self._predicted(state, self._nominal(state["x"], u, ()))
+            state = {**state, "covariance": state["covariance"] + self._any_input}
+            if self._is_lost(state):
+                return self._begun(state)
+        nominal = self._nominal(state["x"], u, seen.pieces)
+        predicted = self._predicted(state, nominal)
+        if self._is_lost(predicted):
+            return self._begun(state)
+        return Expected(predicted, nominal, state["covariance"], *self._innovation(predicted, seen.y))
+
+    def corrected(
+        self, expected: Expected, seen: Measured, trusted: np.ndarray | None = None
+    ) -> tuple[EstimatorState, Estimate]:
+        """The memory and the estimate once the sample counts.
+
+        trusted: of which states, (d,) of booleans, the measurement counts, of those that are measured; None: of all.
+        """
+        d, prior = self._model.d, expected.state
+        measured = self._measured if trusted is None else self._measured[trusted[self._measured]]
+        if expected.begins:
+            prior = {**prior, "x": prior["x"].copy()}
+            prior["x"][measured] = seen.y[measured]
+        after = self._corrected(prior, seen.y, measured)
+        reached, variance = after["x"], np.full(d, np.inf)
+        if expected.nominal is not None and expected.before is not None:
+            reached = expected.nominal + after["disturbance"]
+            reached[measured] = seen.y[measured]
+            variance = np.diag(after["covariance"])[d:] * self._repeats
+            A = self._F[measured, :d]
+            variance[measured] = self._R(prior)[measured] + ((A @ expected.before[:d, :d]) * A).sum(axis=1)
+            variance = variance * self._units**2
+        estimate = Estimate(after["x"], reached, variance, expected.innovation, expected.innovation_variance)
         after = {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}
         if self._finder is not None:
-            follows = periods == 1 and np.isfinite(estimate.variance).all()
-            usable = u if follows and len(measured) == len(self._measured) else None
+            follows = seen.sequence - prior["sample"].tolist()[1] == 1 and np.isfinite(variance).all()
+            usable = seen.applied if follows and len(measured) == len(self._measured) else None
             after = self._with_noise(self._finder, after, seen, usable)
         return after, estimate
 
@@ -167,50 +221,13 @@ class KalmanEstimator(Estimator):
         nothing = np.zeros(self._model.d)
         return {**state, "x": nothing, "disturbance": nothing.copy(), "covariance": self._unknown}
 
-    def _begun(
-        self, state: EstimatorState, seen: Measured, measured: np.ndarray
-    ) -> tuple[EstimatorState, Estimate]:
-        """After a sample of which nothing is known that came before."""
-        begun = self._afresh(state)
-        begun["x"][measured] = seen.y[measured]
-        after, estimate = self._unlabelled(begun, seen, measured)
+    def _begun(self, state: EstimatorState) -> Expected:
+        """Of a sample of which nothing is known that came before."""
         nothing = np.full(self._model.d, np.nan)
-        return after, estimate._replace(innovation=nothing, innovation_variance=nothing)
-
-    def _unlabelled(
-        self, state: EstimatorState, seen: Measured, measured: np.ndarray
-    ) -> tuple[EstimatorState, Estimate]:
-        """After a sample of the time that the memory is of, which says nothing of the period before."""
-        after = self._corrected(state, seen.y, measured)
-        unknown = np.full(self._model.d, np.inf)
-        return after, Estimate(after["x"], after["x"], unknown, *self._innovation(state, seen.y))
+        return Expected(self._afresh(state), None, None, nothing, nothing, begins=True)
 
     def _is_lost(self, state: EstimatorState) -> bool:
         return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()
-
-    def _followed(
-        self, state: EstimatorState, seen: Measured, measured: np.ndarray, u: np.ndarray, periods: int
-    ) -> tuple[EstimatorState, Estimate]:
-        """After a sample so many periods behind the one before, under u, (m,), in the last of them."""
-        d = self._model.d
-        for _ in range(periods - 1):
-            # What acted then is not known.
-            state = self._predicted(state, self._nominal(state["x"], u, ()))
-            state = {**state, "covariance": state["covariance"] + self._any_input}
-            if self._is_lost(state):
-                return self._begun(state, seen, measured)
-        nominal, before = self._nominal(state["x"], u, seen.pieces), state["covariance"][:d, :d]
-        predicted = self._predicted(state, nominal)
-        if self._is_lost(predicted):
-            return self._begun(state, seen, measured)
-        after = self._corrected(predicted, seen.y, measured)
-        reached = nominal + after["disturbance"]
-        reached[measured] = seen.y[measured]
-        variance = np.diag(after["covariance"])[d:] * self._repeats
-        A = self._F[measured, :d]
-        variance[measured] = self._R(state)[measured] + ((A @ before) * A).sum(axis=1)
-        innovation = self._innovation(predicted, seen.y)
-        return after, Estimate(after["x"], reached, variance * self._units**2, *innovation)
 
     def _innovation(self, predicted: EstimatorState, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of every measured state, trusted or not, and the variance that it would have, (d,) each."""

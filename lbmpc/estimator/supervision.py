@@ -110,9 +110,7 @@ class SupervisedEstimator(Estimator):
         unseen = self._unseen(tuple(np.flatnonzero(self._measured & (fault == 0)).tolist()))
         return {self._model.plant.states[i]: f"{WORDS[fault[i]]}; {unseen}" for i in np.flatnonzero(fault)}
 
-    def update(
-        self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
-    ) -> tuple[EstimatorState, Estimate]:
+    def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
         counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
         noise = self._inner.noise(state)
         # Of a plant that was held, or started again, nobody knows that it moved.
@@ -122,19 +120,15 @@ class SupervisedEstimator(Estimator):
             # A plant that rests: a repetition alone proves nothing.
             fine[:] = False
         usable = numbers & (counts[FAULT] == 0)
-        if trusted is not None:
-            usable &= trusted
 
-        tried = usable & ~(same & fine)
-        memory, estimate = self._inner.update(state, seen, tried)
-        known = np.isfinite(estimate.innovation) & numbers
-        away = np.where(known, np.abs(estimate.innovation), 0.0)
-        variance = np.where(known, estimate.innovation_variance, np.inf)
-        leapt, leap = self._leaps(state, estimate.innovation, away, variance, usable & ~same)
+        expected = self._inner.expected(state, seen)
+        known = np.isfinite(expected.innovation) & numbers
+        away = np.where(known, np.abs(expected.innovation), 0.0)
+        variance = np.where(known, expected.innovation_variance, np.inf)
+        leapt, leap = self._leaps(state, expected.innovation, away, variance, usable & ~same)
         vague = variance > (1.0 + KNOWS_LESS) * noise**2
-        used = tried & ~leapt & (~same | vague)
-        if (used != tried).any():
-            memory, estimate = self._inner.update(state, seen, used)
+        used = usable & ~(same & fine) & ~leapt & (~same | vague)
+        memory, estimate = self._inner.corrected(expected, seen, used)
 
         sure = fine | ((away > MOVED * np.sqrt(variance)) & (away > step))
         agrees = known & (away <= AGREES * np.sqrt(variance))

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lbmpc.plants.rows import LinearRows, Row, no_rows, rows_of
+from lbmpc.plants.rows import LinearRows, Row, no_rows, rows_of, together
 
 STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
 INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
@@ -140,6 +140,21 @@ class Description:
         """An input of U near u, (m,): each in its bounds, and then as far to u_e as the rows need; u itself in U."""
         return self.input_rows.pulled(np.minimum(np.maximum(u, self.u_min), self.u_max), self.u_e)
 
+    def within_about(self, v: np.ndarray) -> np.ndarray:
+        """As `within`, in deviations from u_e, (m,)."""
+        low, high, rows = self._inputs_about
+        return rows.pulled(np.minimum(np.maximum(v, low), high), 0.0)
+
+    def reachable(self, u: np.ndarray, previous: np.ndarray, period: float) -> np.ndarray:
+        """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,); deviations or not.
+
+        Where U has rows beside its box, that on the straight way from there, which keeps them.
+        """
+        step = self.input_rates * period
+        if self.input_rows.names:
+            return together(u, previous, previous - step, previous + step)
+        return np.minimum(np.maximum(u, previous - step), previous + step)
+
     def beyond_x(self, x: np.ndarray) -> np.ndarray:
         """How far x is beyond each bound of X, in half-widths, negative inside: (..., d) -> (..., d + rows)."""
         boxes, rows = np.maximum(self.x_min - x, x - self.x_max) / self.x_scale, self.state_rows
@@ -159,6 +174,11 @@ class Description:
     def input_rows(self) -> LinearRows:
         """Of U, beside its box."""
         return rows_of(self.rows, self.inputs, self.u_scale) if self.rows else no_rows(self.m)
+
+    @cached_property
+    def _inputs_about(self) -> tuple[np.ndarray, np.ndarray, LinearRows]:
+        """U about u_e: its box, and the rows beside it."""
+        return self.u_min - self.u_e, self.u_max - self.u_e, self.input_rows.about(self.u_e)
 
     @property
     def d(self) -> int:
