@@ -278,7 +278,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     """The file that `controller.sets` names, or what the cache or this installation has for this very model.
 
     Raises:
-        ConfigError: there is none, it was edited, it is about another model, or the plant has a dead time.
+        ConfigError: there is none, it was edited, it is about another model, or there can be none for this plant.
     """
     try:
         require_certifiable(model)

@@ -87,7 +87,7 @@ class ControllerCore:
 
     def ready_backup(self) -> None:
         """Build now what `backup` would build when it is first called."""
-        state = self.controller.initial_state(self.config.seed)
+        state = self.memory.state
         theta = self.controller.oracle.theta(state.oracle)
         self._planner().policy(state.predicted, theta, state.plan.u)
 
@@ -95,7 +95,7 @@ class ControllerCore:
         """Build now what the first reference would build: a loop has no time for it."""
         model, aims = self.controller.model, self.controller.aims
         if aims.targets is not None:
-            theta = self.controller.oracle.theta(self.controller.initial_state(self.config.seed).oracle)
+            theta = self.controller.oracle.theta(self.memory.state.oracle)
             aims.targets.find(theta, np.zeros(model.d + model.m), (), np.zeros(0))
 
     def _planner(self) -> BackupPlanner:

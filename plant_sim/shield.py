@@ -23,11 +23,8 @@ Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 JITTER = 0.1
 """Share of a period by which the time between two measurements may differ from it: the error of a label is that share
 of what the plant moves in a period."""
-
-
 HAIR = 1e-9
 """Of a period: two moments that are so near are one."""
-
 MOST_ACTED = 1000
 """Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
 

@@ -89,7 +89,7 @@ class SupervisedEstimator(Estimator):
         }
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
-        return {**state, **self._inner.missed(state, delay)}
+        return self._inner.missed(state, delay)
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return self._inner.commanded(state, u)
