@@ -82,6 +82,7 @@ WITHOUT_FLOATS = (
     inspect.IntType,
     inspect.BoolType,
     inspect.NoneType,
+    inspect.UnsetType,
     inspect.BytesType,
     inspect.LiteralType,
 )
@@ -113,7 +114,7 @@ def _surely_finite(value: object) -> bool:
     """False where `first_non_finite` has to look closer; quick, for it is asked of every message of a fast loop."""
     if isinstance(value, float):
         return isfinite(value)
-    if value is None:
+    if value is None or value is msgspec.UNSET:
         return True
     if isinstance(value, list):
         first = value[0] if value else 0.0
