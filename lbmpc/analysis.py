@@ -124,7 +124,7 @@ def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float
     What is fed back acts a dead time later, in whole periods, and before it the safe input without its gain.
     """
     plant, x = model.plant, np.array(start, dtype=float)
-    coming = [plant.safe_input] * math.ceil(plant.dead_time / model.period - 1e-9)
+    coming = [plant.safe_input] * plant.dead_periods(model.period)
     steps = max(1, round(seconds / model.period))
     for k in range(steps + 1):
         outside = np.flatnonzero(plant.beyond_x(x) > 0.0)

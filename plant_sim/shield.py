@@ -23,8 +23,6 @@ Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 JITTER = 0.1
 """Share of a period by which the time between two measurements may differ from it: the error of a label is that share
 of what the plant moves in a period."""
-HAIR = 1e-9
-"""Of a period: two moments that are so near are one."""
 MOST_ACTED = 1000
 """Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
 
@@ -75,7 +73,7 @@ class Shield:
         self.plant = plant
         self.hand = Hand(plant, way_back)
         # What is on its way through the dead time, one a period.
-        dead = math.ceil(plant.dead_time / period - HAIR)
+        dead = plant.dead_periods(period)
         self._on_the_way = deque([plant.safe_input] * dead, maxlen=dead)
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,6 +14,8 @@ from lbmpc.plants.rows import LinearRows, Row, no_rows, rows_of, together
 
 STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
 INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
+HAIR = 1e-9
+"""Of a period: two moments that are so near are one."""
 TUPLES = ("states", "inputs", "performance", "kernel", "poles")
 
 
@@ -154,6 +157,10 @@ class Description:
         if self.input_rows.names:
             return together(u, previous, previous - step, previous + step)
         return np.minimum(np.maximum(u, previous - step), previous + step)
+
+    def dead_periods(self, period: float) -> int:
+        """The dead time in whole periods, the last one begun."""
+        return math.ceil(self.dead_time / period - HAIR)
 
     def beyond_x(self, x: np.ndarray) -> np.ndarray:
         """How far x is beyond each bound of X, in half-widths, negative inside: (..., d) -> (..., d + rows)."""
