@@ -50,10 +50,9 @@ class Expected(NamedTuple):
 
     state: EstimatorState
     """The memory, predicted to the sample's time."""
-    nominal: np.ndarray | None
-    """Where the nominal model led in the period before it, (d,); None: there is no label of that period."""
-    before: np.ndarray | None
-    """The covariance where that period began, (2d, 2d); None likewise."""
+    period: tuple[np.ndarray, np.ndarray] | None
+    """Where the nominal model led in the period before it, (d,), and the covariance of x where that began, (d, d);
+    None: there is no label of that period."""
     innovation: np.ndarray
     """As that of an `Estimate`, and so the next."""
     innovation_variance: np.ndarray
@@ -140,18 +139,19 @@ class KalmanEstimator(Estimator):
             return self._begun(state)
         if periods <= 0:
             # The period was counted as missed, and its sample comes late.
-            return Expected(state, None, None, *self._innovation(state, seen.y))
+            return Expected(state, None, *self._innovation(state, seen.y))
         for _ in range(periods - 1):
             # What acted then is not known.
             state = self._predicted(state, self._nominal(state["x"], u, ()))
             state = {**state, "covariance": state["covariance"] + self._any_input}
             if self._is_lost(state):
                 return self._begun(state)
-        nominal = self._nominal(state["x"], u, seen.pieces)
+        nominal, d = self._nominal(state["x"], u, seen.pieces), self._model.d
         predicted = self._predicted(state, nominal)
         if self._is_lost(predicted):
             return self._begun(state)
-        return Expected(predicted, nominal, state["covariance"], *self._innovation(predicted, seen.y))
+        period = nominal, state["covariance"][:d, :d]
+        return Expected(predicted, period, *self._innovation(predicted, seen.y))
 
     def corrected(
         self, expected: Expected, seen: Measured, trusted: np.ndarray | None = None
@@ -167,12 +167,13 @@ class KalmanEstimator(Estimator):
             prior["x"][measured] = seen.y[measured]
         after = self._corrected(prior, seen.y, measured)
         reached, variance = after["x"], np.full(d, np.inf)
-        if expected.nominal is not None and expected.before is not None:
-            reached = expected.nominal + after["disturbance"]
+        if expected.period is not None:
+            nominal, before = expected.period
+            reached = nominal + after["disturbance"]
             reached[measured] = seen.y[measured]
             variance = np.diag(after["covariance"])[d:] * self._repeats
             A = self._F[measured, :d]
-            variance[measured] = self._R(prior)[measured] + ((A @ expected.before[:d, :d]) * A).sum(axis=1)
+            variance[measured] = self._R(prior)[measured] + ((A @ before) * A).sum(axis=1)
             variance = variance * self._units**2
         estimate = Estimate(after["x"], reached, variance, expected.innovation, expected.innovation_variance)
         after = {**after, "sample": np.array([seen.source, seen.sequence], dtype=np.int64)}
@@ -224,7 +225,7 @@ class KalmanEstimator(Estimator):
     def _begun(self, state: EstimatorState) -> Expected:
         """Of a sample of which nothing is known that came before."""
         nothing = np.full(self._model.d, np.nan)
-        return Expected(self._afresh(state), None, None, nothing, nothing, begins=True)
+        return Expected(self._afresh(state), None, nothing, nothing, begins=True)
 
     def _is_lost(self, state: EstimatorState) -> bool:
         return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()
