@@ -82,7 +82,6 @@ WITHOUT_FLOATS = (
     inspect.IntType,
     inspect.BoolType,
     inspect.NoneType,
-    inspect.UnsetType,
     inspect.BytesType,
     inspect.LiteralType,
 )
