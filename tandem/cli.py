@@ -19,7 +19,7 @@ from tyro.conf import subcommand
 
 from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
-from tandem.commands.by_hand import Auto, Manual, Pause
+from tandem.commands.operating.by_hand import Auto, Manual, Pause
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
 from tandem.commands.health import Health
@@ -31,7 +31,7 @@ from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
 from tandem.commands.report import Report
 from tandem.commands.run import Run
-from tandem.commands.set_point import SetPoint
+from tandem.commands.operating.set_point import SetPoint
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
 from tandem.streams import never_failing

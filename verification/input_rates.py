@@ -106,7 +106,7 @@ def by_hand(config: Config, seed: int, ticks: int) -> Found:
     states, until = [], int(rng.integers(5, 20))
     for k in range(ticks):
         if k == until:
-            if loop.by_hand is None:
+            if loop.person.by_hand is None:
                 loop.manual(rng.uniform(plant.u_min, plant.u_max))
             else:
                 loop.auto()

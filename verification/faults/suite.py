@@ -14,7 +14,7 @@ from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
 from run_log.errors import LogError
-from tandem.set_points import trajectory
+from tandem.operating.set_points import trajectory
 from verification.faults.catalogue import Fault, Stage
 from verification.faults.evaluation import evaluate
 from verification.faults.facts import Facts

@@ -10,7 +10,7 @@ from scipy.optimize import root
 from lbmpc.plants import Description, PlantError, TrueMotion
 from node_runtime.config.strict import ConfigError, did_you_mean
 from protocol import messages as m
-from tandem.set_points import trajectory
+from tandem.operating.set_points import trajectory
 
 Values = Mapping[str, Sequence[float]]
 """By the name of a state, plant units: those that follow each other within a cycle, equally long."""

@@ -23,7 +23,7 @@ from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
-from tandem.commander import commanding
+from tandem.operating.commander import commanding
 from tandem.live.processes import command_line
 from verification.faults.processes import link as links
 from verification.faults.processes.running import Event, Heard, Running

@@ -21,7 +21,6 @@ AGAIN_S = 0.25
 MOST_PERIODS = 3.0
 """Of a slow loop, until it says what it made of a tick."""
 LONGEST = 1e6
-LONGEST_LEASE = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +44,13 @@ class SetPoint(Configured):
 
     def run(self) -> int:
         config, plant = self.resolve_with_plant()
+        from tandem.operating import set_points
+        from tandem.operating.hand_session import LONGEST_LEASE_S
+
         terminal.limited("--seconds", self.seconds, 0.1, 86_400.0)
         terminal.limited("--over", self.over, 0.0, LONGEST)
         if self.lease is not None:
-            terminal.limited("--for", self.lease, config.period, LONGEST_LEASE)
-        from tandem import set_points
+            terminal.limited("--for", self.lease, config.period, LONGEST_LEASE_S)
 
         asked = self._asked()
         where = str(self.file) if self.file is not None else " ".join(self.values)
@@ -69,7 +70,7 @@ class SetPoint(Configured):
 
     def _asked(self) -> m.Reference:
         from protocol import messages as m
-        from tandem import set_points
+        from tandem.operating import set_points
 
         if (bool(self.values), self.file is not None, self.configured).count(True) != 1:
             raise Refused("one of NAME=VALUE, --file and --configured is needed")
@@ -90,7 +91,7 @@ def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickRe
         ConfigError: no link, and why.
     """
     from protocol import messages, topics
-    from tandem.commander import commanding
+    from tandem.operating.commander import commanding
 
     with commanding(config, topics.RESULT) as commander:
         results: list[messages.TickResult] = []
@@ -103,7 +104,7 @@ def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickRe
             return len(results) > 1
 
         every = max(AGAIN_S, MOST_PERIODS * config.period)
-        commander.keep_saying(topics.REFERENCE, reference, every, max(seconds, every), done)
+        commander.keep_saying(reference, every, max(seconds, every), done)
         return results
 
 

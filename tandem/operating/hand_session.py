@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from lbmpc.plants import Description
 from plant_sim.hand import NO_LONGER
 from protocol import messages as m
+from tandem.operating.set_points import from_words
 from tandem.terminal import Refused
 
 LEASE_S, LEASE_PERIODS, LONGEST_LEASE_S = 1.0, 3.0, 60.0
@@ -88,18 +88,11 @@ class Follower:
 
 def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
     """`u=1.2` and so on, by input. Raises `Refused`."""
-    given: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
+    given = from_words(texts)
+    for name, value in given.items():
         if name not in plant.inputs:
             known = ", ".join(plant.inputs)
-            raise Refused(f"{text}: {plant.name} has no input {name!r}; it has {known}")
-        try:
-            given[name] = float(value)
-        except ValueError:
-            raise Refused(f"{text}: write {name}=VALUE, with a number") from None
-        if not math.isfinite(given[name]):
-            raise Refused(f"{text}: a finite number is needed")
+            raise Refused(f"{name}={value:g}: {plant.name} has no input {name!r}; it has {known}")
     return given
 
 
