@@ -37,8 +37,8 @@ from protocol.messages import Reference, TickResult
 from run_log.reporting.summary import Summary, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import Run
-from tandem.operating import set_points
 from tandem.experiments.simulation.lockstep import LockStep
+from tandem.operating import set_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,8 +23,8 @@ from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
-from tandem.operating.commander import commanding
 from tandem.live.processes import command_line
+from tandem.operating.commander import commanding
 from verification.faults.processes import link as links
 from verification.faults.processes.running import Event, Heard, Running
 from verification.faults.processes.scenes import Surroundings
