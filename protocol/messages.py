@@ -100,6 +100,11 @@ class PlantState(Message, frozen=True, kw_only=True):
     missing: list[str] | msgspec.UnsetType = msgspec.UNSET
     """States of which no number came, by name; their entries of x count nothing. Unset, and no byte, where all did."""
 
+    @property
+    def acting(self) -> list[float] | None:
+        """The input that acts at this sample, (m,); None where that is not known."""
+        return self.pieces[-1].u if self.pieces else self.applied
+
 
 class Command(Message, frozen=True):
     """The input for now and the whole remaining plan; `seq` is the tick."""

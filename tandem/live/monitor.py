@@ -15,6 +15,7 @@ from node_runtime.config.sections import Config
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
+from run_log.reporting.motion import with_outputs
 from run_log.reporting.summary import ADDS, ADDS_NOTHING, SOFT
 from tandem.live.presence import SILENT_S, Presence
 from tandem.live.snapshot import Event, Gauge, ProcessRow, Snapshot, Weight
@@ -140,7 +141,7 @@ class Monitor:
             what = "driven by hand" if by_hand else f"no longer driven by hand: {state.source}"
             self.say(f"the plant is {what}", now, "note" if by_hand else "good")
         if state.source == "manual":
-            self._u = state.pieces[-1].u if state.pieces else state.applied
+            self._u = state.acting
 
     def miss_plant(self, now: float) -> None:
         """Say it, once, when a plant that was there is silent."""
@@ -288,11 +289,10 @@ class Monitor:
 
     def _goal(self) -> np.ndarray:
         """Where the states should come to rest, (d,)."""
-        goal, states = self.plant.x_e.copy(), self.plant.states
-        for name, value in self._seen.reference.items():
-            if name in states:
-                goal[states.index(name)] = value
-        return goal
+        known = self.plant.states
+        return with_outputs(
+            self.plant, {name: r for name, r in self._seen.reference.items() if name in known}
+        )
 
     def _row(self, name: str, now: float) -> ProcessRow:
         health, at = self._health.get(name, (None, now))

@@ -96,11 +96,6 @@ def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
     return given
 
 
-def acting(state: m.PlantState) -> list[float] | None:
-    """The input that acts at a sample, (m,); None where that is not known."""
-    return state.pieces[-1].u if state.pieces else state.applied
-
-
 def completed(named: Mapping[str, float], plant: Description, acts: Sequence[float] | None) -> np.ndarray:
     """The whole input, (m,), with those that are not named as they are. Raises `Refused`: that is not known."""
     others = [name for name in plant.inputs if name not in named]
@@ -125,7 +120,7 @@ def clipped(u: np.ndarray, plant: Description) -> str:
 
 def line(state: m.PlantState, plant: Description, seconds: float) -> str:
     """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
-    x, acts = np.array(state.x), acting(state)
+    x, acts = np.array(state.x), state.acting
     room = -plant.beyond_x(x)
     least = int(np.argmin(room))
     u = "not known" if acts is None else figures(plant.inputs, acts)

@@ -161,7 +161,7 @@ class Manual(ByHand):
                 follower.take(heard)
         if follower.state is None:
             raise terminal.Refused(f"no plant of {config.name} says anything at {config.bus.endpoint}")
-        u = completed(named, plant, acting(follower.state))
+        u = completed(named, plant, follower.state.acting)
         word = Override(
             run_id=commander.run_id, seq=0, mode="manual", u=u.tolist(), lease=lease_of(config.period)
         )
