@@ -145,7 +145,6 @@ class Manual(ByHand):
         from protocol.messages import Override
         from tandem.operating.hand_session import (
             Follower,
-            acting,
             assignments,
             clipped,
             completed,

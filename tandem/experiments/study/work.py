@@ -24,7 +24,6 @@ from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
 from tandem.experiments.study.plan import Job
 
-
 Rests = tuple[np.ndarray, np.ndarray]
 """Where the true plant rests at the set-points of each tick of a cycle, as of `wave.rests`."""
 
