@@ -25,6 +25,10 @@ Word = m.Override | m.Reference
 TOPICS = {m.Override: topics.OVERRIDE, m.Reference: topics.REFERENCE}
 ROUTER_S = 5.0
 """Seconds in which a router answers."""
+AGAIN_S = 0.25
+"""Seconds from one asking to the next."""
+MOST_PERIODS = 3.0
+"""Of a slow loop, until it says what it made of a tick."""
 LAST_WORDS, APART_S = 3, 0.1
 """How often what ends something is said, and how soon again: the control lane drops what finds no room."""
 
@@ -130,3 +134,25 @@ def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
         yield Commander(bus, heard)
     finally:
         bus.close()
+
+
+def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickResult]:
+    """What the controller made of it: the result of the tick that latched it, and of the next; none: no answer.
+
+    A tick that was prepared in the time before it still aims where it aimed then.
+
+    Raises:
+        Refused: no router answers.
+        ConfigError: no link, and why.
+    """
+    with commanding(config, topics.RESULT) as commander:
+        results: list[m.TickResult] = []
+
+        def done(heard: m.Message) -> bool:
+            if isinstance(heard, m.TickResult) and (results or heard.reference_from == commander.run_id):
+                results.append(heard)
+            return len(results) > 1
+
+        every = max(AGAIN_S, MOST_PERIODS * config.period)
+        commander.keep_saying(reference, every, max(seconds, every), done)
+        return results

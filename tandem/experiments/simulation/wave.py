@@ -56,14 +56,12 @@ def rests(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the true plant rests at each set-point: (steps, d) and (steps, m) of a cycle's `steps` ticks, plant units.
 
+    values: as of `require_fit`: with as many outputs as inputs a rest is unique.
+
     Raises:
-        PlantError: it does not rest there, or there are not as many outputs as inputs, which a rest is unique for.
+        PlantError: it does not rest there.
     """
     own = [plant.states.index(name) for name in values]
-    if len(own) != plant.m:
-        raise PlantError(
-            f"a rest is known where as many states as inputs ({plant.m}) are given, not {len(own)}"
-        )
     found = [_rest(np.array(row), own, true, plant, period) for row in zip(*values.values(), strict=True)]
     turn = np.arange(steps) * len(found) // steps
     x, u = (np.array(of) for of in zip(*found, strict=True))
