@@ -12,6 +12,8 @@ seconds for time), and are listed by name in `RunInfo.units`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import msgspec
@@ -209,6 +211,23 @@ class Tick(Message, frozen=True):
     """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
     reference: Reference | msgspec.UnsetType = msgspec.UNSET
     """That arrived since the tick before, the last of several; unset, and no byte, where there was none."""
+
+    @classmethod
+    def punctual(
+        cls,
+        run_id: str,
+        seq: int,
+        period: float,
+        state: PlantState | None,
+        weights: HiddenWeights | None = None,
+        truth: Mapping[str, float] = MappingProxyType({}),
+        reference: Reference | msgspec.UnsetType = msgspec.UNSET,
+    ) -> Tick:
+        """Of a loop that never skips a slot; a state that is there is fresh."""
+        verdict: StateVerdict = "missing" if state is None else "fresh"
+        return cls(
+            run_id, seq, seq, seq * period, 0, 0.0, False, verdict, state, weights, dict(truth), reference
+        )
 
 
 class TickResult(Message, frozen=True):

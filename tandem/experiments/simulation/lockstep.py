@@ -289,20 +289,8 @@ class LockStep:
         asked = self.person.reference()
         if asked is not None:
             self._note(topics.REFERENCE, asked, seq)
-        tick = m.Tick(
-            run_id=CONTROLLER,
-            seq=seq,
-            slot=seq,
-            t=t,
-            skipped=0,
-            lateness=0.0,
-            late=False,
-            state_verdict="missing" if state is None else "fresh",
-            state=state,
-            weights=weights,
-            truth=dict(truth),
-            reference=msgspec.UNSET if asked is None else asked,
-        )
+        reference = msgspec.UNSET if asked is None else asked
+        tick = m.Tick.punctual(CONTROLLER, seq, self.config.period, state, weights, truth, reference)
         stepped = time.perf_counter()
         outputs = self.core.step(tick)
         timing = m.TickTiming(
