@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 import msgspec
@@ -220,13 +219,24 @@ class Tick(Message, frozen=True):
         period: float,
         state: PlantState | None,
         weights: HiddenWeights | None = None,
-        truth: Mapping[str, float] = MappingProxyType({}),
+        truth: Mapping[str, float] | None = None,
         reference: Reference | msgspec.UnsetType = msgspec.UNSET,
     ) -> Tick:
         """Of a loop that never skips a slot; a state that is there is fresh."""
         verdict: StateVerdict = "missing" if state is None else "fresh"
         return cls(
-            run_id, seq, seq, seq * period, 0, 0.0, False, verdict, state, weights, dict(truth), reference
+            run_id,
+            seq,
+            seq,
+            seq * period,
+            0,
+            0.0,
+            False,
+            verdict,
+            state,
+            weights,
+            dict(truth or {}),
+            reference,
         )
 
 
