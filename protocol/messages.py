@@ -223,20 +223,19 @@ class Tick(Message, frozen=True):
         reference: Reference | msgspec.UnsetType = msgspec.UNSET,
     ) -> Tick:
         """Of a loop that never skips a slot; a state that is there is fresh."""
-        verdict: StateVerdict = "missing" if state is None else "fresh"
         return cls(
-            run_id,
-            seq,
-            seq,
-            seq * period,
-            0,
-            0.0,
-            False,
-            verdict,
-            state,
-            weights,
-            dict(truth or {}),
-            reference,
+            run_id=run_id,
+            seq=seq,
+            slot=seq,
+            t=seq * period,
+            skipped=0,
+            lateness=0.0,
+            late=False,
+            state_verdict="missing" if state is None else "fresh",
+            state=state,
+            weights=weights,
+            truth=dict(truth or {}),
+            reference=reference,
         )
 
 
