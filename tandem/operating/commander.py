@@ -84,6 +84,15 @@ class Commander:
                 continue
         return None
 
+    def hear_until(self, done: Callable[[m.Message], bool], seconds: float) -> bool:
+        """Listen until it is done, which is asked of everything that is heard; False after so many seconds."""
+        until = clock.now() + seconds
+        while (left := until - clock.now()) > 0.0:
+            heard = self.hear(left)
+            if heard is not None and done(heard):
+                return True
+        return False
+
     def keep_saying(
         self, word: Word, every: float, seconds: float, done: Callable[[m.Message], bool]
     ) -> bool:
@@ -99,13 +108,10 @@ class Commander:
             Whether it was done; False after so many seconds.
         """
         until = clock.now() + seconds
-        while (now := clock.now()) < until:
+        while (left := until - clock.now()) > 0.0:
             self.say(word)
-            due = min(now + every, until)
-            while (left := due - clock.now()) > 0.0:
-                heard = self.hear(left)
-                if heard is not None and done(heard):
-                    return True
+            if self.hear_until(done, min(every, left)):
+                return True
         return False
 
 

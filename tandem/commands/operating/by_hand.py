@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from lbmpc.plants import Description
     from node_runtime.config.sections import Config
+    from protocol.messages import Message
     from tandem.operating.commander import Commander, Word
     from tandem.operating.hand_session import Follower
 
@@ -110,13 +111,13 @@ class ByHand(Configured):
 
     def _reason(self, commander: Commander, follower: Follower, why: str) -> str:
         """As the plant says it, where it is the plant that ended it: in its next health."""
-        from node_runtime.realtime import clock
 
-        end = clock.now() + HEALTH_S
-        while follower.mine and not follower.told and (left := end - clock.now()) > 0.0:
-            heard = commander.hear(left)
-            if heard is not None:
-                follower.take(heard)
+        def told(heard: Message) -> bool:
+            follower.take(heard)
+            return bool(follower.told) or not follower.mine
+
+        if follower.mine and not follower.told:
+            commander.hear_until(told, HEALTH_S)
         return follower.told or why if follower.mine else why
 
     def _ended(self, why: str, what: str) -> int:
@@ -141,7 +142,6 @@ class Manual(ByHand):
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
     ) -> int:
-        from node_runtime.realtime import clock
         from protocol.messages import Override
         from tandem.operating.hand_session import (
             Follower,
@@ -153,11 +153,13 @@ class Manual(ByHand):
         )
 
         named = assignments(self.inputs, plant)
-        follower, end = Follower(commander.run_id, Override), clock.now() + patience(config)
-        while follower.state is None and (left := end - clock.now()) > 0.0:
-            heard = commander.hear(left)
-            if heard is not None:
-                follower.take(heard)
+        follower = Follower(commander.run_id, Override)
+
+        def seen(heard: Message) -> bool:
+            follower.take(heard)
+            return follower.state is not None
+
+        commander.hear_until(seen, patience(config))
         if follower.state is None:
             raise terminal.Refused(f"no plant of {config.name} says anything at {config.bus.endpoint}")
         u = completed(named, plant, follower.state.acting)
