@@ -12,6 +12,7 @@ seconds for time), and are listed by name in `RunInfo.units`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import msgspec
@@ -99,6 +100,11 @@ class PlantState(Message, frozen=True, kw_only=True):
     """Tick of the last command received, -1 before the first."""
     missing: list[str] | msgspec.UnsetType = msgspec.UNSET
     """States of which no number came, by name; their entries of x count nothing. Unset, and no byte, where all did."""
+
+    @property
+    def acting(self) -> list[float] | None:
+        """The input that acts at this sample, (m,); None where that is not known."""
+        return self.pieces[-1].u if self.pieces else self.applied
 
 
 class Command(Message, frozen=True):
@@ -204,6 +210,33 @@ class Tick(Message, frozen=True):
     """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
     reference: Reference | msgspec.UnsetType = msgspec.UNSET
     """That arrived since the tick before, the last of several; unset, and no byte, where there was none."""
+
+    @classmethod
+    def punctual(
+        cls,
+        run_id: str,
+        seq: int,
+        period: float,
+        state: PlantState | None,
+        weights: HiddenWeights | None = None,
+        truth: Mapping[str, float] | None = None,
+        reference: Reference | msgspec.UnsetType = msgspec.UNSET,
+    ) -> Tick:
+        """Of a loop that never skips a slot; a state that is there is fresh."""
+        return cls(
+            run_id=run_id,
+            seq=seq,
+            slot=seq,
+            t=seq * period,
+            skipped=0,
+            lateness=0.0,
+            late=False,
+            state_verdict="missing" if state is None else "fresh",
+            state=state,
+            weights=weights,
+            truth=dict(truth or {}),
+            reference=reference,
+        )
 
 
 class TickResult(Message, frozen=True):

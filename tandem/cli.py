@@ -19,19 +19,19 @@ from tyro.conf import subcommand
 
 from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
-from tandem.commands.by_hand import Auto, Manual, Pause
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
 from tandem.commands.health import Health
 from tandem.commands.identify import Identify
 from tandem.commands.keys import KeysCommand
 from tandem.commands.model import ModelCommand
+from tandem.commands.operating.by_hand import Auto, Manual, Pause
+from tandem.commands.operating.set_point import SetPoint
 from tandem.commands.processes import Controller, Plant, Record, Router, Trainer
 from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
 from tandem.commands.report import Report
 from tandem.commands.run import Run
-from tandem.commands.set_point import SetPoint
 from tandem.commands.sets import SetsCommand
 from tandem.commands.simulate import Simulate
 from tandem.streams import never_failing

@@ -37,8 +37,8 @@ from protocol.messages import Reference, TickResult
 from run_log.reporting.summary import Summary, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import Run
-from tandem import set_points
 from tandem.experiments.simulation.lockstep import LockStep
+from tandem.operating import set_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -187,7 +187,7 @@ class Loop:
         """Where the plant shall go, from the next period on; None: where the configuration says.
 
         Args:
-            reference: for instance of `tandem.set_points.trajectory`, or `from_file`.
+            reference: for instance of `tandem.operating.set_points.trajectory`, or `from_file`.
 
         Raises:
             ValueError: it is none of this plant; nothing has happened then.

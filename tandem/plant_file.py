@@ -68,20 +68,8 @@ def source(fields: Mapping[str, Any], about: Sequence[str]) -> str:
 def shared_fields(known: Known) -> dict[str, Any]:
     """What a model with other matrices has in common with this one, as `from_matrices` takes it; names come first."""
     names = (
-        *(
-            "name",
-            "states",
-            "inputs",
-            "units",
-            "x_e",
-            "u_e",
-            "x_min",
-            "x_max",
-            "u_min",
-            "u_max",
-            "u_rate_max",
-        ),
-        *("x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
+        *("name", "states", "inputs", "units", "x_e", "u_e", "x_min", "x_max", "u_min", "u_max"),
+        *("u_rate_max", "x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
     )
     fields = {key: getattr(known, key) for key in names}
     fields |= {key: dict(getattr(known, key)) or None for key in ("scale", "names", "rows")}

@@ -104,12 +104,7 @@ def table(summary: Summary) -> Table:
             continue
         style = "bold red" if name in SHOULD_BE_ZERO and value else ""
         shown.add_row(name, Text(_text(name, value), style), MEANING.get(name, ""))
-    counted = [
-        share
-        for weights in (summary.weight, summary.constant_weight)
-        if weights
-        for share in weights.values()
-    ]
+    counted = [*(summary.weight or {}).values(), *(summary.constant_weight or {}).values()]
     if counted and max(counted) < ADDS:
         shown.add_row("learning", Text("adds nothing", "bold yellow"), "noise exceeds h")
     return shown

@@ -86,7 +86,7 @@ def follow(config: Config, seed: int, ticks: int) -> Found:
         sources[state.source] = sources.get(state.source, 0) + 1
         if state.applied is not None:
             applied.append(state.applied[0])
-        outputs = core.step(_tick(k, t, state))
+        outputs = core.step(m.Tick.punctual("controller", k, period, state))
         silent = silent - 1 if silent else int(rng.integers(1, 40)) * int(rng.random() < SILENT)
         if silent:
             continue
@@ -106,7 +106,7 @@ def by_hand(config: Config, seed: int, ticks: int) -> Found:
     states, until = [], int(rng.integers(5, 20))
     for k in range(ticks):
         if k == until:
-            if loop.by_hand is None:
+            if loop.person.by_hand is None:
                 loop.manual(rng.uniform(plant.u_min, plant.u_max))
             else:
                 loop.auto()
@@ -126,21 +126,6 @@ def by_hand(config: Config, seed: int, ticks: int) -> Found:
     counted = Counter[str](state.source for state in states)
     samples = float(np.abs(np.diff(applied)).max()) / (rate * period)
     return Found(_largest(written, rate, period), samples, dict(counted))
-
-
-def _tick(seq: int, t: float, state: m.PlantState) -> m.Tick:
-    return m.Tick(
-        run_id="controller",
-        seq=seq,
-        slot=seq,
-        t=t,
-        skipped=0,
-        lateness=0.0,
-        late=False,
-        state_verdict="fresh",
-        state=state,
-        weights=None,
-    )
 
 
 def _largest(written: list[tuple[float, float]], rate: float, period: float) -> float:

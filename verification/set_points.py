@@ -21,7 +21,7 @@ from node_runtime.config.sections import Config
 from node_runtime.config.shipped import config_file
 from tandem.experiments.simulation.lockstep import LockStep
 from tandem.loop import Loop
-from tandem.set_points import set_point, trajectory
+from tandem.operating.set_points import set_point, trajectory
 
 HALF = 0.5
 """Half-width of y."""

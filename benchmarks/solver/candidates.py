@@ -158,18 +158,7 @@ class WholeTick:
             source="command",
             command_seq=tick - 1,
         )
-        return m.Tick(
-            run_id="benchmark",
-            seq=tick,
-            slot=tick,
-            t=tick * period,
-            skipped=0,
-            lateness=0.0,
-            late=False,
-            state_verdict="fresh",
-            state=state,
-            weights=None,
-        )
+        return m.Tick.punctual("benchmark", tick, period, state)
 
 
 def _part(mode: str, seconds: float, solution: Solution, expected: Status) -> Part:

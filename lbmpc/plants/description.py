@@ -17,6 +17,8 @@ INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
 HAIR = 1e-9
 """Of a period: two moments that are so near are one."""
 TUPLES = ("states", "inputs", "performance", "kernel", "poles")
+EVERY: Any = None
+"""What nobody chose."""
 
 
 class PlantError(ArithmeticError):
@@ -53,10 +55,10 @@ class Description:
     x0: np.ndarray
     safe_input: np.ndarray
     """What the plant's own hardware applies when nobody commands it, at x_e where there is a `safe_gain`."""
-    performance: tuple[int, ...]
-    """States that make up the reported cost; the first is the one whose overshoot is reported."""
-    kernel: tuple[str, ...]
-    """States and inputs that the L2NW kernel sees."""
+    performance: tuple[int, ...] = EVERY
+    """States that make up the reported cost; the first is the one whose overshoot is reported. All by default."""
+    kernel: tuple[str, ...] = EVERY
+    """States and inputs that the L2NW kernel sees. All by default."""
     safe_gain: np.ndarray | None = None
     """(m, d): then that is safe_input + safe_gain (x - x_e), renewed every period; for a plant that no constant input
     holds at x_e. None: safe_input."""
@@ -80,6 +82,11 @@ class Description:
             object.__setattr__(self, name, as_array(getattr(self, name)))
         for name in TUPLES:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        if isinstance(self.states, tuple) and isinstance(self.inputs, tuple):
+            every = {"performance": tuple(range(self.d)), "kernel": (*self.states, *self.inputs)}
+            for name, whole in every.items():
+                if getattr(self, name) is EVERY:
+                    object.__setattr__(self, name, whole)
 
     def changed(
         self,

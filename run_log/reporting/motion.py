@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import accumulate, groupby, pairwise
 
 import msgspec
@@ -87,10 +88,13 @@ def goal(plant: Description, config: Config) -> np.ndarray:
     gives a value."""
     reference = config.reference
     values = reference.values if reference.outputs else None
-    return _instead(plant, {} if values is None else dict(zip(reference.outputs or [], values, strict=True)))
+    return with_outputs(
+        plant, {} if values is None else dict(zip(reference.outputs or [], values, strict=True))
+    )
 
 
-def _instead(plant: Description, values: dict[str, float]) -> np.ndarray:
+def with_outputs(plant: Description, values: Mapping[str, float]) -> np.ndarray:
+    """x_e, (d,), plant units, but for the states that are given by name."""
     wanted = plant.x_e.copy()
     wanted[[plant.states.index(name) for name in values]] = [*values.values()]
     return wanted
@@ -100,7 +104,7 @@ def _asked(run: Run, states: list[PlantState], plant: Description) -> np.ndarray
     """(n, d) of `Trajectory.goal`. A sample that no tick of the log answers has the goal of the sample before."""
     given = {(r.run_id, r.seq): r.reference for r in run.results if r.reference}
     configured = goal(plant, run.config)
-    goals = {key: _instead(plant, values) for key, values in given.items()}
+    goals = {key: with_outputs(plant, values) for key, values in given.items()}
     if all((one == configured).all() for one in goals.values()):
         return None
     of_sample = {

@@ -20,7 +20,8 @@ from tandem.commands.base import FROM_CONFIG, INTERRUPTED, Configured, require
 if TYPE_CHECKING:
     from node_runtime.config.sections import Config
     from tandem.live.files import RunFiles
-    from tandem.live.monitor import Monitor, Snapshot
+    from tandem.live.monitor import Monitor
+    from tandem.live.snapshot import Snapshot
     from tandem.live.supervisor import Wish
 
 USUAL_S, LONGEST_S = 20.0, 1e8

@@ -71,8 +71,9 @@ class Simulate(Configured):
         from node_runtime.config.loading import override
         from run_log.reporting.summary import summarise
         from run_log.writing.save import save
-        from tandem import set_points, summary_table
+        from tandem import summary_table
         from tandem.experiments.simulation.lockstep import simulate
+        from tandem.operating import set_points
 
         require("zstandard")
         asked = None

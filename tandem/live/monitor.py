@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,8 +15,10 @@ from node_runtime.config.sections import Config
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
 from protocol import messages as m
+from run_log.reporting.motion import with_outputs
 from run_log.reporting.summary import ADDS, ADDS_NOTHING, SOFT
 from tandem.live.presence import SILENT_S, Presence
+from tandem.live.snapshot import Event, Gauge, ProcessRow, Snapshot, Weight
 
 RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
@@ -30,104 +31,6 @@ PATIENCE_S, PATIENCE_TICKS = 3.0, 10
 UNSEEN = (topics.KEYFRAME, topics.SETS, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
 # Nothing is counted over all of these: a fast loop's are looked at now and then.
 ONLY_SHOWN = (topics.PLANT_STATE, topics.COMMAND, topics.TIMING)
-
-Weight = Literal["note", "good", "bad"]
-
-
-@dataclass(frozen=True)
-class Gauge:
-    """One state or input against its bounds, in the plant's own units."""
-
-    name: str
-    value: float | None
-    low: float
-    high: float
-    target: float
-    scale: float
-    """What counts as 1: the half-width where both bounds are finite."""
-
-
-@dataclass(frozen=True)
-class ProcessRow:
-    """One process as it says itself, and how long ago it said so."""
-
-    name: str
-    status: str
-    """Of its Health; "not heard of", "not configured", "silent" or "ended" where there is none."""
-    note: str
-    counters: dict[str, int]
-
-
-@dataclass(frozen=True)
-class Event:
-    """One line for a person."""
-
-    at: float
-    """Seconds since the first command; negative before it."""
-    text: str
-    weight: Weight = "note"
-
-
-@dataclass
-class Snapshot:
-    """All that the live view shows at one moment. The monitor counts in one, and gives copies."""
-
-    config: Config
-    plant: Description
-    seconds: float
-    phase: str = ""
-    """What is being waited for, e.g. "the trainer" or "the plant"; empty while the run goes on."""
-    elapsed: float | None = None
-    """Seconds since the first command, None before it."""
-    states: tuple[Gauge, ...] = ()
-    inputs: tuple[Gauge, ...] = ()
-    source: str = ""
-    """What drives the plant: hold, command, plan, safe, manual."""
-    ticks: int = 0
-    measured_rate: float | None = None
-    late: int = 0
-    skipped: int = 0
-    mode: str = ""
-    sensor_faults: dict[str, str] = field(default_factory=dict)
-    """What is wrong with sensors that are not believed, in words, by the names of their states."""
-    fallback: int = 0
-    slack: float = 0.0
-    slack_row: str = ""
-    """Which state constraint gives way, as "y at step 3"."""
-    soft: int = 0
-    set_margin: float | None = None
-    """To the boundary of the certified sets, negative outside; None where none are in force, or no state."""
-    set_piece: int = -1
-    outside: int = 0
-    """Ticks outside of them."""
-    reference: dict[str, float] = field(default_factory=dict)
-    """Where outputs should be now, by name; empty where there are none."""
-    target_status: str = "none"
-    solve_ms: tuple[float, float] | None = None
-    """p50 and p99 of the recent ticks."""
-    tick_ms: tuple[float, float] | None = None
-    prediction_error: float | None = None
-    """Mean of the last second."""
-    counts: float | None = None
-    """What of the network, or of the constant beside it, counts in the prediction of some state: the most; None where
-    nothing weighs it."""
-    adds_nothing: bool = False
-    """Whether it has been nearly nothing for seconds."""
-    noise: dict[str, float] | None = None
-    """Standard deviation of what is measured as the estimator found it, by the names of states; None where it was
-    told."""
-    trend: tuple[float, ...] = ()
-    """Mean prediction error of each second so far, the newest last."""
-    weights_version: int = -1
-    adopted: int = 0
-    refused: int = 0
-    rolled_back: int = 0
-    loss: tuple[float, float] | None = None
-    """Of the last training: before, after."""
-    samples: int = 0
-    processes: tuple[ProcessRow, ...] = ()
-    bad_messages: int = 0
-    events: tuple[Event, ...] = ()
 
 
 class Monitor:
@@ -238,7 +141,7 @@ class Monitor:
             what = "driven by hand" if by_hand else f"no longer driven by hand: {state.source}"
             self.say(f"the plant is {what}", now, "note" if by_hand else "good")
         if state.source == "manual":
-            self._u = state.pieces[-1].u if state.pieces else state.applied
+            self._u = state.acting
 
     def miss_plant(self, now: float) -> None:
         """Say it, once, when a plant that was there is silent."""
@@ -386,11 +289,10 @@ class Monitor:
 
     def _goal(self) -> np.ndarray:
         """Where the states should come to rest, (d,)."""
-        goal, states = self.plant.x_e.copy(), self.plant.states
-        for name, value in self._seen.reference.items():
-            if name in states:
-                goal[states.index(name)] = value
-        return goal
+        known = self.plant.states
+        return with_outputs(
+            self.plant, {name: r for name, r in self._seen.reference.items() if name in known}
+        )
 
     def _row(self, name: str, now: float) -> ProcessRow:
         health, at = self._health.get(name, (None, now))

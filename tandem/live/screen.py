@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.live import Live
 
 from tandem.live import view
-from tandem.live.monitor import Event, Snapshot
+from tandem.live.snapshot import Event, Snapshot
 from tandem.streams import blocked
 from tandem.terminal import say
 

@@ -16,8 +16,9 @@ from node_runtime.bus.zenoh_bus import Bus, Mailbox, OpenInterrupted
 from node_runtime.config.sections import Config
 from node_runtime.lifecycle import new_run_id
 from protocol import topics
-from tandem.live.monitor import Monitor, Snapshot
+from tandem.live.monitor import Monitor
 from tandem.live.processes import STOP_S, TABLE, Child
+from tandem.live.snapshot import Snapshot
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # One Ctrl-C may arrive twice (`timeout`, a shell's process group): still one wish.

@@ -11,7 +11,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from run_log.reporting.summary import ADDS_NOTHING
-from tandem.live.monitor import Event, Gauge, ProcessRow, Snapshot
+from tandem.live.snapshot import Event, Gauge, ProcessRow, Snapshot
 
 NARROW = 76
 FIGURES = 9

@@ -20,8 +20,8 @@ from node_runtime.realtime.scheduling import one_blas_thread
 from node_runtime.router import open_router
 from protocol import codec, topics
 from protocol import messages as m
-from tandem.commander import commanding
-from tandem.set_points import set_point
+from tandem.operating.commander import commanding
+from tandem.operating.set_points import set_point
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
 
 FLOOD = 300
@@ -83,9 +83,9 @@ def command(config: Config) -> None:
     with commanding(config, topics.RESULT) as commander:
         asked = [set_point({"y": y}) for y in (1.7, 5.0)]
         for one in asked:
-            assert commander.keep_saying(topics.REFERENCE, one, 0.2, HANG_S, answers(commander.run_id))
+            assert commander.keep_saying(one, 0.2, HANG_S, answers(commander.run_id))
         for _ in range(FLOOD):
-            commander.say(topics.REFERENCE, asked[0])
+            commander.say(asked[0])
             time.sleep(1e-3)
 
 

@@ -21,7 +21,7 @@ from run_log.reporting.traces import traces
 from run_log.run import Run
 from tandem.experiments.simulation.lockstep import LockStep
 from tandem.loop import Loop
-from tandem.set_points import set_point, trajectory
+from tandem.operating.set_points import set_point, trajectory
 
 PLANT = get_plant("moore_greitzer")
 HALF = 0.5

@@ -9,8 +9,8 @@ import pytest
 
 from protocol import messages as m
 from tandem.cli import main
-from tandem.commands.set_point import words
-from tandem.set_points import from_file, from_words
+from tandem.commands.operating.set_point import words
+from tandem.operating.set_points import from_file, from_words
 from tandem.terminal import Refused
 
 

@@ -32,8 +32,9 @@ from tandem.console import PlainConsole
 from tandem.experiments.simulation.lockstep import simulate
 from tandem.live import view
 from tandem.live.files import RunFiles
-from tandem.live.monitor import Monitor, Snapshot
+from tandem.live.monitor import Monitor
 from tandem.live.screen import Screen
+from tandem.live.snapshot import Snapshot
 from tandem.live.supervisor import Impatient
 from tandem.terminal import Refused
 from tests.helpers.paths import ROOT

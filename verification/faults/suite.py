@@ -14,7 +14,8 @@ from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.realtime.scheduling import READER_PRIORITY, punctual
 from run_log.errors import LogError
-from tandem.set_points import trajectory
+from tandem.operating.commander import ask
+from tandem.operating.set_points import trajectory
 from verification.faults.catalogue import Fault, Stage
 from verification.faults.evaluation import evaluate
 from verification.faults.facts import Facts
@@ -23,6 +24,8 @@ from verification.faults.processes.scenes import nothing
 
 EARLIEST_S = 0.3
 """After the first command; what comes before concerns no run."""
+LED_S = 60.0
+"""In which a controller answers who says where to go."""
 SETTLED_S = 4.0
 """The fault comes within so many seconds of the beginning, where the plant moves most."""
 
@@ -102,7 +105,8 @@ def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, f
         assert rig.first_command is not None
         if stage.set_points:
             times, values = zip(*stage.set_points, strict=True)
-            rig.lead(trajectory(times, {"y": values}))
+            if not ask(rig.config, trajectory(times, {"y": values}), LED_S):
+                raise RigError("nobody took the reference")
         if fault is not None:
             rig.run_until(rig.first_command + at)
             extra = fault.inflict(rig, rig.config.seed) or {}

@@ -31,6 +31,8 @@ CHEAP = 1e-3
 """Of what the dearest input costs at its half-width: a performance state that costs less there is not cared for."""
 DOUBLED = 2.0
 """What an error of a prediction over the dead time may grow by."""
+BESIDE = 0.01
+"""Half-widths from x_e, in every state: exactly there an unstable plant would stay."""
 WEAK = 0.1
 """Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
 
@@ -204,7 +206,7 @@ def _start(model: Model, x0: np.ndarray) -> Finding:
 def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
     seconds = max(FOLLOWED, 2.0 * horizon * model.period)
     law = "the safe input" if model.plant.safe_gain is None else "the safe input with its gain"
-    for where, start in (("x0", x0), ("x_e", model.plant.x_e)):
+    for where, start in (("x0", x0), ("x_e", _beside_rest(model.plant))):
         kept = under_safe_input(model, step, start, seconds)
         if not kept.left:
             yield Finding("ok", f"safe from {where}", f"{law} keeps it in X for {seconds:.3g} s")
@@ -215,3 +217,9 @@ def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Fi
             yield Finding(
                 "note", f"safe from {where}", f"under {law}, after {kept.seconds:.3g} s: {kept.left}"
             )
+
+
+def _beside_rest(plant: Known) -> np.ndarray:
+    """A state of X, (d,), a little beside x_e, on the side that has more room."""
+    side = np.where(plant.x_max - plant.x_e >= plant.x_e - plant.x_min, BESIDE, -BESIDE)
+    return plant.state_rows.pulled(plant.x_e + side * plant.x_scale, plant.x_e)

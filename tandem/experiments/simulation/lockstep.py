@@ -34,7 +34,7 @@ from protocol import topics
 from protocol.topics import Topic
 from run_log.run import Run, gather
 from tandem.experiments.simulation.faults import Faults
-from tandem.hand_session import lease_of
+from tandem.experiments.simulation.person import Person
 
 if TYPE_CHECKING:
     from trainer_node.training import Trainer
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 Progress = Callable[[int], None]
 NO_FAULTS = Faults()
 CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer-simulated"
-COMMANDER = "commander-simulated"
 
 
 @dataclass(frozen=True)
@@ -153,8 +152,7 @@ class LockStep:
         set_points: m.Reference | None = None,
     ):
         self.config, self.faults = config, faults
-        self._set_points = self._asked = set_points
-        self._said = 0
+        self.person = Person(config.period, set_points)
         register_architecture(config)
         self.core = ControllerCore(config, CONTROLLER, given=given)
         truth = None if given is None else given.truth
@@ -164,8 +162,6 @@ class LockStep:
         self.taken, self.episode, self.began, self.elsewhere = 0, 1, 0, False
         settings = config.controller
         self.way_back = WayBack(self.core.controller.model, settings.backup.margin, settings.horizon)
-        self.by_hand: m.Override | None = None
-        self.intentions = 0
         self.acting = self.core.plant.safe_input
         """The input, (m,), that the last step gave the plant."""
         self.plant = self._started_plant(initial_state(config, self.core.plant))
@@ -233,57 +229,26 @@ class LockStep:
 
     def manual(self, u: np.ndarray) -> None:
         """From the next sample on u, (m,), plant units, acts by hand: until `auto`, or until X would be left."""
-        lease = lease_of(self.config.period)
-        self._intend(m.Override(run_id=self._intention(), seq=0, mode="manual", u=u.tolist(), lease=lease))
+        self._override(self.person.manual(u), self.taken * self.config.period)
 
     def auto(self) -> None:
         """From the next sample on the controller's commands act again."""
-        self._intend(m.Override(run_id=self._intention(), seq=0, mode="auto"))
+        self._override(self.person.auto(), self.taken * self.config.period)
 
-    def _intention(self) -> str:
-        self.intentions += 1
-        return f"{COMMANDER}-hand-{self.intentions}"
-
-    def _intend(self, override: m.Override) -> None:
-        self._say(override, self.taken * self.config.period)
-        self.by_hand = override if override.mode == "manual" else None
-
-    def _say(self, override: m.Override, t: float) -> None:
-        self.plant.override(override, t)
-        self._note(topics.OVERRIDE, override, self.taken)
-
-    def _renew_the_lease(self, t: float) -> None:
-        """In time for the period from t on; what has ended is said no more."""
-        said = self.by_hand
-        if said is None:
-            return
-        if not self.plant.hand.acts:
-            self.by_hand = None
-            return
-        while self.plant.hand.until <= t + self.config.period:
-            said = msgspec.structs.replace(said, seq=said.seq + 1)
-            self._say(said, self.plant.hand.until - said.lease / 2.0)
-        self.by_hand = said
+    def _override(self, word: m.Override, t: float) -> None:
+        self.plant.override(word, t)
+        self._note(topics.OVERRIDE, word, self.taken)
 
     def start_again(self, lost: bool = False) -> None:
         """Another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
         self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
-        self._asked = self._set_points or self._asked
+        self.person.start_again()
 
     def ask(self, reference: m.Reference) -> None:
         """Where the plant shall go from the next period on."""
-        self._asked = reference
-
-    def _asking(self, seq: int) -> m.Reference | msgspec.UnsetType:
-        """What the tick latches; each time somebody else asks, so that nothing is taken for a repetition."""
-        if self._asked is None:
-            return msgspec.UNSET
-        said = msgspec.structs.replace(self._asked, run_id=f"{COMMANDER}-{self._said}", seq=0)
-        self._asked, self._said = None, self._said + 1
-        self._note(topics.REFERENCE, said, seq)
-        return said
+        self.person.ask(reference)
 
     def _end(self) -> list[tuple[Topic, m.Message, int]]:
         """Where the last command has led the plant; of one that moves elsewhere that is not known."""
@@ -310,7 +275,8 @@ class LockStep:
             self.plant = self._started_plant(x)
         t = seq * self.config.period
         true = self.plant.sample(t)
-        self._renew_the_lease(t)
+        for word, at in self.person.renewals(self.plant.hand, t):
+            self._override(word, at)
         truth: Mapping[str, float] = {}
         while self.changes and self.changes[0][0] <= t + self.config.period / 2:
             now = self.changes.pop(0)[1]
@@ -320,20 +286,11 @@ class LockStep:
         self._note(topics.PLANT_STATE, true, seq)
         state = self._measured(true)
         weights = self._arriving(seq)
-        tick = m.Tick(
-            run_id=CONTROLLER,
-            seq=seq,
-            slot=seq,
-            t=t,
-            skipped=0,
-            lateness=0.0,
-            late=False,
-            state_verdict="missing" if state is None else "fresh",
-            state=state,
-            weights=weights,
-            truth=dict(truth),
-            reference=self._asking(seq),
-        )
+        asked = self.person.reference()
+        if asked is not None:
+            self._note(topics.REFERENCE, asked, seq)
+        reference = msgspec.UNSET if asked is None else asked
+        tick = m.Tick.punctual(CONTROLLER, seq, self.config.period, state, weights, truth, reference)
         stepped = time.perf_counter()
         outputs = self.core.step(tick)
         timing = m.TickTiming(

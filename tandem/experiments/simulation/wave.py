@@ -10,7 +10,7 @@ from scipy.optimize import root
 from lbmpc.plants import Description, PlantError, TrueMotion
 from node_runtime.config.strict import ConfigError, did_you_mean
 from protocol import messages as m
-from tandem.set_points import trajectory
+from tandem.operating.set_points import trajectory
 
 Values = Mapping[str, Sequence[float]]
 """By the name of a state, plant units: those that follow each other within a cycle, equally long."""
@@ -56,14 +56,12 @@ def rests(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the true plant rests at each set-point: (steps, d) and (steps, m) of a cycle's `steps` ticks, plant units.
 
+    values: as of `require_fit`: with as many outputs as inputs a rest is unique.
+
     Raises:
-        PlantError: it does not rest there, or there are not as many outputs as inputs, which a rest is unique for.
+        PlantError: it does not rest there.
     """
     own = [plant.states.index(name) for name in values]
-    if len(own) != plant.m:
-        raise PlantError(
-            f"a rest is known where as many states as inputs ({plant.m}) are given, not {len(own)}"
-        )
     found = [_rest(np.array(row), own, true, plant, period) for row in zip(*values.values(), strict=True)]
     turn = np.arange(steps) * len(found) // steps
     x, u = (np.array(of) for of in zip(*found, strict=True))

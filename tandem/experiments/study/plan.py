@@ -27,6 +27,7 @@ CODE = (
     "run_log/reporting/between_samples.py",
     "run_log/reporting/performance.py",
     "tandem/experiments/simulation/lockstep.py",
+    "tandem/experiments/simulation/person.py",
     "tandem/experiments/simulation/wave.py",
 )
 

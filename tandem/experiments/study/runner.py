@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from node_runtime.config.sections import AdaptationConfig, Config, PlantConfig
+from node_runtime.config.sections import AdaptationConfig, Config, SensorsConfig
 from node_runtime.whole_file import read_regular, write_whole
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.simulation.lockstep import follow
@@ -154,9 +154,8 @@ def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
     given = config.plant
-    plant = PlantConfig(model=given.model, x_e=given.x_e, u_e=given.u_e, bounds=given.bounds)
-    if isinstance(given.truth, str):
-        plant = msgspec.structs.replace(plant, truth=given.truth)
+    truth = given.truth if isinstance(given.truth, str) else {}
+    plant = msgspec.structs.replace(given, x0=None, truth=truth, sensors=SensorsConfig())
     config = msgspec.structs.replace(
         config, seed=seed, plant=plant, controller=controller, constant=Config().constant
     )

@@ -24,6 +24,9 @@ from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.lemma import Lemma, measure
 from tandem.experiments.study.plan import Job
 
+Rests = tuple[np.ndarray, np.ndarray]
+"""Where the true plant rests at the set-points of each tick of a cycle, as of `wave.rests`."""
+
 
 class Traces(msgspec.Struct, frozen=True, kw_only=True):
     """n samples, from the start on."""
@@ -69,6 +72,7 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
         ConfigError: the job's configuration admits no controller.
         OSError: something else than a file has the name of a log.
     """
+    rests = None if job.set_points is None else _rests(job, job.set_points)
     outcome = _outcome(job)
     for log in logs:
         require_regular(log)
@@ -76,16 +80,16 @@ def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -
         partial.unlink(missing_ok=True)
         save(outcome.run, partial)
         partial.replace(log)
-    write_whole(folder / f"{key}.json", msgspec.json.encode(_record(job, outcome, detail)))
+    write_whole(folder / f"{key}.json", msgspec.json.encode(_record(job, outcome, rests, detail)))
 
 
-def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
+def _record(job: Job, outcome: Outcome, rests: Rests | None, detail: bool) -> Record:
     run = outcome.run
     summary = summarise(run)
     return Record(
         job=job,
         lost=outcome.lost,
-        episodes=summary.episodes[: outcome.episodes] if job.set_points is None else _cycles(run, job),
+        episodes=summary.episodes[: outcome.episodes] if rests is None else _cycles(run, job, rests),
         performance=Performance(**{name: getattr(summary, name) for name in Performance.__struct_fields__}),
         iteration_limit_ticks=summary.iteration_limit_ticks,
         soft_ticks=summary.soft_ticks,
@@ -101,26 +105,23 @@ def _record(job: Job, outcome: Outcome, detail: bool) -> Record:
 def _outcome(job: Job) -> Outcome:
     if job.set_points is None:
         return follow(job.config, job.steps, job.faults, episodes=job.episodes)
-    _rests(job, job.set_points)  # before anything runs in vain
     asked = wave.reference(job.set_points, job.steps * job.config.period, job.episodes)
     return follow(job.config, job.steps * job.episodes, job.faults, set_points=asked)
 
 
-def _cycles(run: Run, job: Job) -> list[Performance]:
+def _cycles(run: Run, job: Job, rests: Rests) -> list[Performance]:
     """Of each that could be followed to its end: dx and du are from where the true plant rests at the set-points."""
     plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
-    motion = trajectory(run, plant)
-    values = job.set_points or {}
-    outputs = msgspec.structs.replace(job.config.reference, outputs=list(values))
+    motion, (x, u) = trajectory(run, plant), rests
+    outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))
     config = msgspec.structs.replace(job.config, reference=outputs)
-    x, u = _rests(job, values)
     firsts = range(0, len(motion.step) - job.steps, job.steps)
     parts = [motion.part(first, first + job.steps) for first in firsts]
     goal = np.append(x, x[-1:], axis=0)
     return [performance(msgspec.structs.replace(part, goal=goal), plant, config, truth, u) for part in parts]
 
 
-def _rests(job: Job, values: wave.Values) -> tuple[np.ndarray, np.ndarray]:
+def _rests(job: Job, values: wave.Values) -> Rests:
     true = true_motion(true_plant_of(job.config, get_plant, get_truth))
     try:
         return wave.rests(values, job.steps, true, build_plant(job.config), job.config.period)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import casadi as ca
 import numpy as np
@@ -193,6 +193,14 @@ def test_lists_are_as_good_as_arrays_and_tuples() -> None:
     for name in fields:
         np.testing.assert_array_equal(getattr(plant, name), getattr(MOORE_GREITZER, name), strict=True)
     assert all(getattr(plant, name) == getattr(MOORE_GREITZER, name) for name in names)
+
+
+def test_without_a_choice_all_states_are_reported_and_the_kernel_sees_all() -> None:
+    chosen = ("performance", "kernel")
+    given = {one.name: getattr(PENDULUM, one.name) for one in fields(Plant) if one.name not in chosen}
+    plant = Plant(**given)
+    assert (plant.performance, plant.kernel) == ((0, 1), (*PENDULUM.states, *PENDULUM.inputs))
+    assert faults(plant) == ()
 
 
 def test_rounding_of_an_equilibrium_is_judged_by_the_plants_own_units() -> None:

@@ -22,7 +22,7 @@ from protocol import messages as m
 from protocol import topics
 from tandem import certificate_authority
 from tandem.cli import main
-from tandem.hand_session import Follower, assignments, clipped, completed, lease_of, line
+from tandem.operating.hand_session import Follower, assignments, clipped, completed, lease_of, line
 from tandem.terminal import Refused
 from tests.helpers.live import BusListener, free_endpoint, live_config, wait_for
 

@@ -194,6 +194,12 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         "safe from x0",
         "under the safe input angle leaves X after 0.7 s",
     ),
+    "a rest that the safe input does not hold": (
+        PENDULUM,
+        TEN,
+        "safe from x_e",
+        r"under the safe input angle leaves X after 2\.\d s",
+    ),
     "a safe input that leads out of the equations": (
         replace(TANKS, safe_input=np.zeros(1), x_min=np.array([-9.0, -9.0])),
         ("--rate", "0.2"),

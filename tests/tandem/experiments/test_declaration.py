@@ -10,7 +10,7 @@ import pytest
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study.plan import Job, rows
-from tandem.experiments.study.runner import wanted
+from tandem.experiments.study.runner import timing_job, wanted
 from tests.helpers.experiments import SHIPPED, SMALL, cases
 from tests.helpers.paths import ROOT
 
@@ -45,6 +45,14 @@ def test_a_misspelt_key_is_named_with_file_and_nearest(
         cases(small)
     assert str(caught.value).startswith(str(small))
     assert expected in str(caught.value)
+
+
+def test_a_solver_is_timed_with_all_that_limits_it(small: Path) -> None:
+    limits = "rows = { a = { z = 1.0, y = -0.5, max = 0.3 } }, input_rate_max = { u = 2.0 }"
+    small.write_text(SMALL.replace("[set]", f"[set]\nplant = {{ {limits}, sensors = {{ noise = 0.1 }} }}"))
+    plant = timing_job(cases(small)[0], 0, 1.0).config.plant
+    assert (list(plant.rows), plant.input_rate_max) == (["a"], {"u": 2.0})
+    assert not plant.sensors.random
 
 
 def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:

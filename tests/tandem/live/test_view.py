@@ -18,7 +18,8 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
 from tandem.live import view
-from tandem.live.monitor import Monitor, Snapshot
+from tandem.live.monitor import Monitor
+from tandem.live.snapshot import Snapshot
 from tests.helpers.plants.integrator import INTEGRATOR
 
 CONFIG = Config()

@@ -23,7 +23,6 @@ from node_runtime.lifecycle import new_run_id
 from node_runtime.realtime import clock
 from protocol import codec, topics
 from protocol import messages as m
-from tandem.commander import commanding
 from tandem.live.processes import command_line
 from verification.faults.processes import link as links
 from verification.faults.processes.running import Event, Heard, Running
@@ -46,8 +45,6 @@ RESTART_S = 0.5
 READY_S = 60.0
 STOP_S = 8.0
 LOOK_S = 0.01
-LED_AGAIN_S = 0.25
-"""From one saying of a reference to the next."""
 LISTENING = "router listening on"
 
 Place = Literal["loopback", "veth", "wire"]
@@ -249,18 +246,6 @@ class Rig:
                 dead = [f"{p.name}:\n{p.said()[-800:]}" for p in self.processes.values() if not p.alive]
                 raise RigError(f"not within {timeout_s:g} s: {what}. {' '.join(dead)}")
             self.look()
-
-    def lead(self, reference: m.Reference) -> None:
-        """Say where the plant shall go, as a commander does: until the controller has taken it up."""
-        commander = self._stack.enter_context(commanding(self.config))
-        name = commander.run_id.encode()
-
-        def taken() -> bool:
-            commander.say(topics.REFERENCE, reference)
-            self.run_for(LED_AGAIN_S)
-            return any(name in one.payload for one in self.heard if one.topic == topics.RESULT.name)
-
-        self.wait(taken, READY_S, "the reference taken")
 
     # -- faults --------------------------------------------------------
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from lbmpc.plants import Description
 from plant_sim.hand import NO_LONGER
 from protocol import messages as m
+from tandem.operating.set_points import from_words
 from tandem.terminal import Refused
 
 LEASE_S, LEASE_PERIODS, LONGEST_LEASE_S = 1.0, 3.0, 60.0
@@ -88,24 +88,12 @@ class Follower:
 
 def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
     """`u=1.2` and so on, by input. Raises `Refused`."""
-    given: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
+    given = from_words(texts)
+    for name, value in given.items():
         if name not in plant.inputs:
             known = ", ".join(plant.inputs)
-            raise Refused(f"{text}: {plant.name} has no input {name!r}; it has {known}")
-        try:
-            given[name] = float(value)
-        except ValueError:
-            raise Refused(f"{text}: write {name}=VALUE, with a number") from None
-        if not math.isfinite(given[name]):
-            raise Refused(f"{text}: a finite number is needed")
+            raise Refused(f"{name}={value:g}: {plant.name} has no input {name!r}; it has {known}")
     return given
-
-
-def acting(state: m.PlantState) -> list[float] | None:
-    """The input that acts at a sample, (m,); None where that is not known."""
-    return state.pieces[-1].u if state.pieces else state.applied
 
 
 def completed(named: Mapping[str, float], plant: Description, acts: Sequence[float] | None) -> np.ndarray:
@@ -132,7 +120,7 @@ def clipped(u: np.ndarray, plant: Description) -> str:
 
 def line(state: m.PlantState, plant: Description, seconds: float) -> str:
     """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
-    x, acts = np.array(state.x), acting(state)
+    x, acts = np.array(state.x), state.acting
     room = -plant.beyond_x(x)
     least = int(np.argmin(room))
     u = "not known" if acts is None else figures(plant.inputs, acts)

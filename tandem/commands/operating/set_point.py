@@ -13,15 +13,9 @@ from tandem.commands.base import Configured
 from tandem.terminal import Refused
 
 if TYPE_CHECKING:
-    from node_runtime.config.sections import Config
     from protocol import messages as m
 
-AGAIN_S = 0.25
-"""Seconds from one asking to the next."""
-MOST_PERIODS = 3.0
-"""Of a slow loop, until it says what it made of a tick."""
 LONGEST = 1e6
-LONGEST_LEASE = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +39,18 @@ class SetPoint(Configured):
 
     def run(self) -> int:
         config, plant = self.resolve_with_plant()
+        from tandem.operating import set_points
+        from tandem.operating.hand_session import LONGEST_LEASE_S
+
         terminal.limited("--seconds", self.seconds, 0.1, 86_400.0)
         terminal.limited("--over", self.over, 0.0, LONGEST)
         if self.lease is not None:
-            terminal.limited("--for", self.lease, config.period, LONGEST_LEASE)
-        from tandem import set_points
-
+            terminal.limited("--for", self.lease, config.period, LONGEST_LEASE_S)
         asked = self._asked()
         where = str(self.file) if self.file is not None else " ".join(self.values)
         set_points.require_fit(asked, plant, config.period, where)
+        from tandem.operating.commander import ask
+
         results = ask(config, asked, self.seconds)
         if not results:
             text = f"no answer from a controller of {config.name} within {self.seconds:g} s"
@@ -69,7 +66,7 @@ class SetPoint(Configured):
 
     def _asked(self) -> m.Reference:
         from protocol import messages as m
-        from tandem import set_points
+        from tandem.operating import set_points
 
         if (bool(self.values), self.file is not None, self.configured).count(True) != 1:
             raise Refused("one of NAME=VALUE, --file and --configured is needed")
@@ -78,33 +75,6 @@ class SetPoint(Configured):
         if self.file is not None:
             return set_points.from_file(self.file, self.lease)
         return set_points.set_point(set_points.from_words(self.values), self.over, self.lease)
-
-
-def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickResult]:
-    """What the controller made of it: the result of the tick that latched it, and of the next; none: no answer.
-
-    A tick that was prepared in the time before it still aims where it aimed then.
-
-    Raises:
-        Refused: no router answers.
-        ConfigError: no link, and why.
-    """
-    from protocol import messages, topics
-    from tandem.commander import commanding
-
-    with commanding(config, topics.RESULT) as commander:
-        results: list[messages.TickResult] = []
-
-        def done(heard: messages.Message) -> bool:
-            if isinstance(heard, messages.TickResult) and (
-                results or heard.reference_from == commander.run_id
-            ):
-                results.append(heard)
-            return len(results) > 1
-
-        every = max(AGAIN_S, MOST_PERIODS * config.period)
-        commander.keep_saying(topics.REFERENCE, reference, every, max(seconds, every), done)
-        return results
 
 
 def answer(result: m.TickResult) -> dict[str, object]:

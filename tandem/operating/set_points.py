@@ -53,7 +53,9 @@ def from_words(words: Sequence[str]) -> dict[str, float]:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise Refused(f"{word}: write NAME=VALUE, each name once, as in y=1.8")
+            raise Refused(
+                f"{word}: write NAME=VALUE, with a number that is finite, each name once, as in y=1.8"
+            )
         values[name] = value
     return values
 

@@ -21,8 +21,16 @@ from protocol import messages as m
 from protocol.topics import Topic
 from tandem.terminal import Refused
 
+Word = m.Override | m.Reference
+TOPICS = {m.Override: topics.OVERRIDE, m.Reference: topics.REFERENCE}
 ROUTER_S = 5.0
 """Seconds in which a router answers."""
+AGAIN_S = 0.25
+"""Seconds from one asking to the next."""
+MOST_PERIODS = 3.0
+"""Of a slow loop, until it says what it made of a tick."""
+LAST_WORDS, APART_S = 3, 0.1
+"""How often what ends something is said, and how soon again: the control lane drops what finds no room."""
 
 
 class Commander:
@@ -43,15 +51,23 @@ class Commander:
         """By which others know who said it."""
         return self._bus.run_id
 
-    def say(self, topic: Topic, message: m.Message) -> None:
-        """Once; its run_id and seq are put in here."""
-        self._bus.publish(topic, msgspec.structs.replace(message, run_id=self.run_id, seq=self._seq))
+    def say(self, word: Word, again: bool = False) -> None:
+        """Once; its run_id and seq are put in here.
+
+        again: by the number of what was said last, for who must not take it for another word.
+        """
+        if again:
+            self._seq = max(0, self._seq - 1)
+        self._bus.publish(
+            TOPICS[type(word)], msgspec.structs.replace(word, run_id=self.run_id, seq=self._seq)
+        )
         self._seq += 1
 
-    def say_again(self, topic: Topic, message: m.Message) -> None:
-        """Once more, by the number of what was said last: for who must not take it for another word."""
-        self._seq = max(0, self._seq - 1)
-        self.say(topic, message)
+    def say_last(self, word: Word) -> None:
+        """What ends something: more than once, in little time."""
+        for i in range(LAST_WORDS):
+            self.say(word, again=i > 0)
+            clock.sleep_until(clock.now() + APART_S)
 
     def hear(self, seconds: float) -> m.Message | None:
         """The next of what it listens to; None: there was none for so long. What cannot be read is not heard."""
@@ -68,19 +84,22 @@ class Commander:
                 continue
         return None
 
+    def hear_until(self, done: Callable[[m.Message], bool], seconds: float) -> bool:
+        """Listen until it is done, which is asked of everything that is heard; False after so many seconds."""
+        until = clock.now() + seconds
+        while (left := until - clock.now()) > 0.0:
+            heard = self.hear(left)
+            if heard is not None and done(heard):
+                return True
+        return False
+
     def keep_saying(
-        self,
-        topic: Topic,
-        message: m.Message,
-        every: float,
-        seconds: float,
-        done: Callable[[m.Message], bool],
+        self, word: Word, every: float, seconds: float, done: Callable[[m.Message], bool]
     ) -> bool:
         """Say it every so often, in seconds, until it is done.
 
         Args:
-            topic: of the message.
-            message: what is said.
+            word: what is said.
             every: seconds from one time to the next.
             seconds: for how long; infinite: until it is interrupted.
             done: asked of everything that is heard meanwhile.
@@ -89,13 +108,10 @@ class Commander:
             Whether it was done; False after so many seconds.
         """
         until = clock.now() + seconds
-        while (now := clock.now()) < until:
-            self.say(topic, message)
-            due = min(now + every, until)
-            while (left := due - clock.now()) > 0.0:
-                heard = self.hear(left)
-                if heard is not None and done(heard):
-                    return True
+        while (left := until - clock.now()) > 0.0:
+            self.say(word)
+            if self.hear_until(done, min(every, left)):
+                return True
         return False
 
 
@@ -124,3 +140,25 @@ def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
         yield Commander(bus, heard)
     finally:
         bus.close()
+
+
+def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickResult]:
+    """What the controller made of it: the result of the tick that latched it, and of the next; none: no answer.
+
+    A tick that was prepared in the time before it still aims where it aimed then.
+
+    Raises:
+        Refused: no router answers.
+        ConfigError: no link, and why.
+    """
+    with commanding(config, topics.RESULT) as commander:
+        results: list[m.TickResult] = []
+
+        def done(heard: m.Message) -> bool:
+            if isinstance(heard, m.TickResult) and (results or heard.reference_from == commander.run_id):
+                results.append(heard)
+            return len(results) > 1
+
+        every = max(AGAIN_S, MOST_PERIODS * config.period)
+        commander.keep_saying(reference, every, max(seconds, every), done)
+        return results

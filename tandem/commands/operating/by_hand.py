@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from lbmpc.plants import Description
     from node_runtime.config.sections import Config
-    from protocol.messages import Override, Reference
-    from tandem.commander import Commander
-    from tandem.hand_session import Follower
+    from protocol.messages import Message
+    from tandem.operating.commander import Commander, Word
+    from tandem.operating.hand_session import Follower
 
 RENEWALS = 3
 """Of a lease: two may be lost."""
@@ -28,18 +28,16 @@ HEARD_S, HEARD_PERIODS = 2.0, 4.0
 HEALTH_S = 0.7
 """A little more than from one health to the next."""
 LOOK_S = 0.1
-LAST_WORDS = 3
-"""How often what ends something is said: the control lane drops what finds no room."""
 LONGEST_S = 1e8
 ENDED = 1
 
 
 @contextmanager
 def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
-    """A commander, and what Ctrl-C sets. Raises as `tandem.commander.commanding`."""
+    """A commander, and what Ctrl-C sets. Raises as `tandem.operating.commander.commanding`."""
     from node_runtime.lifecycle import stopped_by_signals
     from protocol import topics
-    from tandem.commander import commanding
+    from tandem.operating.commander import commanding
 
     heard = (
         *(topics.PLANT_STATE, topics.RESULT, topics.HEALTH["plant"]),
@@ -47,23 +45,6 @@ def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
     )
     with stopped_by_signals() as stopping, commanding(config, *heard) as commander:
         yield commander, stopping
-
-
-def say(commander: Commander, word: Override | Reference, again: bool = False) -> None:
-    """Once; again: by the number of what was said last."""
-    from protocol import messages, topics
-
-    topic = topics.OVERRIDE if isinstance(word, messages.Override) else topics.REFERENCE
-    (commander.say_again if again else commander.say)(topic, word)
-
-
-def say_last(commander: Commander, word: Override | Reference) -> None:
-    """What ends something: more than once, in little time."""
-    from node_runtime.realtime import clock
-
-    for i in range(LAST_WORDS):
-        say(commander, word, again=i > 0)
-        clock.sleep_until(clock.now() + LOOK_S)
 
 
 def patience(config: Config) -> float:
@@ -100,12 +81,12 @@ class ByHand(Configured):
         plant: Description,
         commander: Commander,
         stopping: threading.Event,
-        word: Override | Reference,
+        word: Word,
         follower: Follower,
     ) -> str:
         """Say it again and again until something ends it: why, or "" where the person did."""
         from node_runtime.realtime import clock
-        from tandem.hand_session import lease_of, line
+        from tandem.operating.hand_session import lease_of, line
 
         began = clock.now()
         every, limit = lease_of(config.period) / RENEWALS, patience(config)
@@ -114,7 +95,7 @@ class ByHand(Configured):
         while not stopping.is_set() and (now := clock.now()) < end:
             if now - said >= every:
                 # Number 0 begins it, and is said until it is taken; those behind it only renew.
-                say(commander, word, again=not follower.begun)
+                commander.say(word, again=not follower.begun)
                 follower.said()
                 said = now
             heard = commander.hear(min(said + every - now, end - now, LOOK_S))
@@ -130,13 +111,13 @@ class ByHand(Configured):
 
     def _reason(self, commander: Commander, follower: Follower, why: str) -> str:
         """As the plant says it, where it is the plant that ended it: in its next health."""
-        from node_runtime.realtime import clock
 
-        end = clock.now() + HEALTH_S
-        while follower.mine and not follower.told and (left := end - clock.now()) > 0.0:
-            heard = commander.hear(left)
-            if heard is not None:
-                follower.take(heard)
+        def told(heard: Message) -> bool:
+            follower.take(heard)
+            return bool(follower.told) or not follower.mine
+
+        if follower.mine and not follower.told:
+            commander.hear_until(told, HEALTH_S)
         return follower.told or why if follower.mine else why
 
     def _ended(self, why: str, what: str) -> int:
@@ -154,26 +135,34 @@ class Manual(ByHand):
     """u=1.2, in the plant's own units; inputs that are not named stay what they are."""
 
     def _check(self, plant: Description) -> None:
-        from tandem.hand_session import assignments
+        from tandem.operating.hand_session import assignments
 
         assignments(self.inputs, plant)
 
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
     ) -> int:
-        from node_runtime.realtime import clock
         from protocol.messages import Override
-        from tandem.hand_session import Follower, acting, assignments, clipped, completed, figures, lease_of
+        from tandem.operating.hand_session import (
+            Follower,
+            assignments,
+            clipped,
+            completed,
+            figures,
+            lease_of,
+        )
 
         named = assignments(self.inputs, plant)
-        follower, end = Follower(commander.run_id, Override), clock.now() + patience(config)
-        while follower.state is None and (left := end - clock.now()) > 0.0:
-            heard = commander.hear(left)
-            if heard is not None:
-                follower.take(heard)
+        follower = Follower(commander.run_id, Override)
+
+        def seen(heard: Message) -> bool:
+            follower.take(heard)
+            return follower.state is not None
+
+        commander.hear_until(seen, patience(config))
         if follower.state is None:
             raise terminal.Refused(f"no plant of {config.name} says anything at {config.bus.endpoint}")
-        u = completed(named, plant, acting(follower.state))
+        u = completed(named, plant, follower.state.acting)
         word = Override(
             run_id=commander.run_id, seq=0, mode="manual", u=u.tolist(), lease=lease_of(config.period)
         )
@@ -181,7 +170,7 @@ class Manual(ByHand):
         follower.told = ""
         why = self._stay(config, plant, commander, stopping, word, follower)
         if not (why and follower.begun):
-            say_last(commander, Override(run_id=commander.run_id, seq=0, mode="auto"))
+            commander.say_last(Override(run_id=commander.run_id, seq=0, mode="auto"))
         return self._ended(why, "by hand")
 
 
@@ -194,7 +183,7 @@ class Pause(ByHand):
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
     ) -> int:
         from protocol.messages import Reference
-        from tandem.hand_session import Follower, lease_of
+        from tandem.operating.hand_session import Follower, lease_of
 
         word = Reference(run_id=commander.run_id, seq=0, kind="hold", lease=lease_of(config.period))
         follower = Follower(commander.run_id, Reference)
@@ -202,7 +191,7 @@ class Pause(ByHand):
         why = self._stay(config, plant, commander, stopping, word, follower)
         # Where another has said where to go, that counts; who says `auto` leaves this to us.
         if not follower.elsewhere:
-            say_last(commander, Reference(run_id=commander.run_id, seq=0, kind="configured"))
+            commander.say_last(Reference(run_id=commander.run_id, seq=0, kind="configured"))
         return self._ended(why, "paused")
 
 
@@ -215,10 +204,10 @@ class Auto(Configured):
         config, _plant = self.resolve_with_plant()
         from node_runtime.realtime import clock
         from protocol.messages import Override
-        from tandem.hand_session import Follower
+        from tandem.operating.hand_session import Follower
 
         with on_the_bus(config) as (commander, stopping):
-            say_last(commander, Override(run_id=commander.run_id, seq=0, mode="auto"))
+            commander.say_last(Override(run_id=commander.run_id, seq=0, mode="auto"))
             follower, source = Follower(commander.run_id, Override), ""
             end = clock.now() + patience(config)
             while source in ("", "manual") and not stopping.is_set() and (left := end - clock.now()) > 0.0:

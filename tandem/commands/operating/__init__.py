@@ -1,0 +1,1 @@
+"""`tandem manual`, `tandem pause`, `tandem auto` and `tandem set-point`."""

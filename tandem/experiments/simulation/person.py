@@ -1,0 +1,78 @@
+"""What a person says in lock-step: where the plant shall go, and its input by hand.
+
+Each word is another's, so that none is taken for a repetition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+
+from plant_sim.hand import Hand
+from protocol import messages as m
+from tandem.operating.hand_session import lease_of
+
+COMMANDER = "commander-simulated"
+
+
+class Person:
+    """Says it at the right time.
+
+    Args:
+        period: of the loop, seconds.
+        set_points: where the plant shall go from the beginning of each episode on; None: as configured.
+    """
+
+    def __init__(self, period: float, set_points: m.Reference | None):
+        self._period = period
+        self._set_points = self._asked = set_points
+        self._references = self._intentions = 0
+        self.by_hand: m.Override | None = None
+        """What is said while the input acts by hand."""
+
+    def start_again(self) -> None:
+        """Another episode begins."""
+        self._asked = self._set_points or self._asked
+
+    def ask(self, reference: m.Reference) -> None:
+        """Where the plant shall go from the next period on."""
+        self._asked = reference
+
+    def reference(self) -> m.Reference | None:
+        """What is new since the last call; None: nothing."""
+        if self._asked is None:
+            return None
+        said = msgspec.structs.replace(self._asked, run_id=f"{COMMANDER}-{self._references}", seq=0)
+        self._asked, self._references = None, self._references + 1
+        return said
+
+    def manual(self, u: np.ndarray) -> m.Override:
+        """Begins to drive by u, (m,), plant units."""
+        lease = lease_of(self._period)
+        self.by_hand = m.Override(run_id=self._name(), seq=0, mode="manual", u=u.tolist(), lease=lease)
+        return self.by_hand
+
+    def auto(self) -> m.Override:
+        """Gives it back."""
+        self.by_hand = None
+        return m.Override(run_id=self._name(), seq=0, mode="auto")
+
+    def _name(self) -> str:
+        self._intentions += 1
+        return f"{COMMANDER}-hand-{self._intentions}"
+
+    def renewals(self, hand: Hand, t: float) -> Iterator[tuple[m.Override, float]]:
+        """What is said, and when, in time for the period from t on; what has ended is said no more.
+
+        The plant whose `hand` this is takes each before the next is asked for.
+        """
+        if self.by_hand is None:
+            return
+        if not hand.acts:
+            self.by_hand = None
+            return
+        while hand.until <= t + self._period:
+            self.by_hand = said = msgspec.structs.replace(self.by_hand, seq=self.by_hand.seq + 1)
+            yield said, hand.until - said.lease / 2.0
