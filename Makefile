@@ -17,7 +17,7 @@ setup: $(READY)  ## a virtual environment in .venv with everything in it
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-# Python compiles what it imports, when it does: one file in seven.
+# Python compiles a file when it is first imported, and only one in seven is.
 	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,experiment,examples,dev]'
 	@touch $(READY)
 
@@ -56,7 +56,7 @@ test: $(READY)  ## the tests; for some, .venv/bin/pytest PATH
 # Faults on real processes count every message: they run alone.
 	$(BIN)/pytest -m "live and not long" tests/verification
 
-test-long: $(READY)  ## those that take long for what make test shows in part: 3 minutes
+test-long: $(READY)  ## the tests that make test leaves out, since they take long: 3 minutes
 	$(BIN)/pytest -n auto -m long $(ARGS)
 
 compose-test: $(READY)  ## the containers for real; needs a Docker engine

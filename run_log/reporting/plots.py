@@ -134,7 +134,7 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     # A plant that starts again jumps, which is no motion.
     later = list(motion.starts[1:])
     t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
-    ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="true state")
+    ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="state")
     aims = _aim(data, ax, data.target_x[:, i], plant.x_e[i])
     if np.isfinite(data.reference[:, i]).any():
         r = data.reference[:, i]

@@ -53,7 +53,7 @@ class Simulate(Configured):
     set_points: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: the configured reference)")
     ] = None
-    """Where the plant shall go from the beginning of each episode on: a CSV file of times and states."""
+    """Set-points from the beginning of each episode on: a CSV file with the columns time and states."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
     """Write the run's log too, in the format of a live run."""
 

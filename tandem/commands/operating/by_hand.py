@@ -128,8 +128,8 @@ class ByHand(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Manual(ByHand):
-    """Drive a running plant's input by hand, until Ctrl-C or until the plant would leave X. The controller learns on,
-    and takes over then. With certificates it needs the commander's."""
+    """Drive a running plant's input by hand, until Ctrl-C or until the plant would leave X. The controller goes on
+    learning, and takes over then. With certificates it needs the commander's."""
 
     inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]
     """u=1.2, in the plant's own units; inputs that are not named stay what they are."""
@@ -176,8 +176,8 @@ class Manual(ByHand):
 
 @dataclass(frozen=True, kw_only=True)
 class Pause(ByHand):
-    """Hold a running plant where it is, as far as it can rest there, until Ctrl-C: its controller does it. With
-    certificates it needs the commander's."""
+    """Let the controller hold a running plant at the nearest rest to where it is, until Ctrl-C. With certificates it
+    needs the commander's."""
 
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event

@@ -1,4 +1,4 @@
-"""`tandem set-point`: where a running plant shall go. It asks the controller, and says what became of it."""
+"""`tandem set-point`: gives a running controller set-points, and prints its answer."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ LONGEST = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class SetPoint(Configured):
-    """Tell a running controller where outputs shall be. With certificates it needs the commander's."""
+    """Give a running controller set-points. With certificates it needs the commander's."""
 
     values: Annotated[Positional[list[str]], arg(metavar="NAME=VALUE...")] = field(default_factory=list)
-    """States and where they shall be, in the plant's own units: y=1.8."""
+    """States and their set-points, in the plant's own units: y=1.8."""
     over: Annotated[float, arg(metavar="S")] = 0.0
-    """Seconds in which a straight line leads there."""
+    """Seconds of a straight line from the present reference to the set-points."""
     lease: Annotated[
         float | None, arg(name="for", metavar="S", help_behavior_hint="(default: until another is given)")
     ] = None
-    """Seconds after which the configured reference is back."""
+    """Seconds after which the configured reference is back, 60 at most."""
     file: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
-    """A sequence instead: a CSV file with the columns time (seconds from now on) and states."""
+    """A sequence of set-points instead: a CSV file with the columns time (seconds from now) and states."""
     configured: bool = False
-    """Back to what the configuration says."""
+    """Go back to the reference of the configuration."""
     seconds: Annotated[float, arg(metavar="S")] = 3.0
     """How long to wait for the controller's answer."""
 
@@ -93,7 +93,7 @@ def words(result: m.TickResult) -> str:
     if not now:
         return f"taken in tick {result.seq}: plans lead to the equilibrium again"
     rest = {
-        "reached": "a rest of what has been learned",
+        "reached": "the plant can rest there",
         "nearest": f"out of reach: the nearest rest is off by {100.0 * (result.target_distance or 0.0):.3g} % of a "
         "half-width",
         "no rest": "no rest was found inside X and U",
