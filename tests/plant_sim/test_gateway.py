@@ -264,11 +264,11 @@ def test_a_machine_of_a_strangers_is_killed_and_comes_back() -> None:
             return run_id
 
         with Process("controller_node.node", config):
-            with Process("tests.helpers.rig", config) as rig:
+            with Process("tests.plant_sim.rig", config) as rig:
                 first = driven([])
                 rig.signal(signal.SIGKILL)
                 rig.end()
-            with Process("tests.helpers.rig", config) as rig:
+            with Process("tests.plant_sim.rig", config) as rig:
                 driven([first])
                 rig.signal(signal.SIGTERM)
                 assert rig.end() == 0

@@ -31,7 +31,7 @@ from run_log.reporting.report import picture, report
 from run_log.reporting.summary import PredictionError, summarise
 from run_log.reporting.traces import Traces, traces
 from run_log.run import gather
-from tests.helpers.run_log_samples import STEPS, Logged
+from tests.run_log.samples import STEPS, Logged
 
 PLANT = get_plant("moore_greitzer")
 

@@ -9,7 +9,7 @@ import pytest
 from node_runtime.config.sections import BusConfig, Config
 from node_runtime.router import open_router
 from tests.helpers.live import free_endpoint
-from tests.helpers.trainer_partner import TRAINING
+from tests.trainer_node.partner import TRAINING
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
 from protocol import topics
 from protocol.messages import Array, Health
-from tests.helpers.trainer_partner import DESCRIPTION, PATIENCE, Controller, RunningTrainer
+from tests.trainer_node.partner import DESCRIPTION, PATIENCE, Controller, RunningTrainer
 from trainer_node import node as trainer_module
 
 pytestmark = pytest.mark.live

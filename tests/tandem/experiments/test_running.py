@@ -22,8 +22,8 @@ from tandem.experiments.study.declaration import load
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
 from tandem.experiments.study.work import read, work
-from tests.helpers.experiments import PLANT, SMALL, cases
 from tests.helpers.paths import write_namesakes
+from tests.tandem.experiments.small import PLANT, SMALL, cases
 
 
 def run_small(path: Path, out: Path, processes: int) -> Finished:

@@ -18,7 +18,7 @@ from node_runtime.tls import credentials
 from protocol.messages import Health
 from tandem import certificate_authority
 from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
-from tests.helpers.trainer_partner import TRAINING, Controller
+from tests.trainer_node.partner import TRAINING, Controller
 from trainer_node.fleet.discovery import RouterPerPlant
 from trainer_node.main import main
 from trainer_node.node import TrainerNode
