@@ -29,7 +29,7 @@ from node_runtime.router import open_router
 from plant_sim import Gateway
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.imported import imported
+from tests.helpers.interpreter import imported
 from tests.helpers.live import (
     HANG_S,
     BusListener,
@@ -61,7 +61,7 @@ class Machine:
             self.go_on.wait(HANG_S)
         if self.fails == "read":
             raise OSError("no such device")
-        return self.x  # type: ignore[return-value]
+        return self.x
 
     def write(self, u: np.ndarray) -> None:
         if self.fails == "write":

@@ -35,7 +35,7 @@ class Cart:
     """Behind the rules, in virtual time; who commands it wants `commanded`."""
 
     def __init__(self, x0: tuple[float, float] = (0.0, 0.0), way_back: object = WAY_BACK):
-        self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)  # type: ignore[arg-type]
+        self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)
         self.motion = Motion(_Exactly(), np.array(x0), PERIOD)
         self.k = -1
         self.commanded: list[float] | None = [0.0, 0.0]
@@ -71,7 +71,7 @@ class _Exactly:
 
 def _command(seq: int, u: list[float]) -> m.Command:
     who = {"run_id": "controller-a", "seq": seq, "state_run_id": "plant-a", "state_seq": seq}
-    return m.Command(**who, period=PERIOD, mode="solver", u=u, plan=[u] * 3)  # type: ignore[arg-type]
+    return m.Command(**who, period=PERIOD, mode="solver", u=u, plan=[u] * 3)
 
 
 def test_it_acts_from_the_next_sample_on_and_when_it_is_given_back_the_newest_command() -> None:

@@ -31,7 +31,7 @@ X = np.array([0.05, 0.05, 0.0, 0.0])
 X_NEXT = np.array([0.052, 0.049, 0.01, 0.1])
 
 
-def seen(x: np.ndarray | None, sequence: int, applied: float | None = 0.1, **more) -> Observation:  # type: ignore[no-untyped-def]
+def seen(x: np.ndarray | None, sequence: int, applied: float | None = 0.1, **more) -> Observation:
     given = None if applied is None else np.array([applied])
     return Observation(x, given, more.get("source", 1), sequence, more.get("hidden"))
 

@@ -121,7 +121,7 @@ def test_two_inputs_outside_lead_least_far_out() -> None:
 def test_errors_of_measurement_lead_no_liar_out_of_the_sets(
     compressor: ClosedLoop, inputs: str, noise: float
 ) -> None:
-    found = [compressor.run(Case(inputs, noise), seed, 40) for seed in range(4)]  # type: ignore[arg-type]
+    found = [compressor.run(Case(inputs, noise), seed, 40) for seed in range(4)]
     assert [one.outside for one in found] == [0] * 4
     assert min(one.margin for one in found) > 1e-5
 

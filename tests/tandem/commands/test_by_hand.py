@@ -124,7 +124,7 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
         gateway.start()
         assert main(["manual", f"u={U + 0.01}", *far("operator")]) == 2
         assert "is the certificate of operator.jet1" in capsys.readouterr().err
-        certificate_authority.issue(keys / "brief", "commander.jet1", key, issued_by, seconds, [])  # type: ignore[arg-type]
+        certificate_authority.issue(keys / "brief", "commander.jet1", key, issued_by, seconds, [])
         done: list[int] = []
         session = threading.Thread(
             target=lambda: done.append(main(["manual", f"u={U + 0.02}", "--seconds", "5", *far("brief")]))
@@ -140,7 +140,7 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
 
 def state(seq: int, source: str = "command", run_id: str = "plant-1") -> m.PlantState:
     return m.PlantState(
-        run_id=run_id, seq=seq, t=0.0, x=PLANT.x_e.tolist(), applied=[U], source=source, command_seq=0  # type: ignore[arg-type]
+        run_id=run_id, seq=seq, t=0.0, x=PLANT.x_e.tolist(), applied=[U], source=source, command_seq=0
     )  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def begun() -> Follower:
 
 
 def word(mode: str, seq: int, run_id: str) -> m.Override:
-    return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])  # type: ignore[arg-type]
+    return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])
 
 
 def test_what_ends_a_session_by_hand() -> None:
@@ -197,9 +197,9 @@ def test_inputs_are_named_and_the_others_stay() -> None:
         with pytest.raises(Refused, match=says):
             assignments([text], quad)
     two = type("Two", (), {"inputs": ("a", "b")})
-    assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]  # type: ignore[arg-type]
+    assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]
     with pytest.raises(Refused, match="name a too"):
-        completed({"b": 3.0}, two, None)  # type: ignore[arg-type]
+        completed({"b": 3.0}, two, None)
 
 
 def test_what_the_gateway_clips_is_said() -> None:

@@ -66,7 +66,7 @@ def test_ctrl_c_loses_nothing_and_says_how_to_go_on(
 
     def counted(*arguments: object, **named: object):
         began.append("iterate")
-        return iterate(*arguments, **named)  # type: ignore[arg-type]
+        return iterate(*arguments, **named)
 
     monkeypatch.setattr(construction, "predecessor_iteration", counted)
     assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 0
