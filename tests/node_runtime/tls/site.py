@@ -6,13 +6,11 @@ import threading
 from pathlib import Path
 
 import zenoh
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from node_runtime.bus.session import session_config
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
 from node_runtime.tls import access_control, credentials
-from tandem import certificate_authority
 from tests.helpers.live import HANG_S, Process
 
 
@@ -58,14 +56,3 @@ class Site:
         return zenoh.open(
             session_config("client", self.remote, 5000, more=access_control.client_settings(own))
         )
-
-
-def issue(folder: Path, place: str, name: str, days: float) -> None:
-    """A certificate of jet1's authority that `tandem keys` would not make."""
-    authority = folder / "jet1" / "authority"
-    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
-    to = folder / "jet1" / place
-    to.mkdir(mode=0o700)
-    certificate_authority.issue(
-        to, name, key, credentials.load_certificate(authority / "certificate.pem"), days, []
-    )

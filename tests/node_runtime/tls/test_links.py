@@ -17,8 +17,9 @@ from node_runtime.tls import credentials
 from node_runtime.tls.client import refusal
 from protocol import topics
 from tandem import certificate_authority
+from tests.helpers.certificates import issue
 from tests.helpers.live import HANG_S, connected, free_endpoint, live_config, matched, wait_for
-from tests.node_runtime.tls.site import Site, issue
+from tests.node_runtime.tls.site import Site
 
 pytestmark = pytest.mark.live
 
@@ -197,7 +198,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
     site: Site, protocol: str, caplog: pytest.LogCaptureFixture
 ):
     place = f"short-{protocol}"
-    issue(site.folder, place, "trainer.jet1", 3.0 / 86400.0)
+    issue(site.folder / "jet1", place, "trainer.jet1", 3.0 / 86400.0)
     remote = free_endpoint().replace("tcp/", f"{protocol}/")
     local = override(site.local, [f'bus.remote="{remote}"', f'bus.endpoint="{free_endpoint()}"'])
     far = override(site.far("trainer", "jet1"), [f'bus.endpoint="{remote}"'])
