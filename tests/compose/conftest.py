@@ -12,7 +12,7 @@ from tests.compose.project import Project
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     outcome = yield
-    report = outcome.get_result()  # type: ignore[attr-defined]
+    report = outcome.get_result()
     if not report.failed:
         return
     for name, value in getattr(item, "funcargs", {}).items():

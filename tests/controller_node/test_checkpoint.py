@@ -107,7 +107,7 @@ def test_only_the_newest_samples_are_saved(tmp_path: Path) -> None:
                 wait_for(lambda: writer.wanted)
                 done = counted["checkpoints written"]
                 writer.offer(memory(seq))
-                wait_for(lambda done=done: counted["checkpoints written"] > done)  # type: ignore[misc]
+                wait_for(lambda done=done: counted["checkpoints written"] > done)
     saved = [codec.decode_as(m.Samples, payload) for payload in read(tmp_path / "memory", BELONGS).samples]
     assert [each.seq for one in saved for each in one.samples] == list(range(30, 60))
     assert {one.run_id for one in saved} == {"controller-b"}
@@ -181,7 +181,7 @@ def test_a_full_disk_is_warned_of_once_counted_and_leaves_the_old_file(
         for failures in range(3):
             wait_for(lambda: writer.wanted)
             writer.offer(memory(failures))
-            wait_for(lambda failures=failures: counted["checkpoints failed"] > failures)  # type: ignore[misc]
+            wait_for(lambda failures=failures: counted["checkpoints failed"] > failures)
         assert path.read_bytes() == before
         assert caplog.text.count("No space left on device") == 1
         full.clear()

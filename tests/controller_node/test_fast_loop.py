@@ -74,7 +74,7 @@ class Loop:
             self.bus.said.append(("prepare", None))
             prepare()
 
-        self.core.prepare = noted  # type: ignore[method-assign]
+        self.core.prepare = noted
         self.node = ControllerNode(
             self.core, cast(Bus, self.bus), cast(HealthPublisher, None), dict.fromkeys(COUNTS, 0)
         )

@@ -51,7 +51,7 @@ def test_no_label_spans_the_jump_and_the_next_is_right(run: tuple[LockStep, Run]
     assert [result.seq for result in ran.results if result.h is None] == [0, 1, JUMP]
     assert JUMP - 1 not in {sample.seq for sample in ran.samples}
     model, plant = loop.core.controller.model, loop.core.plant
-    before, after = (np.array(ran.ticks[k].state.x) - plant.x_e for k in (JUMP, JUMP + 1))  # type: ignore[union-attr]
+    before, after = (np.array(ran.ticks[k].state.x) - plant.x_e for k in (JUMP, JUMP + 1))
     state = ran.ticks[JUMP + 1].state
     assert state is not None
     pieces = [(piece.seconds, np.array(piece.u) - plant.u_e) for piece in state.pieces]

@@ -167,7 +167,11 @@ def test_keyframes_frame_the_run(run: Run) -> None:
 @pytest.mark.live
 def test_samples_come_in_batches_and_the_outbox_has_them_all(run: Run) -> None:
     batches = run.of(topics.SAMPLES)
-    assert [len(batch.samples) for batch in batches[:-1]] == [5] * (len(batches) - 1)
+    *sizes, last = (len(batch.samples) for batch in batches)
+    assert max(*sizes, last) == 5
+    # A smaller one goes out where the controller waits for its plant again; on a busy machine it may have to.
+    without_state = sum(tick.state_verdict != "fresh" for tick in run.of(topics.TICK))
+    assert sum(size < 5 for size in sizes) <= without_state // run.config.controller.horizon
     published = [one for batch in batches for one in batch.samples]
     assert run.outbox
     assert published[: len(run.outbox)] == run.outbox

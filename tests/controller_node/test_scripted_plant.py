@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 
 import msgspec
 import numpy as np
@@ -20,6 +21,7 @@ from protocol import messages as m
 from tests.helpers.live import HANG_S, BusListener, Process, health_of, live_config, matched, wait_for
 
 PLANT = get_plant("moore_greitzer")
+WAITING = health_of("controller", status="ready", note="no plant: waiting for its states")
 SETTINGS = ("controller.horizon=20", "controller.keyframe_every=20", "network.hidden=[8, 8]")
 
 
@@ -47,8 +49,8 @@ class Script:
         )
         return msgspec.structs.replace(good, **changes)
 
-    def send(self) -> m.PlantState:
-        state = self.state()
+    def send(self, **changes: object) -> m.PlantState:
+        state = self.state(**changes)
         self.seq += 1
         self.bus.publish(topics.PLANT_STATE, state)
         return state
@@ -66,48 +68,48 @@ class Script:
         self.bus.close()
 
 
+@contextmanager
+def beside_a_script(config: Config) -> Iterator[tuple[BusListener, Script, Process]]:
+    """A live controller whose plant the test plays; it waits for the first state. Ask it to end within the block."""
+    with open_router(config), Bus(config, "recorder", "recorder-a") as bus, closing(Script(config)) as script:
+        ear = BusListener(bus)
+        with Process("controller_node.node", config) as process:
+            ear.until(WAITING)
+            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
+            yield ear, script, process
+
+
 @pytest.mark.live
 def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
     config = live_config(*SETTINGS)
-    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = BusListener(bus)
-        script = Script(config)
-        with Process("controller_node.node", config) as process:
-            waiting = health_of("controller", status="ready", note="no plant: waiting for its states")
-            ear.until(waiting)
-            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
-            # Whoever comes first is followed.
-            good = [script.send().seq]
-            ear.until(lambda message: isinstance(message, m.Tick))
-            for _ in range(20):
-                script.period(config)
-                script.forge(script.state(run_id="plant-b"))
-                good.append(script.send().seq)
-                script.forge(b"junk")
-                script.forge(script.state(x=[float("nan")] * 4))
-                script.forge(script.state(x=[0.0]))
-                script.forge(script.state(seq=0))
-            wait_for(lambda: any(tick.seq >= 15 for tick in ear.of(topics.TICK)))
-            # Silence, then what piled up, all at once and old.
-            silent = clock.now()
-            ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "missing")
-            for k in range(3):
-                old = script.state(t=silent - 5.0 + k * config.period)
-                script.seq += 1
-                script.bus.publish(topics.PLANT_STATE, old)
-            ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "stale")
-            # The plan comes to its end, the controller waits, and goes on when the plant is back.
-            ear.until(waiting)
-            ticks_before = ear.of(topics.TICK)[-1].seq
-            again: list[int] = []
-            while all(
-                tick.seq <= ticks_before for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"
-            ):
-                script.period(config)
-                again.append(script.send().seq)
-            process.signal(signal.SIGTERM)
-            assert process.end() == 0
-        script.close()
+    with beside_a_script(config) as (ear, script, process):
+        # Whoever comes first is followed.
+        good = [script.send().seq]
+        ear.until(lambda message: isinstance(message, m.Tick))
+        for _ in range(20):
+            script.period(config)
+            script.forge(script.state(run_id="plant-b"))
+            good.append(script.send().seq)
+            script.forge(b"junk")
+            script.forge(script.state(x=[float("nan")] * 4))
+            script.forge(script.state(x=[0.0]))
+            script.forge(script.state(seq=0))
+        wait_for(lambda: any(tick.seq >= 15 for tick in ear.of(topics.TICK)))
+        # Silence, then what piled up, all at once and old.
+        silent = clock.now()
+        ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "missing")
+        for k in range(3):
+            script.send(t=silent - 5.0 + k * config.period)
+        ear.until(lambda message: isinstance(message, m.Tick) and message.state_verdict == "stale")
+        # The plan comes to its end, the controller waits, and goes on when the plant is back.
+        ear.until(WAITING)
+        ticks_before = ear.of(topics.TICK)[-1].seq
+        again: list[int] = []
+        while all(tick.seq <= ticks_before for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"):
+            script.period(config)
+            again.append(script.send().seq)
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0
     ticks: list[m.Tick] = ear.of(topics.TICK)
     assert [tick.seq for tick in ticks] == list(range(len(ticks)))
     assert {tick.state.run_id for tick in ticks if tick.state} == {"plant-a"}
@@ -128,29 +130,22 @@ def test_only_good_states_are_obeyed_and_an_outage_is_bridged() -> None:
 def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None:
     """The plant's clock has lost five seconds: no ticks without a state meanwhile, and control afterwards."""
     config = live_config(*SETTINGS)
-    with open_router(config), Bus(config, "recorder", "recorder-a") as bus:
-        ear = BusListener(bus)
-        script = Script(config)
+    with beside_a_script(config) as (ear, script, process):
 
         def played(behind: float, until: Callable[[], bool]) -> None:
             end = clock.now() + HANG_S
             while not until() and clock.now() < end:
                 script.period(config)
-                script.bus.publish(topics.PLANT_STATE, script.state(t=clock.now() - behind))
-                script.seq += 1
+                script.send(t=clock.now() - behind)
 
         def fresh() -> list[m.Tick]:
             return [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "fresh"]
 
-        with Process("controller_node.node", config) as process:
-            ear.until(health_of("controller", status="ready", note="no plant: waiting for its states"))
-            wait_for(lambda: matched(script.bus, topics.PLANT_STATE))
-            played(0.0, lambda: len(fresh()) > 10)
-            before = len(fresh())
-            played(5.0, lambda: len(fresh()) > before + 10)
-            process.signal(signal.SIGTERM)
-            assert process.end() == 0
-        script.close()
+        played(0.0, lambda: len(fresh()) > 10)
+        before = len(fresh())
+        played(5.0, lambda: len(fresh()) > before + 10)
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0
     notes = [health.note for health in ear.of(topics.HEALTH["controller"])]
     assert notes.count("no plant: its states come too late to act on") >= 1
     assert "taken for punctual" in process.said

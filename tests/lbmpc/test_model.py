@@ -135,7 +135,7 @@ def test_numbers_that_give_no_P_are_refused() -> None:
                 warnings.catch_warnings(action="ignore"),
                 pytest.raises(ModelError, match=f"'{terminal}' at .* take '{other}'"),
             ):
-                build_model(steep, 0.1, terminal=terminal)  # type: ignore[arg-type]
+                build_model(steep, 0.1, terminal=terminal)
 
 
 def test_without_poles_K_is_the_lqr_gain() -> None:

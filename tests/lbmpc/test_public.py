@@ -14,7 +14,7 @@ import pytest
 
 import lbmpc
 import tandem
-from tests.helpers.imported import imported
+from tests.helpers.interpreter import imported
 from tests.helpers.paths import DOCS
 
 

@@ -14,7 +14,7 @@ from network_model.description import NetworkDescription
 from network_model.operations import BOUNDED, Activation
 from network_model.registry import architecture_names, get_architecture
 from tandem.parity import parity
-from tests.helpers.imported import imported
+from tests.helpers.interpreter import imported
 from tests.helpers.science import function
 from tests.helpers.torch_network import h_hat_of
 from trainer_node.network import Network

@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers.live import free_endpoint
 from tests.helpers.plants.tanks import write_tanks
-from tests.helpers.wheel import build_wheel, copy_sources
+from tests.packaging.wheel import build_wheel, copy_sources
 
 PATIENCE_S = 600.0
 """A limit only ends a hang."""

@@ -10,7 +10,7 @@ import pytest
 from controller_node.certified_sets import read_sets
 from node_runtime.config.shipped import shipped
 from tests.helpers.paths import CONFIGS
-from tests.helpers.wheel import INSTALLED, build_wheel, copy_sources, unpacked_sdist
+from tests.packaging.wheel import INSTALLED, build_wheel, copy_sources, unpacked_sdist
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from node_runtime.router import open_router
 from plant_sim import Gateway
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.imported import imported
+from tests.helpers.interpreter import imported
 from tests.helpers.live import (
     HANG_S,
     BusListener,
@@ -61,7 +61,7 @@ class Machine:
             self.go_on.wait(HANG_S)
         if self.fails == "read":
             raise OSError("no such device")
-        return self.x  # type: ignore[return-value]
+        return self.x
 
     def write(self, u: np.ndarray) -> None:
         if self.fails == "write":
@@ -264,11 +264,11 @@ def test_a_machine_of_a_strangers_is_killed_and_comes_back() -> None:
             return run_id
 
         with Process("controller_node.node", config):
-            with Process("tests.helpers.rig", config) as rig:
+            with Process("tests.plant_sim.rig", config) as rig:
                 first = driven([])
                 rig.signal(signal.SIGKILL)
                 rig.end()
-            with Process("tests.helpers.rig", config) as rig:
+            with Process("tests.plant_sim.rig", config) as rig:
                 driven([first])
                 rig.signal(signal.SIGTERM)
                 assert rig.end() == 0

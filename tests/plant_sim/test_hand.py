@@ -11,10 +11,10 @@ from lbmpc.plants import Known
 from node_runtime.config.sections import Config
 from plant_sim.shield import Shield
 from plant_sim.simulator import Motion
-from plant_sim.way_back import way_back_of
+from plant_sim.way_back import WayBack, way_back_of
 from protocol import messages as m
+from tests.plant_sim.commands import PERIOD, planned
 
-PERIOD = 0.05
 CART = Known.from_matrices(
     [[0.0, 1.0], [0.0, 0.0]],
     [[0.0, 0.0], [1.0, 0.5]],
@@ -35,7 +35,7 @@ class Cart:
     """Behind the rules, in virtual time; who commands it wants `commanded`."""
 
     def __init__(self, x0: tuple[float, float] = (0.0, 0.0), way_back: object = WAY_BACK):
-        self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)  # type: ignore[arg-type]
+        self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)
         self.motion = Motion(_Exactly(), np.array(x0), PERIOD)
         self.k = -1
         self.commanded: list[float] | None = [0.0, 0.0]
@@ -51,7 +51,7 @@ class Cart:
             state = self.shield.sample(t, x)
             self.shield.renew(t, None if self.blind else x, self.motion)
             if self.commanded is not None:
-                self.shield.command(_command(self.k, self.commanded), t)
+                self.shield.command(planned(self.k, [self.commanded] * 3, self.k), t)
         return state
 
     def say(self, run_id: str, seq: int, u: float | None = 0.4, lease: float = 1.0) -> str:
@@ -69,9 +69,25 @@ class _Exactly:
         return np.array([x[0] + dt * x[1] + 0.5 * dt**2 * push, x[1] + dt * push])
 
 
-def _command(seq: int, u: list[float]) -> m.Command:
-    who = {"run_id": "controller-a", "seq": seq, "state_run_id": "plant-a", "state_seq": seq}
-    return m.Command(**who, period=PERIOD, mode="solver", u=u, plan=[u] * 3)  # type: ignore[arg-type]
+def _braking(x: np.ndarray) -> list[float]:
+    """What a controller does: to rest at the middle, within its range."""
+    wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))
+    return [wanted, wanted]
+
+
+def _ended(plant: Known, way_back: WayBack, u: float) -> np.ndarray:
+    """The state in which a hand on `u` is refused, from near an edge on."""
+    shield = Shield(plant, PERIOD, 1.25, "plant-a", True, way_back)
+    motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD, plant.dead_time, np.zeros(2))
+    for k in range(200):
+        t = k * PERIOD
+        shield.advance(t, motion)
+        x = motion.read(t)
+        shield.sample(t, x)
+        if shield.override(m.Override(run_id="a", seq=k, mode="manual", u=[u, 0.0]), t) == "ended":
+            return x
+        shield.renew(t, x, motion)
+    raise AssertionError("it is never ended")
 
 
 def test_it_acts_from_the_next_sample_on_and_when_it_is_given_back_the_newest_command() -> None:
@@ -245,21 +261,9 @@ def test_the_way_back_is_asked_of_numbers_that_are_none() -> None:
 
 
 def test_a_slow_actuator_needs_a_longer_way_back() -> None:
-    ends = []
-    for rate in (np.inf, 1.0):
-        slow = replace(CART, u_rate_max=[rate, rate])
-        shield = Shield(slow, PERIOD, 1.25, "plant-a", True, way_back_of(Config(rate=1.0 / PERIOD), slow))
-        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD)
-        for k in range(200):
-            shield.advance(k * PERIOD, motion)
-            x = motion.read(k * PERIOD)
-            shield.sample(k * PERIOD, x)
-            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.3, 0.0])
-            if shield.override(word, k * PERIOD) == "ended":
-                break
-            shield.renew(k * PERIOD, x, motion)
-        ends.append(float(x[0]))
-    assert ends[1] < ends[0] - 0.05
+    slow = replace(CART, u_rate_max=[1.0, 1.0])
+    of_slow = _ended(slow, way_back_of(Config(rate=1.0 / PERIOD), slow), 0.3)
+    assert of_slow[0] < _ended(CART, WAY_BACK, 0.3)[0] - 0.05
 
 
 def test_a_row_of_states_ends_it_by_name() -> None:
@@ -275,25 +279,8 @@ def test_a_row_of_states_ends_it_by_name() -> None:
     assert reasons[1].startswith("reach would leave X within")
 
 
-def _braking(x: np.ndarray) -> list[float]:
-    """What a controller does: to rest at the middle, within its range."""
-    wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))
-    return [wanted, wanted]
-
-
 def test_what_is_on_its_way_through_a_dead_time_counts() -> None:
     """At full speed towards the edge the way back is shorter by the way of two periods and a half."""
-    ends = []
-    for dead_time in (0.0, 2.5 * PERIOD):
-        shield = Shield(replace(CART, dead_time=dead_time), PERIOD, 1.25, "plant-a", True, WAY_BACK)
-        motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD, dead_time, np.zeros(2))
-        for k in range(200):
-            shield.advance(k * PERIOD, motion)
-            x = motion.read(k * PERIOD)
-            shield.sample(k * PERIOD, x)
-            word = m.Override(run_id="a", seq=k, mode="manual", u=[0.2, 0.0])
-            if shield.override(word, k * PERIOD) == "ended":
-                break
-            shield.renew(k * PERIOD, x, motion)
-        ends.append(float(x[0] + dead_time * x[1]))
-    assert ends[0] == pytest.approx(ends[1], abs=0.05)
+    late = 2.5 * PERIOD
+    with_it, without = (_ended(replace(CART, dead_time=seconds), WAY_BACK, 0.2) for seconds in (late, 0.0))
+    assert without[0] == pytest.approx(with_it[0] + late * with_it[1], abs=0.05)

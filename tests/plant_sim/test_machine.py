@@ -21,7 +21,7 @@ def guarded(
     period: float = 10.0,
     simulated: bool = False,
 ) -> Guarded:
-    return Guarded(read, write, 2, period, simulated)  # type: ignore[arg-type]
+    return Guarded(read, write, 2, period, simulated)
 
 
 def raising(error: BaseException) -> Callable[..., None]:

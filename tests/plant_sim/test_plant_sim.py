@@ -17,7 +17,7 @@ from plant_sim import node
 from plant_sim.orders import Orders, Standby
 from plant_sim.simulator import Motion, PlantSim
 from protocol import messages as m
-from tests.helpers.commands import PERIOD, PLANT, U, command
+from tests.plant_sim.commands import PERIOD, PLANT, U, command
 
 
 def backup(

@@ -13,8 +13,8 @@ from node_runtime.router import open_router
 from plant_sim import node
 from protocol import messages as m
 from protocol import topics
-from tests.helpers.commands import PLANT, U, command
 from tests.helpers.live import BusListener, Process, health_of, live_config, matched, wait_for
+from tests.plant_sim.commands import PLANT, U, command
 
 
 @pytest.mark.live

@@ -13,7 +13,8 @@ from node_runtime.config.sections import Config
 from plant_sim.shield import Shield
 from plant_sim.way_back import way_back_of
 from protocol import messages as m
-from tests.plant_sim.test_shield import PERIOD, PLANT, Bench, U
+from tests.plant_sim.commands import PERIOD, PLANT, U, planned
+from tests.plant_sim.test_shield import Bench
 
 RATE = 2.0
 STEP = RATE * PERIOD
@@ -35,17 +36,17 @@ def largest_within_a_period(writes: list[tuple[float, float]]) -> float:
 def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
     """Commands early, late, in bursts and none at all; backup policies; a feedback as the safe input; failed writes."""
     rng, bench = np.random.default_rng(seed), Bench(u_rate_max=[RATE])
-    applied, seq, silent = [], 0, 0
+    applied, sources, silent = [], set(), 0
     for k in range(80):
         bench.x = PLANT.x_e + rng.uniform(-0.3, 0.3, 4) * PLANT.x_scale
         bench.fails = seed % 3 == 0 and rng.random() < 0.1
         state = bench.sampled(k)
+        sources.add(state.source)
         applied.append(np.nan if state.applied is None else state.applied[0])
         silent = silent - 1 if silent else int(rng.integers(1, 12)) * int(rng.random() < 0.15)
         for at in np.sort(rng.uniform(k + 0.05, k + 0.95, 0 if silent else int(rng.integers(1, 4)))):
             bench.act_until(at * PERIOD)
             bench.command(k, at, float(rng.uniform(*PLANT.u_min, *PLANT.u_max)))
-            seq += 1
         if not silent and rng.random() < 0.5:
             bench.backup(k, rng.uniform(PLANT.u_min[0], PLANT.u_max[0], 5).tolist(), gain=0.5)
         bench.act_until((k + 1) * PERIOD)
@@ -55,7 +56,7 @@ def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
         assert np.nanmax(differences) <= STEP * (1 + 1e-5)
         assert np.nanmax(differences) > 0.9 * STEP
     assert all(PLANT.u_min[0] <= u <= PLANT.u_max[0] for _t, u in bench.writes)
-    assert {"command", "plan", "safe"} >= {bench.sampled(k).source for k in (80,)}
+    assert sources == {"command", "plan", "safe"}
 
 
 def test_a_command_that_comes_early_waits_and_loses_nothing() -> None:
@@ -136,17 +137,7 @@ def test_rows_of_inputs_hold_whoever_acts_and_with_them_the_rates(seed: int) -> 
         for at in np.sort(rng.uniform(0.1, 0.9, int(rng.integers(0, 4)))) if k % 10 < 5 else ():
             shield.advance(t + at * PERIOD, machine)
             plan = rng.uniform(-2.0, 2.0, (3, 2)).tolist()
-            command = m.Command(
-                run_id="c",
-                seq=k,
-                state_run_id="plant-a",
-                state_seq=k,
-                period=PERIOD,
-                mode="solver",
-                u=plan[0],
-                plan=plan,
-            )
-            assert shield.command(command, t + at * PERIOD) == "ok"
+            assert shield.command(planned(k, plan, k), t + at * PERIOD) == "ok"
     times, inputs = np.array([t for t, _u in machine.writes]), np.array([u for _t, u in machine.writes])
     assert (limited.input_rows.beyond(inputs) <= 0.0).all()
     assert (np.abs(inputs) <= 1.0).all()

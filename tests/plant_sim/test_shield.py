@@ -9,14 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lbmpc.plants import Plant, get_plant
 from plant_sim.shield import MOST_ACTED, Shield
 from protocol import messages as m
+from tests.plant_sim.commands import PERIOD, PLANT, U, planned
 
-PLANT = get_plant("moore_greitzer")
-assert isinstance(PLANT, Plant)
-PERIOD = 0.05
-U = float(PLANT.u_e[0])
 AWAY = PLANT.x_e + np.array([0.1, 0.0, 0.0, 0.0])
 
 
@@ -61,19 +57,7 @@ class Bench:
     def sent(self, seq: int, at: float, u: float, plan: int) -> str:
         """A command for sample `seq` that arrives at that many periods; its plan is u + 0.01, u + 0.02 and so on."""
         entries = [[u + 0.01 * i] for i in range(1 + plan)]
-        return self.shield.command(
-            m.Command(
-                run_id="controller-a",
-                seq=seq,
-                state_run_id="plant-a",
-                state_seq=seq,
-                period=PERIOD,
-                mode="solver",
-                u=[u],
-                plan=entries,
-            ),
-            at * PERIOD,
-        )
+        return self.shield.command(planned(seq, entries, seq), at * PERIOD)
 
     def backup(self, seq: int, inputs: list[float], gain: float = 0.0) -> str:
         return self.shield.backup(

@@ -8,7 +8,7 @@ import pytest
 
 from node_runtime.config.loading import override
 from node_runtime.config.sections import Config
-from tests.helpers.run_log_samples import STEPS, Logged, synthetic, write
+from tests.run_log.samples import STEPS, Logged, synthetic, write
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from run_log.file_format import FORMAT, IDENTITY, PROFILE, VERSIONS
 from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
 from tests.helpers.paths import CONFIGS
-from tests.helpers.run_log_samples import synthetic, write
+from tests.run_log.samples import synthetic, write
 
 
 def log_of(path: Path, library: str) -> Path:

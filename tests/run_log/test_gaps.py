@@ -22,7 +22,7 @@ from run_log.reporting.summary import summarise
 from run_log.run import gather
 from run_log.writing.writer import LogWriter
 from tests.helpers.live import HANG_S, Process, live_config, matched, wait_for
-from tests.helpers.run_log_samples import RUN, synthetic
+from tests.run_log.samples import RUN, synthetic
 
 LEASE_S = 0.3
 

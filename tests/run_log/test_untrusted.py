@@ -33,7 +33,7 @@ from run_log.reporting.summary import summarise
 from run_log.run import gather
 from run_log.writing.writer import LogWriter
 from tests.helpers.paths import ROOT
-from tests.helpers.run_log_samples import synthetic, write
+from tests.run_log.samples import synthetic, write
 
 MEMORY = 3 * 1024**3
 """Bytes of address space in which a command must say that it does not read a log."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +15,7 @@ from node_runtime.config.loading import to_tree
 from node_runtime.config.plant import spelt_out
 from node_runtime.config.sections import Config
 from tandem.cli import main
+from tests.helpers.interpreter import imported, python
 
 COMMANDS = (
     *("run", "simulate", "replay", "report", "recover", "router", "controller", "trainer", "plant", "record"),
@@ -62,18 +62,11 @@ KEYS = {
     ),
     "log",
 }
-HEAVY = ("torch", "casadi", "matplotlib", "zenoh", "numpy", "mcap")
+HEAVY = {"torch", "casadi", "matplotlib", "zenoh", "numpy", "mcap"}
 
 
 def tandem(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tandem", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=cwd,
-        check=False,
-    )
+    return python("-m", "tandem", *arguments, cwd=cwd)
 
 
 def called(*arguments: str) -> int:
@@ -105,19 +98,14 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 
 
 def test_help_loads_nothing_heavy():
-    program = f"""
-import sys
+    code = """
 from tandem.cli import main
 try:
     main(["run", "--help"])
 except SystemExit:
     pass
-sys.exit([name for name in {HEAVY} if name in sys.modules] or 0)
 """
-    shown = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert shown.returncode == 0, shown.stderr
+    assert not imported(code) & HEAVY
 
 
 @pytest.mark.parametrize(
@@ -313,14 +301,7 @@ sys.exit(main(sys.argv[2:]))
     ],
 )
 def test_a_package_that_is_missing_names_the_extra(package: str, command: str, extras: str, tmp_path: Path):
-    shown = subprocess.run(
-        [sys.executable, "-c", WITHOUT, package, *command.split()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=tmp_path,
-        check=False,
-    )
+    shown = python("-c", WITHOUT, package, *command.split(), cwd=tmp_path)
     assert shown.returncode == 2, shown.stderr
     assert shown.stderr.count("tandem: ") == 1
     assert shown.stderr.endswith(f"this command needs {package}: pip install 'tandem-control[{extras}]'\n")
@@ -328,12 +309,6 @@ def test_a_package_that_is_missing_names_the_extra(package: str, command: str, e
 
 
 def test_without_extras_a_linear_run_needs_no_torch(tmp_path: Path):
-    shown = subprocess.run(
-        [sys.executable, "-c", WITHOUT, "torch", *["simulate", "--steps", "2", "--oracle", "linear"]],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=tmp_path,
-        check=False,
-    )
+    linear = ("simulate", "--steps", "2", "--oracle", "linear")
+    shown = python("-c", WITHOUT, "torch", *linear, cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr

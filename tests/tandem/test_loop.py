@@ -19,7 +19,7 @@ from run_log.replaying.replay import replay
 from run_log.run import Run, equations_of, true_plant_of
 from tandem import Loop
 from tandem.experiments.simulation.lockstep import simulate
-from tests.helpers.imported import imported
+from tests.helpers.interpreter import imported
 from tests.helpers.paths import DOCS
 
 PAGE = DOCS / "python.md"

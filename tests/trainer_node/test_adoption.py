@@ -11,7 +11,7 @@ from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.sections import Config
 from protocol import topics
 from protocol.messages import Array, Health
-from tests.helpers.trainer_partner import DESCRIPTION, PATIENCE, Controller, RunningTrainer
+from tests.trainer_node.partner import DESCRIPTION, PATIENCE, Controller, RunningTrainer
 from trainer_node import node as trainer_module
 
 pytestmark = pytest.mark.live
@@ -38,10 +38,10 @@ def test_after_every_refusal_training_goes_on_from_what_is_in_use(
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         for refused in range(1, 4):
             controller.adopts = False
-            controller.until(lambda h, n=refused: h.counters["not adopted"] >= n, tick=True)  # type: ignore[misc]
+            controller.until(lambda h, n=refused: h.counters["not adopted"] >= n, tick=True)
             controller.adopts = True
             done = len(controller.adopted)
-            health = controller.until(lambda _, n=done: len(controller.adopted) > n, tick=True)  # type: ignore[misc]
+            health = controller.until(lambda _, n=done: len(controller.adopted) > n, tick=True)
         bases = [hash_layers(initial_hidden(DESCRIPTION, np.random.default_rng(0)))]
         bases += [weights.sha256 for weights in controller.adopted]
         assert [weights.base_sha256 for weights in controller.adopted] == bases[:-1]

@@ -15,7 +15,7 @@ from node_runtime.bus.zenoh_bus import session_config
 from node_runtime.config.sections import Config
 from protocol import topics
 from protocol.messages import Array, OutputWeights, Sample, Samples
-from tests.helpers.trainer_partner import Controller, RunningTrainer, holds, joined
+from tests.trainer_node.partner import Controller, RunningTrainer, holds, joined
 
 pytestmark = pytest.mark.live
 

@@ -8,7 +8,7 @@ import pytest
 
 from network_model.description import hash_layers
 from node_runtime.config.sections import Config
-from tests.helpers.trainer_partner import DESCRIPTION, Controller, RunningTrainer, holds, joined
+from tests.trainer_node.partner import DESCRIPTION, Controller, RunningTrainer, holds, joined
 from trainer_node import node as trainer_module
 
 pytestmark = pytest.mark.live

@@ -13,7 +13,7 @@ import pytest
 from node_runtime.config.loading import to_json
 from node_runtime.config.sections import BusConfig, Config
 from tests.helpers.live import PROGRAM
-from tests.helpers.trainer_partner import PATIENCE, TRAINING, Controller, holds
+from tests.trainer_node.partner import PATIENCE, TRAINING, Controller, holds
 from trainer_node.main import main
 
 pytestmark = pytest.mark.live

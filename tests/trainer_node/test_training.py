@@ -13,71 +13,16 @@ import numpy as np
 import pytest
 import torch
 
-from network_model.description import NetworkDescription, hash_layers, initial_hidden
+from network_model.description import hash_layers, initial_hidden
 from node_runtime.config.sections import TrainerConfig
-from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
+from protocol.messages import HiddenWeights
 from tests.helpers.paths import ROOT
 from tests.helpers.torch_network import h_hat_of
-from trainer_node import training
+from tests.trainer_node.problem import CONFIG, DESCRIPTION, HIDDEN, K, make, output, samples, trained
 from trainer_node.network import DenseLoss, Network
-from trainer_node.pace import Worth
 from trainer_node.training import Trainer, TrainerError, pick_device
 
-DESCRIPTION = NetworkDescription(
-    states=4,
-    inputs=1,
-    hidden=[32, 32],
-    activations=["tanh", "tanh"],
-    input_scale=[0.5, 0.5, 1.0, 20.0, 1.0],
-    output_scale=[0.01, 0.01, 0.02, 0.01],
-)
-CONFIG = TrainerConfig(capacity=600, batch=256, device="cpu")
-HIDDEN = initial_hidden(DESCRIPTION, np.random.default_rng(0))
-K = np.random.default_rng(1).normal(size=(DESCRIPTION.features, 4)) * 0.1
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Any:
-    before = torch.get_num_threads()
-    training.use_one_thread()
-    yield
-    torch.set_num_threads(before)
-
-
-def samples(first: int, number: int, seed: int = 2) -> list[Sample]:
-    """Samples of a smooth h of the size that the compressor's has."""
-    rng = np.random.default_rng([seed, first])
-    found = []
-    for seq in range(first, first + number):
-        v = rng.uniform(-1, 1, 5)
-        x, u = v[:4] * DESCRIPTION.input_scale[:4], v[4:] * DESCRIPTION.input_scale[4:]
-        h = np.array([-0.01 * v[0] ** 2, 0.01 * v[1] * v[4], 1e-5 * v[2], 0.0])
-        found.append(Sample(seq=seq, x=x.tolist(), u=u.tolist(), h=h.tolist()))
-    return found
-
-
-def output(
-    trainer: Trainer, seq: int = 40, weights: np.ndarray = K, sha256: str | None = None
-) -> OutputWeights:
-    return OutputWeights(
-        run_id="controller-1",
-        seq=seq,
-        hidden_version=0,
-        hidden_sha256=trainer.sha256 if sha256 is None else sha256,
-        K=Array.of(weights),
-    )
-
-
-def make(config: TrainerConfig = CONFIG, number: int = 300, **changes: Any) -> Trainer:
-    trainer = Trainer(DESCRIPTION, msgspec.structs.replace(config, **changes), 5, "trainer-1", HIDDEN)
-    trainer.add("controller-1", samples(0, number))
-    return trainer
-
-
-def trained(trainer: Trainer, seq: int = 40) -> HiddenWeights:
-    weights = trainer.train(output(trainer, seq), "controller-1")
-    assert weights is not None, trainer.counters
-    return weights
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def losses(weights: list[np.ndarray]) -> float:
@@ -140,8 +85,8 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(strategy: Any) -> None
 def test_another_process_trains_the_same_bits() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "import tests.trainer_node.test_training as t\n"
-        "t.training.use_one_thread()\n"
+        "import tests.trainer_node.problem as t, trainer_node.training\n"
+        "trainer_node.training.use_one_thread()\n"
         "sys.stdout.write(t.trained(t.make()).sha256)"
     )
     found = subprocess.run(
@@ -302,163 +247,3 @@ def test_a_training_is_quick() -> None:
         trained(trainer)
         taken.append(time.thread_time() - start)
     assert min(taken) < 0.3, taken
-
-
-def noisy(number: int, deviation: float, share: float = 1.0) -> list[Sample]:
-    """The samples of a smooth h, `share` of it, whose labels err by so much of the output scale."""
-    rng, scale = np.random.default_rng(8), np.array(DESCRIPTION.output_scale)
-    variance = ((deviation * scale) ** 2).tolist()
-    return [
-        msgspec.structs.replace(
-            sample,
-            h=(share * np.array(sample.h) + deviation * scale * rng.normal(size=4)).tolist(),
-            variance=variance,
-        )
-        for sample in samples(0, number)
-    ]
-
-
-def trained_on(labels: list[Sample], weights: np.ndarray) -> tuple[Trainer, HiddenWeights | None]:
-    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
-    trainer.add("controller-1", labels)
-    return trainer, trainer.train(output(trainer, weights=weights), "controller-1")
-
-
-def test_noise_is_not_trained_on_and_an_h_that_exceeds_it_is() -> None:
-    still = np.zeros_like(K)
-    still[1:] = 0.05 * np.random.default_rng(1).normal(size=K[1:].shape)
-    trainer, found = trained_on(noisy(80, 1.0, share=0.0), still)
-    assert found is None
-    assert trainer.counters["kept: loss not lower"] == 1
-    # The same numbers, and nobody says that they are noise: they are fitted.
-    exact = [msgspec.structs.replace(sample, variance=[]) for sample in noisy(80, 1.0, share=0.0)]
-    _, fitted = trained_on(exact, still)
-    assert fitted is not None
-    assert fitted.loss_after < 0.99 * fitted.loss_before
-    _, learned = trained_on(noisy(300, 0.1), K)
-    assert learned is not None
-    assert learned.loss_after < 0.9 * learned.loss_before
-
-
-def test_what_is_held_out_says_where_to_stop() -> None:
-    """The loss in the message is that of the layers that are sent, on samples that they were not trained on."""
-    _, learned = trained_on(noisy(60, 0.3), K)
-    assert learned is not None
-    assert learned.samples == 45
-    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
-    trainer.add("controller-1", noisy(60, 0.3))
-    draw = trainer.begin(output(trainer), "controller-1")
-    assert draw is not None
-    assert draw.problem.held_out is not None
-    window, _ = draw.problem.held_out
-    network = Network(DESCRIPTION)
-    network.load([layer.numpy().astype(float) for layer in learned.layers])
-    h_hat = h_hat_of(network, network.tensor(window), network.tensor(K)).numpy(force=True)
-    labels = {tuple(sample.x + sample.u): sample.h for sample in noisy(60, 0.3)}
-    error = (h_hat - [labels[tuple(row)] for row in window]) / DESCRIPTION.output_scale
-    # As a share of the labels' variance.
-    np.testing.assert_allclose(learned.loss_after, np.mean((error / 0.3) ** 2), rtol=1e-4)
-
-
-def test_of_a_few_steps_the_last_one_counts_too() -> None:
-    trainer = Trainer(DESCRIPTION, msgspec.structs.replace(CONFIG, steps=7), 5, "trainer-1", HIDDEN)
-    trainer.add("controller-1", noisy(300, 0.01))
-    learned = trainer.train(output(trainer), "controller-1")
-    assert learned is not None
-    assert learned.loss_after < learned.loss_before
-
-
-def test_the_newest_samples_say_whether_labels_are_noisy_and_a_bad_one_says_nothing() -> None:
-    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
-
-    def holds_out() -> bool:
-        draw = trainer.begin(output(trainer), "controller-1")
-        assert draw is not None
-        return draw.problem.held_out is not None
-
-    trainer.add("controller-1", samples(0, 40))
-    (bad,) = noisy(1, 1.0)
-    trainer.add("controller-1", [msgspec.structs.replace(bad, seq=90, h=[float("nan")] * 4)])
-    assert trainer.counters["bad samples"] == 1
-    assert not holds_out()
-    trainer.add("controller-1", [msgspec.structs.replace(bad, seq=91)])
-    assert holds_out()
-    trainer.add("controller-2", samples(100, 1))
-    assert not holds_out()
-
-
-@pytest.mark.parametrize("variance", [[-1.0] * 4, [float("nan")] * 4, [1.0], [1e306] * 4])
-def test_a_variance_that_is_none_is_a_bad_sample(variance: list[float]) -> None:
-    trainer = make(number=30)
-    (bad,) = samples(50, 1)
-    assert trainer.add("controller-1", [msgspec.structs.replace(bad, variance=variance)]) == 0
-    assert trainer.counters["bad samples"] == 1
-
-
-def test_a_set_says_the_newest_sample_that_it_was_trained_on_where_labels_are_noisy() -> None:
-    trainer, learned = trained_on(noisy(300, 0.1), K)
-    assert learned is not None
-    assert learned.newest == 299
-    trainer.add("controller-2", noisy(10, 0.1))
-    again = trainer.train(output(trainer), "controller-2")
-    assert again is None or again.newest == 9
-    exact = trained(make())
-    assert exact.newest is msgspec.UNSET
-    assert b"newest" not in msgspec.msgpack.encode(exact)
-
-
-def test_a_state_that_nobody_measures_does_not_keep_others_from_being_learned() -> None:
-    scale = np.array(DESCRIPTION.output_scale)
-    blind = [
-        msgspec.structs.replace(
-            sample,
-            h=(np.array(sample.h) + np.array([0.0, 0.0, 0.0, 30.0]) * scale * (-1) ** sample.seq).tolist(),
-            variance=[*sample.variance[:3], float(1e3 * scale[3] ** 2)],
-        )
-        for sample in noisy(300, 0.1)
-    ]
-    _, learned = trained_on(blind, K)
-    assert learned is not None
-    assert learned.loss_after < 0.9 * learned.loss_before
-
-
-def trainings(trainer: Trainer, first: int, number: int, share: float) -> list[int]:
-    """The samples, all of them labels of `share` h with as much noise as h, at which a training began."""
-    began = []
-    rng, scale = np.random.default_rng(first), np.array(DESCRIPTION.output_scale)
-    for sample in samples(first, number):
-        h = share * np.array(sample.h) + 0.3 * scale * rng.normal(size=4)
-        noise = ((0.3 * scale) ** 2).tolist()
-        trainer.add("controller-1", [msgspec.structs.replace(sample, h=h.tolist(), variance=noise)])
-        if trainer.due(output(trainer, weights=np.zeros_like(K))):
-            trainer.train(output(trainer, weights=np.zeros_like(K)), "controller-1")
-            began.append(sample.seq)
-    return began
-
-
-def test_it_trains_less_where_there_is_nothing_to_gain_and_at_once_where_h_changes() -> None:
-    trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
-    # K = 0: no hidden layers predict anything.
-    calm = np.diff(trainings(trainer, 0, 600, share=0.0))
-    assert list(calm[:3]) == [40, 80, 150]
-    # A quarter of the buffer, at most.
-    assert set(calm[2:]) == {150}
-    assert trainer.worth == Worth(0.0, pays=False)
-    assert str(trainer.worth) == "training has nothing to gain (0.0% of the labels' variance)"
-    risen = trainings(trainer, 600, 40, share=3.0)
-    assert risen[0] < 625
-    # Of another controller's layers nothing is known.
-    trainer.resume(HIDDEN)
-    assert trainings(trainer, 700, 30, share=0.0)[0] <= 709
-
-
-def test_labels_without_a_variance_are_trained_on_as_often_as_ever() -> None:
-    trainer = make(number=0)
-    began = []
-    for sample in samples(0, 100):
-        trainer.add("controller-1", [msgspec.structs.replace(sample, h=[0.0] * 4)])
-        if trainer.due(output(trainer, weights=np.zeros_like(K))):
-            trainer.train(output(trainer, weights=np.zeros_like(K)), "controller-1")
-            began.append(sample.seq)
-    assert began == list(range(19, 100, 10))
-    assert trainer.worth is None

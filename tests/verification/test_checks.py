@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.live import stalls
 from protocol import messages as m
-from tests.helpers.faults import CALM, sampled, seen
+from tests.verification.calm import CALM, sampled, seen
 from verification.faults import evaluation as measured
 from verification.faults import holds
 from verification.faults.catalogue import ALL

@@ -14,9 +14,9 @@ from benchmarks.document_block import DocumentError
 from lbmpc.plants import get_plant
 from protocol import codec, topics
 from protocol import messages as m
-from tests.helpers.faults import CALM, seen
 from tests.helpers.live import HANG_S, wait_for
 from tests.helpers.paths import ROOT
+from tests.verification.calm import CALM, seen
 from verification.faults import holds, suite, table
 from verification.faults.catalogue import ALL, BY_NAME, Fault, Stage
 from verification.faults.facts import Facts

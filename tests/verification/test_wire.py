@@ -15,8 +15,8 @@ from node_runtime.config.loading import override, to_json
 from node_runtime.realtime import clock
 from protocol import messages as m
 from protocol import topics
-from tests.helpers.faults import sampled
 from tests.helpers.live import Process, live_config, matched, wait_for
+from tests.verification.calm import sampled
 from verification.faults.processes import link
 
 ECHO = """

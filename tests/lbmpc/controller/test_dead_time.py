@@ -281,7 +281,7 @@ def test_what_cannot_be_with_a_dead_time_is_refused_by_name() -> None:
         model(3.0)
     for wrong in (-0.1, math.inf, math.nan, "soon"):
         with pytest.raises(PlantDefinitionError, match="dead_time"):
-            linear_plant(np.random.default_rng(0), wrong)  # type: ignore[arg-type]
+            linear_plant(np.random.default_rng(0), wrong)
     problem = build_problem(delayed, LinearOracle(4, 1), 10, "none")
     controller = Controller(problem, Solver(problem))
     seen = Observation(np.zeros(4), np.zeros(1), 1, 0, None)

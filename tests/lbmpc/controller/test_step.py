@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from lbmpc.oracles.base import HiddenSet, Verdict
 from lbmpc.plants.linear_motion import discretise
 from lbmpc.problem import build_problem
 from lbmpc.references import Reference
-from lbmpc.solver.constraint_rows import Box
 from lbmpc.solver.gauss_newton import Solver
 from lbmpc.solver.solution import Solution, Status
 from lbmpc.targets import TargetSelector
@@ -31,7 +31,7 @@ X = np.array([0.05, 0.05, 0.0, 0.0])
 X_NEXT = np.array([0.052, 0.049, 0.01, 0.1])
 
 
-def seen(x: np.ndarray | None, sequence: int, applied: float | None = 0.1, **more) -> Observation:  # type: ignore[no-untyped-def]
+def seen(x: np.ndarray | None, sequence: int, applied: float | None = 0.1, **more) -> Observation:
     given = None if applied is None else np.array([applied])
     return Observation(x, given, more.get("source", 1), sequence, more.get("hidden"))
 
@@ -115,18 +115,11 @@ class Failing:
         self.good, self.real = good, Solver(PROBLEM)
 
     def solve(
-        self,
-        x: np.ndarray,
-        oracle_parameters: np.ndarray,
-        warm_start: np.ndarray,
-        xr: np.ndarray | None = None,
-        ur: np.ndarray | None = None,
-        first: Box | None = None,
-        previous: np.ndarray | None = None,
+        self, x: np.ndarray, theta: np.ndarray, warm_start: np.ndarray, *more: Any, **named: Any
     ) -> Solution:
         self.good -= 1
         if self.good >= 0:
-            return self.real.solve(x, oracle_parameters, warm_start, xr, ur)
+            return self.real.solve(x, theta, warm_start, *more, **named)
         nothing = np.zeros_like(warm_start)
         return Solution(
             Status.NUMERICAL, nothing, nothing, nothing, np.zeros((len(nothing), 4)), np.inf, 0, 0.0, ""

@@ -122,7 +122,7 @@ def test_the_estimate_is_bounded_whatever_the_point() -> None:
         assert (np.abs(h) <= oracle.bounds * oracle.output_scale * sigma + 1e-15).all()
 
 
-def _offer(oracle: DnnOracle, state, **change):  # type: ignore[no-untyped-def]
+def _offer(oracle: DnnOracle, state, **change):
     layers = [layer + np.float32(0.25) for layer in oracle.hidden(state)]
     layers = [layer.astype(np.float32).astype(float) for layer in layers]
     offer = {

@@ -1,44 +1,26 @@
-"""What is claimed of sets, who checks it, and what the controller does with it."""
+"""What is claimed of sets, and who checks it."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 
-from lbmpc.controller.signals import Observation
-from lbmpc.controller.step import Controller
 from lbmpc.model import build_model
-from lbmpc.oracles import DnnOracle
 from lbmpc.plants import get_plant
 from lbmpc.problem import build_problem
 from lbmpc.sets import check as checker
 from lbmpc.sets.certificate import Certificate, CertificateError, Piece, decode, encode, require_match
 from lbmpc.sets.check import check
-from lbmpc.sets.constraint_sets import state_set
-from lbmpc.sets.construct import construct, points_in, volume_fraction
-from lbmpc.sets.geometry.operations import body
+from lbmpc.sets.construct import construct, volume_fraction
 from lbmpc.sets.guard import Guard
-from lbmpc.sets.invariance.approach import one_period
-from lbmpc.solver.constraint_rows import Box
-from lbmpc.solver.gauss_newton import Solver
-from lbmpc.solver.solution import Solution, Status
-from tests.helpers.plants.pendulum import pendulum, two_inputs
+from tests.helpers.plants.pendulum import pendulum
 from tests.helpers.science import oracle_named
 
 MODEL = pendulum()
 START = np.array([0.62, 0.0])
-
-
-@pytest.fixture(scope="module")
-def family() -> Certificate:
-    """A base set and a chain of pieces from a state outside of it."""
-    found = construct(MODEL, "regions", START)
-    assert len(found.pieces) > 3
-    return found
 
 
 def changed(certificate: Certificate, index: int, **fields: object) -> Certificate:
@@ -169,62 +151,6 @@ def test_work_that_was_done_is_not_done_again(family: Certificate) -> None:
     assert encode(again) == encode(family)
 
 
-def observation(x: np.ndarray, number: int) -> Observation:
-    return Observation(x, None, 1, number, None)
-
-
-@pytest.mark.parametrize("real_time", [False, True])
-@pytest.mark.parametrize("theory", ["none", "lies", "nan"])
-def test_from_every_state_of_the_sets_the_controller_keeps_the_plant_inside(
-    family: Certificate, theory: str, real_time: bool
-) -> None:
-    oracle = oracle_named("linear" if theory == "none" else "dnn", MODEL)
-    problem = build_problem(MODEL, oracle, 8, "invariant", certificate=family)
-    controller = Controller(problem, Solver(problem), real_time)
-    rng, X = np.random.default_rng(4), state_set(MODEL)
-    move = one_period(MODEL)
-    guard = problem.guard
-    assert guard is not None
-    for index in (0, 0, len(family.pieces) - 1):
-        piece = family.pieces[index]
-        x = points_in(body(np.array(piece.G), np.array(piece.g)), 1, rng)[0]
-        state = controller.initial_state(0)
-        for number in range(25):
-            if isinstance(oracle, DnnOracle):
-                wild = rng.normal(scale=np.nan if theory == "nan" else 1e3, size=state.oracle["K"].shape)
-                state.oracle["K"] = wild
-            state, result = controller.step(state, observation(x, number))
-            first = result.first
-            assert first is not None
-            assert first.lower is not None
-            assert first.upper is not None
-            u = result.plan[0]
-            assert (first.lower <= u).all()
-            assert (u <= first.upper).all()
-            x = np.array(move(x, u)).ravel()
-            assert X.contains(x)
-            assert guard.first_inputs(x).piece >= 0
-
-
-def test_outside_it_says_so_and_finds_back(family: Certificate) -> None:
-    problem = build_problem(MODEL, oracle_named("linear", MODEL), 10, "invariant", certificate=family)
-    controller = Controller(problem, Solver(problem))
-    move = one_period(MODEL)
-    # Outside of every piece, and still to be saved.
-    x = np.array([0.75, 0.0])
-    state, pieces = controller.initial_state(0), []
-    for number in range(40):
-        state, result = controller.step(state, observation(x, number))
-        assert result.mode == "solver"
-        assert result.first is not None
-        pieces.append(result.first.piece)
-        assert (result.first.piece < 0) == (result.first.margin < 0)
-        x = np.array(move(x, result.plan[0])).ravel()
-    assert pieces[0] == -1
-    assert pieces[-1] == 0
-    assert abs(x[0]) < 0.2
-
-
 def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family: Certificate) -> None:
     approximation = construct(MODEL, "extension", START)
     assert volume_fraction(approximation) > volume_fraction(family)
@@ -236,147 +162,12 @@ def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant", certificate=approximation)
 
 
-def test_without_sets_there_is_no_invariant_tightening() -> None:
-    with pytest.raises(CertificateError, match="tandem sets compute"):
-        build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant")
-
-
-def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
-    model = two_inputs()
-    certificate = construct(model, "box", np.zeros(2))
-    assert check(certificate).ok
-    guard, rng, move = Guard(certificate), np.random.default_rng(5), one_period(model)
-    base = body(np.array(certificate.pieces[0].G), np.array(certificate.pieces[0].g))
-    for x in points_in(base, 30, rng):
-        first = guard.first_inputs(x)
-        assert first.lower is not None
-        assert first.upper is not None
-        for u in (first.lower, first.upper, np.array([first.lower[0], first.upper[1]])):
-            assert base.contains(np.array(move(x, u)).ravel())
-
-
-def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
-    guard, rng = Guard(family, share=0.0), np.random.default_rng(6)
-    bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
-    tight = 0
-    for index, piece in enumerate(family.pieces):
-        A, B = MODEL.A + np.array(piece.slope_x), MODEL.B + np.array(piece.slope_u)
-        target = bodies[piece.target]
-        for x in points_in(bodies[index], 20, rng):
-            first = guard.first_inputs(x)
-            if first.piece != index:
-                # The first piece that holds x decides.
-                assert first.piece < index
-                assert bodies[first.piece].contains(x)
-                continue
-            for u, step in ((first.lower, -1e-6), (first.upper, 1e-6)):
-                assert u is not None
-                after = A @ x + B @ u + np.array(piece.W)
-                assert target.contains(after).all()
-                if piece.u_lower[0] <= u[0] + step <= piece.u_upper[0]:
-                    assert not target.contains(after + B @ np.array([step])).all()
-                    tight += 1
-    assert tight > 10
-
-
-def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
-    plain, wary, rng = Guard(family, share=0.0), Guard(family), np.random.default_rng(9)
-    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
-    tighter = 0
-    for x in np.vstack([points_in(base, 60, rng), 0.97 * base.vertices]):
-        all_, some = plain.first_inputs(x), wary.first_inputs(x)
-        assert all_.lower is not None
-        assert all_.upper is not None
-        assert some.lower is not None
-        assert some.upper is not None
-        assert all_.lower <= some.lower <= some.upper <= all_.upper
-        tighter += bool(some.upper - some.lower < all_.upper - all_.lower)
-    assert tighter
-
-
 def test_a_last_digit_is_no_other_model(family: Certificate) -> None:
     again = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 3e-16)).tolist())
     require_match(msgspec.structs.replace(family, model=again), MODEL)
     other = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 1e-9)).tolist())
     with pytest.raises(CertificateError, match="A: sha256"):
         require_match(msgspec.structs.replace(family, model=other), MODEL)
-
-
-@pytest.mark.parametrize("wish", [-50.0, 50.0])
-def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(wish: float) -> None:
-    problem = build_problem(MODEL, oracle_named("linear", MODEL), 6)
-    solver, first = Solver(problem), (np.array([-0.5]), np.array([0.2]))
-    x, warm, nothing = np.array([0.01, 0.0]), np.zeros((6, 1)), np.zeros(0)
-    bound = first[0][0] if wish < 0 else first[1][0]
-    references = {"ur": np.full((6, 1), wish)}
-    assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
-    assert solver.solve(x, nothing, warm, **references, first=first).v[0, 0] == pytest.approx(bound, abs=1e-9)
-    # The bounds are for one solve only.
-    assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
-    solver.prepare(x, nothing, np.full((6, 1), 0.1))
-    assert first[0][0] <= solver.feedback(np.array([-0.3 * np.sign(wish), 0.0]), first).v[0, 0] <= first[1][0]
-
-
-class Failing:
-    """A solver that finds its first solution and nothing after it."""
-
-    def __init__(self, real: Solver, good: int):
-        self.real, self.good = real, good
-
-    def solve(
-        self,
-        x: np.ndarray,
-        theta: np.ndarray,
-        warm: np.ndarray,
-        xr: np.ndarray | None = None,
-        ur: np.ndarray | None = None,
-        first: Box | None = None,
-        previous: np.ndarray | None = None,
-    ) -> Solution:
-        self.good -= 1
-        found = self.real.solve(x, theta, warm, xr, ur, first=first)
-        return found if self.good >= 0 else replace(found, status=Status.NUMERICAL)
-
-    def prepare(
-        self,
-        x: np.ndarray,
-        theta: np.ndarray,
-        warm: np.ndarray,
-        xr: np.ndarray | None = None,
-        ur: np.ndarray | None = None,
-        previous: np.ndarray | None = None,
-    ) -> None: ...
-
-    def feedback(
-        self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
-    ) -> Solution:
-        raise AssertionError("not in this mode")
-
-
-@pytest.mark.parametrize("good", [0, 1])
-def test_what_is_certified_holds_without_a_solution_too(family: Certificate, good: int) -> None:
-    # A feedback that drives the plant away.
-    model = replace(MODEL, K=-3.0 * MODEL.K)
-    problem = build_problem(model, oracle_named("linear", model), 6, "invariant", certificate=family)
-    rng, clipped = np.random.default_rng(8), 0
-    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g))
-    states = points_in(base, 40, rng)
-    for start, x in zip(states[::2], states[1::2], strict=True):
-        controller = Controller(problem, Failing(Solver(problem), good))
-        state = controller.initial_state(0)
-        if good:
-            state, _ = controller.step(state, observation(start, 0))
-        wanted = state.plan.u[0] if good else np.clip(model.K @ x, -3.0, 3.0)
-        # Far from where the plan was made for: it would lead anywhere.
-        _, result = controller.step(state, observation(x, 1))
-        assert result.mode == ("shifted_plan" if good else "feedback")
-        first = result.first
-        assert first is not None
-        assert first.lower is not None
-        assert first.upper is not None
-        assert first.lower[0] <= result.plan[0, 0] <= first.upper[0]
-        clipped += bool(result.plan[0, 0] != wanted[0])
-    assert clipped
 
 
 def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:

@@ -21,8 +21,8 @@ from lbmpc.sets.enclosures.disturbance import (
     bound_hull,
     given_box,
 )
-from tests.helpers.enclosures import TRUTH, a_plant
 from tests.helpers.plants.pendulum import PENDULUM
+from tests.lbmpc.sets.enclosures import TRUTH, a_plant
 
 SAMPLES = 2000
 VAN_DER_POL = a_plant(lambda x, u: [x[1], (1 - x[0] ** 2) * x[1] - x[0] + u[0]], "van_der_pol")

@@ -15,17 +15,12 @@ from lbmpc.sets.check import check
 from lbmpc.sets.construct import construct, points_in
 from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.guard import MOST, Guard
+from lbmpc.sets.invariance.approach import one_period
 from tests.helpers.plants.pendulum import pendulum, two_inputs
 from verification.closed_loop import Case, ClosedLoop
 
 MODEL = pendulum()
 HALF = np.array([1.0, 2.0])
-START = np.array([0.62, 0.0])
-
-
-@pytest.fixture(scope="module")
-def family() -> Certificate:
-    return construct(MODEL, "regions", START)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +121,7 @@ def test_two_inputs_outside_lead_least_far_out() -> None:
 def test_errors_of_measurement_lead_no_liar_out_of_the_sets(
     compressor: ClosedLoop, inputs: str, noise: float
 ) -> None:
-    found = [compressor.run(Case(inputs, noise), seed, 40) for seed in range(4)]  # type: ignore[arg-type]
+    found = [compressor.run(Case(inputs, noise), seed, 40) for seed in range(4)]
     assert [one.outside for one in found] == [0] * 4
     assert min(one.margin for one in found) > 1e-5
 
@@ -160,3 +155,56 @@ def test_the_bounds_do_not_leap_at_the_sets_boundary(family: Certificate) -> Non
         assert near.lower is not None
         assert beyond.lower is not None
         assert near.lower == pytest.approx(beyond.lower, abs=1e-3)
+
+
+def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
+    model = two_inputs()
+    certificate = construct(model, "box", np.zeros(2))
+    assert check(certificate).ok
+    guard, rng, move = Guard(certificate), np.random.default_rng(5), one_period(model)
+    base = body(np.array(certificate.pieces[0].G), np.array(certificate.pieces[0].g))
+    for x in points_in(base, 30, rng):
+        first = guard.first_inputs(x)
+        assert first.lower is not None
+        assert first.upper is not None
+        for u in (first.lower, first.upper, np.array([first.lower[0], first.upper[1]])):
+            assert base.contains(np.array(move(x, u)).ravel())
+
+
+def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
+    guard, rng = Guard(family, share=0.0), np.random.default_rng(6)
+    bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
+    tight = 0
+    for index, piece in enumerate(family.pieces):
+        A, B = MODEL.A + np.array(piece.slope_x), MODEL.B + np.array(piece.slope_u)
+        target = bodies[piece.target]
+        for x in points_in(bodies[index], 20, rng):
+            first = guard.first_inputs(x)
+            if first.piece != index:
+                # The first piece that holds x decides.
+                assert first.piece < index
+                assert bodies[first.piece].contains(x)
+                continue
+            for u, step in ((first.lower, -1e-6), (first.upper, 1e-6)):
+                assert u is not None
+                after = A @ x + B @ u + np.array(piece.W)
+                assert target.contains(after).all()
+                if piece.u_lower[0] <= u[0] + step <= piece.u_upper[0]:
+                    assert not target.contains(after + B @ np.array([step])).all()
+                    tight += 1
+    assert tight > 10
+
+
+def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
+    plain, wary, rng = Guard(family, share=0.0), Guard(family), np.random.default_rng(9)
+    base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
+    tighter = 0
+    for x in np.vstack([points_in(base, 60, rng), 0.97 * base.vertices]):
+        all_, some = plain.first_inputs(x), wary.first_inputs(x)
+        assert all_.lower is not None
+        assert all_.upper is not None
+        assert some.lower is not None
+        assert some.upper is not None
+        assert all_.lower <= some.lower <= some.upper <= all_.upper
+        tighter += bool(some.upper - some.lower < all_.upper - all_.lower)
+    assert tighter

@@ -43,7 +43,7 @@ def one_state(rhs: Rhs) -> Model:
 
 @pytest.mark.parametrize("kind", ["box", "hull", "regions", "given"])
 def test_an_integrator_is_kept_in_all_of_its_interval(kind: str) -> None:
-    certificate = construct(one_state(lambda _x, u: [u[0]]), kind, np.array([0.5]))  # type: ignore[arg-type]
+    certificate = construct(one_state(lambda _x, u: [u[0]]), kind, np.array([0.5]))
     verdict = check(certificate)
     assert verdict.ok, verdict.reason
     assert verdict.vertices == 2

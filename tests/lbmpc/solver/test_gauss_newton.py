@@ -30,7 +30,7 @@ SMALL = np.array([0.003, 0.0005, 1e-5, 1.1e-4])
 def test_the_optimum_is_that_of_ipopt(name: str, tightening: str) -> None:
     rng = np.random.default_rng(7)
     oracle = oracle_named(name, MODEL)
-    problem = build_problem(MODEL, oracle, 20, tightening, SMALL)  # type: ignore[arg-type]
+    problem = build_problem(MODEL, oracle, 20, tightening, SMALL)
     solver, reference = Solver(problem, max_iterations=60, tolerance=1e-9), ReferenceSolver(problem)
     compared = active = 0
     for _ in range(16):
@@ -48,7 +48,7 @@ def test_the_optimum_is_that_of_ipopt(name: str, tightening: str) -> None:
         compared += 1
         rows = [(zbar, set_) for zbar, set_ in zip(ours.zbar, problem.states, strict=True)]
         rows += [(v, set_) for v, set_ in zip(ours.v, problem.inputs, strict=True)]
-        active += any(not set_.minus(1e-6, 1e-6).contains(set_point) for set_point, set_ in rows)  # type: ignore[arg-type]
+        active += any(not set_.minus(1e-6, 1e-6).contains(set_point) for set_point, set_ in rows)
     assert compared >= 5
     assert active >= 3
 

@@ -127,4 +127,4 @@ def test_what_claims_x_for_ever_refuses_a_rate() -> None:
     model = with_rates(build_model(COMPRESSOR, 0.05), np.array([3.0]), np.zeros(1))
     for tightening in ("tube", "invariant"):
         with pytest.raises(CertificateError, match="how fast u may change"):
-            build_problem(model, LinearOracle(4, 1), 10, tightening)  # type: ignore[arg-type]
+            build_problem(model, LinearOracle(4, 1), 10, tightening)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from datetime import timedelta
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from lbmpc.plants import get_plant
+from lbmpc.plants import Known, get_plant
 from node_runtime.bus.zenoh_bus import Bus
 from node_runtime.config.loading import override, to_toml
 from node_runtime.config.sections import Config
 from node_runtime.router import open_router
-from node_runtime.tls import credentials
 from plant_sim import Gateway
 from protocol import messages as m
 from protocol import topics
@@ -24,6 +22,7 @@ from tandem import certificate_authority
 from tandem.cli import main
 from tandem.operating.hand_session import Follower, assignments, clipped, completed, lease_of, line
 from tandem.terminal import Refused
+from tests.helpers.certificates import issue
 from tests.helpers.live import BusListener, free_endpoint, live_config, wait_for
 
 PLANT = get_plant("moore_greitzer")
@@ -44,27 +43,39 @@ class Machine:
         self.written.append(float(u[0]))
 
 
-@pytest.fixture
-def served() -> Iterator[tuple[Config, Machine]]:
+@contextmanager
+def served(config: Config) -> Iterator[Machine]:
     """A gateway behind a router, nobody commands it."""
-    config, machine, stop = live_config(), Machine(), threading.Event()
+    machine, stop = Machine(), threading.Event()
     thread = threading.Thread(target=Gateway(None, config).serve, args=(machine.read, machine.write, stop))
     with open_router(config):
         thread.start()
-        yield config, machine
-        stop.set()
-        thread.join()
+        try:
+            yield machine
+        finally:
+            stop.set()
+            thread.join()
+
+
+@contextmanager
+def by_hand(*arguments: str) -> Iterator[list[int]]:
+    """`tandem manual` beside the block, which ends with it; its exit code, once there is one."""
+    code: list[int] = []
+    session = threading.Thread(target=lambda: code.append(main(["manual", *arguments])))
+    session.start()
+    try:
+        yield code
+    finally:
+        session.join()
 
 
 @pytest.mark.live
-def test_a_hand_on_the_switch_of_a_machine(
-    served: tuple[Config, Machine], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config, machine = served
+def test_a_hand_on_the_switch_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = live_config()
     file = tmp_path / "a.toml"
     file.write_text(to_toml(config))
     at = ["--config", str(file)]
-    with Bus(config, "recorder", "r-1") as bus:
+    with served(config) as machine, Bus(config, "recorder", "r-1") as bus:
         ear = BusListener(bus)
         assert main(["manual", f"u={U + 0.02}", "--seconds", "1.5", *at]) == 0
         said = capsys.readouterr().out
@@ -78,15 +89,10 @@ def test_a_hand_on_the_switch_of_a_machine(
         assert PLANT.u_max[0] not in machine.written
         machine.x = PLANT.x_e
         # From elsewhere.
-        result: list[int] = []
-        session = threading.Thread(
-            target=lambda: result.append(main(["manual", f"u={U + 0.03}", "--seconds", "30", *at]))
-        )
-        session.start()
-        wait_for(lambda: machine.written[-1] == U + 0.03)
-        assert main(["auto", *at]) == 0
-        session.join()
-        assert result == [1]
+        with by_hand(f"u={U + 0.03}", "--seconds", "30", *at) as code:
+            wait_for(lambda: machine.written[-1] == U + 0.03)
+            assert main(["auto", *at]) == 0
+        assert code == [1]
         assert "gave it back to the controller" in capsys.readouterr().out
         states = ear.of(topics.PLANT_STATE)
         notes = {one.note for name, one in ear.heard if name == topics.HEALTH["plant"].name}
@@ -104,8 +110,6 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
     certificate_authority.create("jet1", [], keys, 30)
     remote = free_endpoint().replace("tcp/", "tls/")
     local = live_config(f'bus.remote="{remote}"', f'bus.tls.keys="{keys / "router"}"')
-    machine, stop = Machine(), threading.Event()
-    gateway = threading.Thread(target=Gateway(None, local).serve, args=(machine.read, machine.write, stop))
 
     def far(role: str) -> list[str]:
         config = override(
@@ -115,32 +119,19 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
         file.write_text(to_toml(config))
         return ["--config", str(file)]
 
-    authority = keys / "authority"
-    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
-    issued_by = credentials.load_certificate(authority / "certificate.pem")
-    (keys / "brief").mkdir(mode=0o700)
-    seconds = timedelta(seconds=4) / timedelta(days=1)
-    with open_router(local):
-        gateway.start()
+    with served(local) as machine:
         assert main(["manual", f"u={U + 0.01}", *far("operator")]) == 2
         assert "is the certificate of operator.jet1" in capsys.readouterr().err
-        certificate_authority.issue(keys / "brief", "commander.jet1", key, issued_by, seconds, [])  # type: ignore[arg-type]
-        done: list[int] = []
-        session = threading.Thread(
-            target=lambda: done.append(main(["manual", f"u={U + 0.02}", "--seconds", "5", *far("brief")]))
-        )
-        session.start()
-        wait_for(lambda: U + 0.02 in machine.written)
-        # The session goes on saying it, and nobody hears it: the lease is over.
-        wait_for(lambda: machine.written[-1] != U + 0.02)
-        session.join()
-        stop.set()
-        gateway.join()
+        issue(keys, "brief", "commander.jet1", 4.0 / 86400.0)
+        with by_hand(f"u={U + 0.02}", "--seconds", "5", *far("brief")):
+            wait_for(lambda: U + 0.02 in machine.written)
+            # The session goes on saying it, and nobody hears it: the lease is over.
+            wait_for(lambda: machine.written[-1] != U + 0.02)
 
 
 def state(seq: int, source: str = "command", run_id: str = "plant-1") -> m.PlantState:
     return m.PlantState(
-        run_id=run_id, seq=seq, t=0.0, x=PLANT.x_e.tolist(), applied=[U], source=source, command_seq=0  # type: ignore[arg-type]
+        run_id=run_id, seq=seq, t=0.0, x=PLANT.x_e.tolist(), applied=[U], source=source, command_seq=0
     )  # fmt: skip
 
 
@@ -156,7 +147,7 @@ def begun() -> Follower:
 
 
 def word(mode: str, seq: int, run_id: str) -> m.Override:
-    return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])  # type: ignore[arg-type]
+    return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])
 
 
 def test_what_ends_a_session_by_hand() -> None:
@@ -191,15 +182,15 @@ def test_what_ends_a_pause() -> None:
 
 
 def test_inputs_are_named_and_the_others_stay() -> None:
-    quad = get_plant("moore_greitzer")
-    assert assignments(["u=1.2"], quad) == {"u": 1.2}
+    assert assignments(["u=1.2"], PLANT) == {"u": 1.2}
     for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a number"), ("u=inf", "finite")):
         with pytest.raises(Refused, match=says):
-            assignments([text], quad)
-    two = type("Two", (), {"inputs": ("a", "b")})
-    assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]  # type: ignore[arg-type]
+            assignments([text], PLANT)
+    scale = {"x1": 1.0, "a": 1.0, "b": 1.0}
+    two = Known.from_matrices([[-1.0]], [[1.0, 1.0]], W=[0.0], inputs=("a", "b"), scale=scale)
+    assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]
     with pytest.raises(Refused, match="name a too"):
-        completed({"b": 3.0}, two, None)  # type: ignore[arg-type]
+        completed({"b": 3.0}, two, None)
 
 
 def test_what_the_gateway_clips_is_said() -> None:

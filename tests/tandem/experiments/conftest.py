@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.experiments import SMALL
+from tests.tandem.experiments.small import SMALL
 
 
 @pytest.fixture

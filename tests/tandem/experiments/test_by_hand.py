@@ -66,4 +66,4 @@ def test_a_plant_that_moves_elsewhere_is_given_the_input_by_hand() -> None:
 @pytest.mark.parametrize("u", [[1.0, 2.0], [float("nan")], {"v": 1.0}])
 def test_what_is_no_input_is_refused(loop: Loop, u: object) -> None:
     with pytest.raises(ValueError, match="no input"):
-        loop.manual(u)  # type: ignore[arg-type]
+        loop.manual(u)

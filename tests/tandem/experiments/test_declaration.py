@@ -11,8 +11,8 @@ from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study.plan import Job, rows
 from tandem.experiments.study.runner import timing_job, wanted
-from tests.helpers.experiments import SHIPPED, SMALL, cases
 from tests.helpers.paths import ROOT
+from tests.tandem.experiments.small import SHIPPED, SMALL, cases
 
 
 @pytest.mark.parametrize(

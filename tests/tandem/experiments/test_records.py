@@ -17,8 +17,8 @@ from tandem.experiments.study import results
 from tandem.experiments.study.declaration import Picture
 from tandem.experiments.study.plan import Job, rows
 from tandem.experiments.study.work import Record, Traces, read
-from tests.helpers.experiments import PLANT, SHIPPED, cases
 from tests.helpers.plants.pendulum import PENDULUM
+from tests.tandem.experiments.small import PLANT, SHIPPED, cases
 
 SHIPPED_CASES = cases(SHIPPED)
 NETWORK = next(case for case in SHIPPED_CASES if case.name == "compressor: oracle = dnn")

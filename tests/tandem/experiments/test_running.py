@@ -22,8 +22,9 @@ from tandem.experiments.study.declaration import load
 from tandem.experiments.study.plan import code_version, rows
 from tandem.experiments.study.runner import run_all, wanted
 from tandem.experiments.study.work import read, work
-from tests.helpers.experiments import PLANT, SMALL, cases
+from tests.helpers.interpreter import python
 from tests.helpers.paths import write_namesakes
+from tests.tandem.experiments.small import PLANT, SMALL, cases
 
 
 def run_small(path: Path, out: Path, processes: int) -> Finished:
@@ -151,14 +152,7 @@ def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: P
     # As the installed `tandem`, whose own path begins with its folder.
     program = "import sys; sys.path.remove(''); from tandem.cli import main; sys.exit(main())"
     arguments = ("experiment", str(small), "--only", "rows", "--out", "out", "--jobs", "1")
-    done = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        cwd=here,
-        check=False,
-    )
+    done = python("-c", program, *arguments, cwd=here)
     assert done.returncode == 0, done.stderr
     assert (here / "out" / "report.html").exists()
 

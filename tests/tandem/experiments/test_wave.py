@@ -13,9 +13,9 @@ from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation import wave
 from tandem.experiments.study.plan import rows
 from tandem.experiments.study.work import read, work
-from tests.helpers.experiments import PLANT, SHIPPED, cases
+from tests.tandem.experiments.small import PLANT, SHIPPED, cases
 
-TRUE = PLANT.varied(slope=1.4)  # type: ignore[union-attr]
+TRUE = PLANT.varied(slope=1.4)
 STEPS, CYCLES = 24, 2
 WAVE = f"""
 name = "wave"

@@ -8,17 +8,15 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from node_runtime.config.loading import from_json, load, override, to_json, to_toml
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
-from node_runtime.tls import credentials
 from protocol.messages import Health
 from tandem import certificate_authority
+from tests.helpers.certificates import issue
 from tests.helpers.live import HANG_S, Process, free_endpoint, live_config, wait_for
-from tests.helpers.trainer_partner import TRAINING, Controller
+from tests.trainer_node.partner import TRAINING, Controller
 from trainer_node.fleet.discovery import RouterPerPlant
 from trainer_node.main import main
 from trainer_node.node import TrainerNode
@@ -177,11 +175,7 @@ def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
     monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN_S", 0.2)
     only = site(tmp_path, "jet1")
     folder = tmp_path / "jet1"
-    authority = folder / "authority"
-    key = load_pem_private_key((authority / "key.pem").read_bytes(), None)
-    assert isinstance(key, EllipticCurvePrivateKey)
-    issuer = credentials.load_certificate(authority / "certificate.pem")
-    certificate_authority.issue(folder / "trainer", "trainer.jet1", key, issuer, 6.0 / 86400.0, [])
+    issue(folder, "trainer", "trainer.jet1", 6.0 / 86400.0)
     with ExitStack() as stack:
         stack.enter_context(routing(only))
         plant = stack.enter_context(Controller(only, "controller-1"))

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from node_runtime.config.sections import Config
-from tests.helpers.trainer_partner import Controller
+from tests.trainer_node.partner import Controller
 from trainer_node.main import main
 
 pytestmark = pytest.mark.live

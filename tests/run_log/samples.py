@@ -11,6 +11,7 @@ from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
+from run_log.reading.reader import read_run
 from run_log.writing.writer import LogWriter
 
 PLANT_RUN, RUN, TRAINER_RUN = "plant-1", "controller-1", "trainer-1"
@@ -167,3 +168,16 @@ def write(path: Path, config: Config, messages: list[Logged], flush_every: int =
             if i % flush_every == flush_every - 1:
                 writer.flush()
     return path
+
+
+def payloads(messages: list[Logged]) -> dict[str, list[bytes]]:
+    """What a log of them must hold of each topic."""
+    found: dict[str, list[bytes]] = {}
+    for topic, message, _ in messages:
+        found.setdefault(topic.name, []).append(codec.encode(message))
+    return found
+
+
+def logged(path: Path) -> dict[str, list[bytes]]:
+    """What it holds of each topic."""
+    return {name: [entry.payload for entry in entries] for name, entries in read_run(path).streams.items()}

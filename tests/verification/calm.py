@@ -56,7 +56,7 @@ def sampled(source: str, t: float) -> Sampled:
         t=t,
         x=[0.0],
         applied=[0.0],
-        source=source,  # type: ignore[arg-type]
+        source=source,
         command_seq=0,
     )
     return Sampled(t, state)
