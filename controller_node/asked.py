@@ -67,8 +67,9 @@ def change_of(reference: m.Reference, plant: Description, period: float) -> Chan
     points = np.array(values, dtype=float)
     room = FARTHEST * plant.x_scale
     low, high = np.maximum(plant.x_min, plant.x_e - room), np.minimum(plant.x_max, plant.x_e + room)
+    beyond = np.maximum(low[outputs] - points, points - high[outputs])
     for column, i in enumerate(outputs):
-        worst = max(points[:, column], key=lambda value: max(low[i] - value, value - high[i]))
+        worst = points[beyond[:, column].argmax(), column]
         _require(
             low[i] <= worst <= high[i],
             f"{plant.states[i]} = {worst:g} is outside X: {low[i]:g} to {high[i]:g}",
