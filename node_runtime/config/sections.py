@@ -347,6 +347,11 @@ class LogConfig(Section, frozen=True):
     """How many of a run's files stay, the one being written included; older ones are removed. 0: all."""
 
 
+class LiveConfig(Section, frozen=True):
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 8765
+    """Of 127.0.0.1, where `tandem live` serves its page and the Foxglove WebSocket."""
+
+
 class RealtimeConfig(Section, frozen=True):
     priority: Annotated[int, msgspec.Meta(ge=0, le=99)] = 50
     """SCHED_FIFO priority of router, controller and plant; 0: leave the scheduler alone."""
@@ -375,6 +380,7 @@ class Config(Section, frozen=True):
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()
     log: LogConfig = LogConfig()
+    live: LiveConfig = LiveConfig()
     realtime: RealtimeConfig = RealtimeConfig()
 
     @property

@@ -1,0 +1,138 @@
+"""The server of `tandem live`: the page and the socket, on one port of this machine."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager, suppress
+from http import HTTPStatus
+from typing import NamedTuple
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from tandem.web.address import HOST
+from tandem.web.audience import Audience
+from tandem.web.foxglove_protocol import SUBPROTOCOLS
+from tandem.web.origins import is_own_name, may_connect
+
+log = logging.getLogger(__name__)
+
+MOST_VIEWERS = 32
+LARGEST_REQUEST = 256 * 1024
+"""Bytes of one request of a viewer: it names channels."""
+
+
+class Document(NamedTuple):
+    """What is served at one path."""
+
+    kind: str
+    """Its media type."""
+    content: bytes
+    policy: str = "default-src 'none'"
+    """Its Content-Security-Policy."""
+
+
+@asynccontextmanager
+async def serving(audience: Audience, documents: Mapping[str, Document], port: int) -> AsyncIterator[int]:
+    """Serve on loopback until the block ends; yields the port.
+
+    Args:
+        audience: who looks, and what they are shown.
+        documents: by path, as "/".
+        port: 0 takes any.
+
+    Raises:
+        OSError: the port is taken, or not permitted.
+    """
+
+    async def watch(connection: ServerConnection) -> None:
+        viewer = audience.enter()
+        sending = asyncio.create_task(_send(connection, viewer.next_frame))
+        try:
+            async for text in connection:
+                audience.obey(viewer, text)
+        except ConnectionClosed:
+            pass
+        finally:
+            audience.leave(viewer)
+            sending.cancel()
+            if viewer.dropped:
+                log.info("a viewer was too slow: %d messages were not sent to it", viewer.dropped)
+
+    def answer(_connection: ServerConnection, request: Request) -> Response | None:
+        return respond(request, documents, len(audience.viewers))
+
+    async with serve(
+        watch,
+        HOST,
+        port,
+        process_request=answer,
+        subprotocols=SUBPROTOCOLS,
+        # The link is this machine's, or a tunnel that compresses by itself if it should.
+        compression=None,
+        max_size=LARGEST_REQUEST,
+        server_header=None,
+        # What breaks off inside a handshake is the browser's to say.
+        logger=_quiet(),
+    ) as server:
+        yield next(iter(server.sockets)).getsockname()[1]
+
+
+async def _send(connection: ServerConnection, next_frame) -> None:  # type: ignore[no-untyped-def]
+    with suppress(ConnectionClosed):
+        while True:
+            await connection.send(await next_frame())
+
+
+def respond(request: Request, documents: Mapping[str, Document], viewers: int) -> Response | None:
+    """Return the answer to a request over HTTP; None: the request may become a socket."""
+    headers = request.headers
+    if not is_own_name(_only(headers, "Host")):
+        return _said(HTTPStatus.FORBIDDEN, "this server answers to localhost only; from elsewhere use ssh -L")
+    if "websocket" in headers.get("Upgrade", "").lower():
+        origins = headers.get_all("Origin")
+        if not all(may_connect(origin) for origin in origins):
+            log.warning("refused a connection from a page of %s", ", ".join(origins)[:200])
+            return _said(HTTPStatus.FORBIDDEN, "pages of this origin may not connect")
+        if viewers >= MOST_VIEWERS:
+            return _said(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {viewers} viewers already")
+        return None
+    document = documents.get(request.path.partition("?")[0])
+    if document is None:
+        return _said(HTTPStatus.NOT_FOUND, "there is nothing at this path; the page is at /")
+    return _response(HTTPStatus.OK, document)
+
+
+def _only(headers: Headers, name: str) -> str | None:
+    """The value of a header; None where it is missing or there are several."""
+    values = headers.get_all(name)
+    return values[0] if len(values) == 1 else None
+
+
+def _said(status: HTTPStatus, text: str) -> Response:
+    return _response(status, Document("text/plain; charset=utf-8", f"{text}\n".encode()))
+
+
+def _response(status: HTTPStatus, document: Document) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": document.kind,
+            "Content-Length": str(len(document.content)),
+            "Content-Security-Policy": f"{document.policy}; frame-ancestors 'none'",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cache-Control": "no-store",
+            "Connection": "close",
+        }
+    )
+    return Response(status.value, status.phrase, headers, document.content)
+
+
+def _quiet() -> logging.Logger:
+    logger = logging.getLogger("tandem.web.connections")
+    logger.setLevel(logging.CRITICAL)
+    return logger
