@@ -1,4 +1,6 @@
-"""A gateway without any of Tandem's code: zenoh and msgpack are all it needs. docs/gateway.md is what it follows.
+"""A gateway without any of Tandem's code: it needs zenoh and msgpack only.
+
+It follows docs/reference/gateway.md.
 
     tandem run --no-plant                          # in one terminal
     python examples/gateway_without_tandem.py      # in another; arguments: the router's endpoint, folder of keys

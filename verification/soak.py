@@ -1,6 +1,6 @@
 """`make soak`: does anything grow, and is anything late, when it runs for long?
 
-    python -m verification.soak --minutes 30 --document docs/faults.md
+    python -m verification.soak --minutes 30 --document docs/results/faults.md
 
 `tandem run` at 50 Hz with its trainer, recorder and live view. The resident memory of every process is read every ten
 seconds. Beside it run the empty loops of `benchmarks.live.stalls`: ticks that the machine itself made late are known.

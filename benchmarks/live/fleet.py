@@ -1,6 +1,6 @@
 """One trainer for many plants: time from samples to weights, and what a stack saves.
 
-    python -m benchmarks.live.fleet --document docs/fleet.md
+    python -m benchmarks.live.fleet --document docs/tutorials/fleet.md
 
 A real router and a real `tandem trainer --plants 'plant*'`. The controllers are simulated, all in this process: each
 publishes ten samples and its K twice a second, as a loop at 20 Hz does, answers what the trainer asks, and takes what

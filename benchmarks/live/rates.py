@@ -1,6 +1,6 @@
 """How punctual the live loop is at one rate after the other, and the machine beside it at the same time.
 
-    python -m benchmarks.live.rates --document docs/rates.md
+    python -m benchmarks.live.rates --document docs/results/rates.md
 
 For each rate and solver mode `tandem run` goes on for a while, with its trainer, recorder and live view. Beside it runs
 the empty loop of `benchmarks.live.wakeups`, one priority above: nothing of Tandem delays it, so what is late there is

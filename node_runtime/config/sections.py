@@ -316,7 +316,9 @@ class TrainerConfig(Section, frozen=True):
     learning_rate: Positive = 1e-3
     device: Literal["auto", "cpu", "cuda"] = "auto"
     fleet: list[PlantPlace] = msgspec.field(default_factory=list)
-    """Plants with a router each, trained by one `tandem trainer` (docs/fleet.md); empty: who is at `bus.endpoint`."""
+    """Plants with a router each, trained by one `tandem trainer` (docs/tutorials/fleet.md).
+
+    Empty: the one plant at `bus.endpoint`."""
 
 
 class TlsConfig(Section, frozen=True):
@@ -326,7 +328,7 @@ class TlsConfig(Section, frozen=True):
 
 class BusConfig(Section, frozen=True):
     endpoint: str = "tcp/127.0.0.1:7447"
-    """Where the router listens; nodes are its clients. tls/HOST:PORT needs `tls.keys` (docs/remote.md)."""
+    """Where the router listens; nodes are its clients. tls/HOST:PORT needs `tls.keys` (docs/tutorials/remote.md)."""
     remote: str | None = None
     """Where the router listens for other machines as well: tls/0.0.0.0:7448. Only the router reads it."""
     insecure: bool = False

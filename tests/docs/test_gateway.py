@@ -1,4 +1,4 @@
-"""The tables of docs/gateway.md are what the protocol says: keys, sizes, fields and their types."""
+"""The tables of docs/reference/gateway.md are what the protocol says: keys, sizes, fields and their types."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.rights import rights_of
 from protocol.topics import Topic
 from tests.helpers.paths import DOCS
 
-PAGE = (DOCS / "gateway.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "reference/gateway.md").read_text(encoding="utf-8")
 SHOWN = (m.PlantState, m.Piece, m.Command, m.Backup, m.Override, m.Health)
 
 

@@ -1,6 +1,6 @@
 """`make faults`: run every fault many times, print what held, and put the table into the document.
 
-python -m verification.faults --runs 20 --document docs/faults.md
+python -m verification.faults --runs 20 --document docs/results/faults.md
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`make fuzz`: millions of bad payloads through every reader; nothing may crash, hang or grow.
 
-python -m verification.fuzz --payloads 10000000 --document docs/faults.md
+python -m verification.fuzz --payloads 10000000 --document docs/results/faults.md
 """
 
 from __future__ import annotations
