@@ -2,7 +2,7 @@
 
 An architecture sees the last k pairs (x, u), oldest first, and returns the activations of its last hidden layer. It
 is written in a few operations that numpy, CasADi and torch each provide, so that the controller's network and the
-trainer's cannot differ. Derivatives follow from the operations. docs/architectures.md shows a whole one.
+trainer's cannot differ. Derivatives follow from the operations. docs/tutorials/architectures.md shows a whole one.
 """
 
 from __future__ import annotations

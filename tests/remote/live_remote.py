@@ -1,4 +1,7 @@
-"""docs/remote.md to the letter: its four commands, run on two network namespaces. `make remote-test`; needs root."""
+"""The four commands of docs/tutorials/remote.md, run in two network namespaces.
+
+`make remote-test`; needs root.
+"""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ def test_a_plant_that_was_lost_can_be_started_again() -> None:
 
 
 def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
-    # The plant of docs/python.md.
+    # The plant of docs/tutorials/python.md.
     (block,) = re.findall(r"matrices\n\n```python\n(.*?)result = Loop\(cart", PAGE.read_text(), re.DOTALL)
     names: dict[str, Any] = {}
     exec(block, names)

@@ -1,4 +1,4 @@
-"""A plant file of a stranger's, as text: two tanks, from docs/your-plant.md, and a simulator for one of them."""
+"""A user's plant file, as text: two tanks, from docs/tutorials/your-plant.md, and a simulator for one of them."""
 
 from __future__ import annotations
 
