@@ -1,4 +1,4 @@
-"""`tandem router`, `controller`, `trainer`, `plant`, `record` and `live`: one process each, until it is told to stop."""
+"""`tandem router`, `controller`, `trainer`, `plant`, `record`, `live`: one process each, until it is told to stop."""
 
 from __future__ import annotations
 

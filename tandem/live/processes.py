@@ -45,7 +45,12 @@ LIVE = Process("live", "live", "go on", 0.0, optional=True)
 # In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
 # unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
 # them.
-STOP_S = ({"controller": 4.0, "plant": 4.0}, {"trainer": 6.0}, {"recorder": 15.0, "live": 4.0}, {"router": 4.0})
+STOP_S = (
+    {"controller": 4.0, "plant": 4.0},
+    {"trainer": 6.0},
+    {"recorder": 15.0, "live": 4.0},
+    {"router": 4.0},
+)
 
 
 def command_line(command: str, config: Path) -> list[str]:

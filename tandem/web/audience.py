@@ -123,7 +123,9 @@ class Audience:
     def obey(self, viewer: Viewer, text: str | bytes) -> None:
         """Do what a viewer asks for, or tell it that this is not offered."""
         if isinstance(text, bytes):
-            viewer.say(protocol.refusal("this server accepts no messages: it shows a bus and publishes nothing"))
+            viewer.say(
+                protocol.refusal("this server accepts no messages: it shows a bus and publishes nothing")
+            )
             return
         try:
             request = protocol.request_of(text)
@@ -137,7 +139,11 @@ class Audience:
                 kept = {c: s for c, s in viewer.subscriptions.items() if s not in ids}
                 viewer.subscriptions = kept
             case protocol.Unknown(op=op):
-                viewer.say(protocol.refusal(f"{op[:40]!r} is not offered: this server shows a bus and publishes nothing"))
+                viewer.say(
+                    protocol.refusal(
+                        f"{op[:40]!r} is not offered: this server shows a bus and publishes nothing"
+                    )
+                )
 
     def _subscribe(self, viewer: Viewer, wanted: Iterable[protocol.Subscription]) -> None:
         for one in wanted:

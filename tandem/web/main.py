@@ -99,7 +99,9 @@ async def _follow(
         await asyncio.sleep(GATHER_S)
         for i, delivery in enumerate(mailbox.drain(), 1):
             time_ns = delivery.received_ns + to_unix
-            for channel, data in views.show(delivery.key.removeprefix(prefix), delivery.payload, time_ns).shown:
+            for channel, data in views.show(
+                delivery.key.removeprefix(prefix), delivery.payload, time_ns
+            ).shown:
                 audience.publish(channel, time_ns, data)
             if i % BREATH == 0:
                 await asyncio.sleep(0)

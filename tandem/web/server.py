@@ -13,9 +13,10 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
 
 from tandem.web.address import HOST
-from tandem.web.audience import Audience
+from tandem.web.audience import Audience, Viewer
 from tandem.web.foxglove_protocol import SUBPROTOCOLS
 from tandem.web.origins import is_own_name, may_connect
 
@@ -51,7 +52,7 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
 
     async def watch(connection: ServerConnection) -> None:
         viewer = audience.enter()
-        sending = asyncio.create_task(_send(connection, viewer.next_frame))
+        sending = asyncio.create_task(_send(connection, viewer))
         try:
             async for text in connection:
                 audience.obey(viewer, text)
@@ -71,7 +72,7 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
         HOST,
         port,
         process_request=answer,
-        subprotocols=SUBPROTOCOLS,
+        subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
         # The link is this machine's, or a tunnel that compresses by itself if it should.
         compression=None,
         max_size=LARGEST_REQUEST,
@@ -82,10 +83,10 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
         yield next(iter(server.sockets)).getsockname()[1]
 
 
-async def _send(connection: ServerConnection, next_frame) -> None:  # type: ignore[no-untyped-def]
+async def _send(connection: ServerConnection, viewer: Viewer) -> None:
     with suppress(ConnectionClosed):
         while True:
-            await connection.send(await next_frame())
+            await connection.send(await viewer.next_frame())
 
 
 def respond(request: Request, documents: Mapping[str, Document], viewers: int) -> Response | None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from examples.quadrotor.quadrotor import QUADROTOR
 from lbmpc.plants import get_plant
 from node_runtime.config.sections import Config
 from run_log.views.views import Views
 from tandem.web.layout import layout
-from examples.quadrotor.quadrotor import QUADROTOR
 
 PLANTS = {"compressor": get_plant("moore_greitzer"), "quadrotor": QUADROTOR}
 

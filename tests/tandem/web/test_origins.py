@@ -45,11 +45,15 @@ def test_all_other_pages_may_not(origin: str):
     assert not may_connect(origin)
 
 
-@pytest.mark.parametrize("host", ["localhost:8765", "127.0.0.1:8765", "[::1]:8765", "localhost", "LOCALHOST:1"])
+@pytest.mark.parametrize(
+    "host", ["localhost:8765", "127.0.0.1:8765", "[::1]:8765", "localhost", "LOCALHOST:1"]
+)
 def test_the_server_knows_its_own_names(host: str):
     assert is_own_name(host)
 
 
-@pytest.mark.parametrize("host", [None, "", "example.com:8765", "localhost.example.com", "[::1", "a@example.com"])
+@pytest.mark.parametrize(
+    "host", [None, "", "example.com:8765", "localhost.example.com", "[::1", "a@example.com"]
+)
 def test_a_name_that_was_made_to_lead_here_is_not_its_own(host: str | None):
     assert not is_own_name(host)
