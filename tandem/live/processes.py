@@ -20,7 +20,7 @@ class Process:
     """One row of the table."""
 
     name: str
-    """As in `protocol.topics.PROCESSES`, or "live"."""
+    """As in `protocol.topics.PROCESSES`, or "live-view"."""
     command: str
     """The tandem command that it runs."""
     when_it_dies: Literal["end the run", "go on", "restart"]
@@ -40,7 +40,7 @@ TABLE = (
     Process("plant", "plant", "end the run", 30.0),
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
-LIVE = Process("live", "live", "go on", 0.0, optional=True)
+LIVE = Process("live-view", "live", "go on", 0.0, optional=True)
 """Beside the table, where `tandem run --live` asks for it. It publishes nothing, so nobody hears that it is ready."""
 # In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
 # unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
@@ -48,7 +48,7 @@ LIVE = Process("live", "live", "go on", 0.0, optional=True)
 STOP_S = (
     {"controller": 4.0, "plant": 4.0},
     {"trainer": 6.0},
-    {"recorder": 15.0, "live": 4.0},
+    {"recorder": 15.0, "live-view": 4.0},
     {"router": 4.0},
 )
 
