@@ -2,6 +2,7 @@
 
 const $ = (id) => document.getElementById(id);
 const SERIES = ["plant/state", "controller/result", "controller/tick", "controller/timing", "targets", "bounds"];
+const HEALTH = /^(router|plant|controller|trainer|recorder)\/health$/;
 const VIEW = "view/";
 const SILENT_S = 2;
 const EVENTS = 200;
@@ -28,7 +29,7 @@ function below({topic}) { return topic.startsWith(VIEW) ? topic.slice(VIEW.lengt
 
 function wanted(channel) {
   const name = below(channel);
-  return SERIES.includes(name) || name.endsWith("/health") || channel.schemaName === "foxglove.Log";
+  return SERIES.includes(name) || HEALTH.test(name) || channel.schemaName === "foxglove.Log";
 }
 
 // -- messages ----------------------------------------------------------
@@ -36,8 +37,8 @@ function wanted(channel) {
 function take(channel, t, message) {
   const name = below(channel);
   if (channel.schemaName === "foxglove.Log") { addEvent(message); return; }
-  if (newest === null || t > newest) { newest = t; arrived = performance.now() / 1000; }
-  if (name.endsWith("/health")) { health.set(message.process, {message, at: t}); return; }
+  if (newest === null || t > newest || t < newest - CLOCK_SET_S) { newest = t; arrived = performance.now() / 1000; }
+  if (HEALTH.test(name)) { health.set(message.process, {message, at: t}); return; }
   if (!follow(name, t, message.run_id)) return;
   latest[name] = message;
   if (name === "plant/state") streams.state.push(t, {...under("x", message.x), ...under("applied", message.applied)});
@@ -129,14 +130,15 @@ function fitsPeriod(period) {
   return period > 0 && Math.max(0, ...recent) > 0.2 * period;
 }
 
+const shownSeconds = () => Math.max(WINDOW_S, WINDOW_SAMPLES * (streams.state.interval ?? 0));
+
 let drawn = 0;
 function frame() {
   const begun = performance.now();
   // Where the drawing takes long, or nobody looks, it is done less often.
   if (begun >= drawn && newest !== null && !document.hidden && !paused) {
     const time = newest + Math.min(1, begun / 1000 - arrived);
-    const seconds = Math.max(WINDOW_S, WINDOW_SAMPLES * (streams.state.interval ?? 0));
-    for (const plot of plots) if (plot.visible) plot.draw(time - seconds, time, fit);
+    for (const plot of plots) if (plot.visible) plot.draw(time - shownSeconds(), time, fit);
     drawn = begun + Math.max(50, 4 * (performance.now() - begun));
   }
   requestAnimationFrame(frame);
@@ -178,7 +180,7 @@ function showLink() {
 const ORDER = ["router", "plant", "controller", "trainer", "recorder"];
 const CALM = ["ready", "running"];
 function showProcesses() {
-  const names = Object.keys(schemas).filter((name) => name.endsWith("/health")).map((name) => name.split("/")[0]);
+  const names = Object.keys(schemas).filter((name) => HEALTH.test(name)).map((name) => name.split("/")[0]);
   names.sort((a, b) => ORDER.indexOf(a) - ORDER.indexOf(b));
   const rows = names.map((name) => {
     const known = health.get(name);
@@ -261,7 +263,7 @@ setInterval(() => {
   showProcesses();
   if (!paused) { showFigures(); showAbout(); }
   if (newest !== null) {
-    const before = newest - (paused ? PAUSED_KEPT_S : KEPT_S);
+    const before = newest - Math.max(paused ? PAUSED_KEPT_S : KEPT_S, 2 * shownSeconds());
     Object.values(streams).forEach((stream) => stream.trim(before));
     shared.marks = shared.marks.filter((mark) => mark.t > before);
   }

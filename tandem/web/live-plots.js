@@ -2,12 +2,16 @@
 
 const KEPT_S = 120;
 const PAUSED_KEPT_S = 900;
+// A time so much before the last one means that a clock was set.
+const CLOCK_SET_S = 5;
 const WINDOW_S = 30;
 const WINDOW_SAMPLES = 100;
 
 // Rows of numbers with rising times. A gap in time is a row without values, so that no line is drawn through it.
 class Stream {
-  constructor() {
+  constructor() { this.clear(); }
+
+  clear() {
     this.t = [];
     this.columns = new Map();
     this.interval = null;
@@ -17,7 +21,8 @@ class Stream {
 
   push(t, values) {
     const last = this.newest;
-    if (last !== null) {
+    if (last !== null && t < last - CLOCK_SET_S) this.clear();
+    else if (last !== null) {
       if (t <= last) return;
       const usual = this.interval ?? t - last;
       if (t - last > Math.max(0.3, 6 * usual)) this.append(last + usual / 2, {});

@@ -23,6 +23,8 @@ from tandem.web.origins import is_own_name, may_connect
 log = logging.getLogger(__name__)
 
 MOST_VIEWERS = 32
+MOST_NAMED = 20
+"""Origins that are named in the log when they are refused."""
 LARGEST_REQUEST = 256 * 1024
 """Bytes of one request of a viewer: it names channels."""
 
@@ -64,7 +66,14 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
             if viewer.dropped:
                 log.info("a viewer was too slow: %d messages were not sent to it", viewer.dropped)
 
+    refused: set[str] = set()
+
     def answer(_connection: ServerConnection, request: Request) -> Response | None:
+        for origin in request.headers.get_all("Origin"):
+            # Each once: a page may ask all the time.
+            if not may_connect(origin) and origin not in refused and len(refused) < MOST_NAMED:
+                refused.add(origin)
+                log.warning("a page of %s may not connect", origin[:200])
         return respond(request, documents, len(audience.viewers))
 
     async with serve(
@@ -95,9 +104,7 @@ def respond(request: Request, documents: Mapping[str, Document], viewers: int) -
     if not is_own_name(_only(headers, "Host")):
         return _said(HTTPStatus.FORBIDDEN, "this server answers to localhost only; from elsewhere use ssh -L")
     if "websocket" in headers.get("Upgrade", "").lower():
-        origins = headers.get_all("Origin")
-        if not all(may_connect(origin) for origin in origins):
-            log.warning("refused a connection from a page of %s", ", ".join(origins)[:200])
+        if not all(may_connect(origin) for origin in headers.get_all("Origin")):
             return _said(HTTPStatus.FORBIDDEN, "pages of this origin may not connect")
         if viewers >= MOST_VIEWERS:
             return _said(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {viewers} viewers already")
