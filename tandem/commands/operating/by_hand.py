@@ -128,7 +128,7 @@ class ByHand(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Manual(ByHand):
-    """Drive a running plant manually, until Ctrl-C or until the plant would leave X. The controller goes on learning and
+    """Drive a running plant manually, until Ctrl-C or until the plant would leave X. The controller goes on learning, and
     takes over at the end. With certificates it needs the commander's."""
 
     inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]
