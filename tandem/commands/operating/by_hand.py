@@ -128,7 +128,7 @@ class ByHand(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Manual(ByHand):
-    """Drive a running plant manually, until Ctrl-C or until the plant would leave X. The controller goes on learning, and
+    """Drive a running plant manually, until Ctrl-C or until it would leave X. The controller goes on learning, and
     takes over at the end. With certificates it needs the commander's."""
 
     inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]
@@ -176,8 +176,8 @@ class Manual(ByHand):
 
 @dataclass(frozen=True, kw_only=True)
 class Pause(ByHand):
-    """Let the controller hold a running plant at the equilibrium nearest to its state, until Ctrl-C. With certificates it
-    needs the commander's."""
+    """Let the controller hold a running plant at the equilibrium nearest to its state, until Ctrl-C. With certificates
+    it needs the commander's."""
 
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
