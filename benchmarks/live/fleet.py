@@ -23,7 +23,7 @@ import tyro
 import zenoh
 from rich.console import Console
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage
 from benchmarks.live.ports import free_port
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
@@ -153,7 +153,7 @@ def main() -> int:
     except DocumentError as error:
         console.print(str(error), markup=False)
         return 2
-    rows, text = [], [_command(settings)]
+    rows, text = [], _command(settings)
     text += _ratios(settings, console)
     for batch in settings.batch:
         for plants in settings.plants:
@@ -166,10 +166,9 @@ def main() -> int:
     return 0
 
 
-def _command(settings: Fleet) -> str:
-    told = provenance.describe()
+def _command(settings: Fleet) -> list[str]:
     words = "" if settings.seconds == Fleet.seconds else f" --seconds {settings.seconds:g}"
-    return f"`python -m benchmarks.live.fleet{words}`, on {told['processor']}, {told['cores']} cores, {told['system']}."
+    return conditions(f"python -m benchmarks.live.fleet{words}")
 
 
 # -- the trainer as a process ------------------------------------------------------------------------------
