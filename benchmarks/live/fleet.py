@@ -1,6 +1,6 @@
 """One trainer for many plants: time from samples to weights, and what a stack saves.
 
-    python -m benchmarks.live.fleet --document docs/tutorials/fleet.md
+    python -m benchmarks.live.fleet --document docs/results/fleet.md
 
 A real router and a real `tandem trainer --plants 'plant*'`. The controllers are simulated, all in this process: each
 publishes ten samples and its K twice a second, as a loop at 20 Hz does, answers what the trainer asks, and takes what
@@ -291,8 +291,8 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
 
 def _table(rows: list[Row], settings: Fleet) -> list[str]:
     lines = [
-        f"Of {settings.seconds:g} s with so many plants, after {settings.warm:g} s of warming up; a training is "
-        f"{TrainerConfig().steps} steps.",
+        f"Each row: {settings.seconds:g} s with this number of plants, after {settings.warm:g} s of warming up. "
+        f"A training has {TrainerConfig().steps} steps.",
         "",
         "| plants | samples drawn | from samples to weights, s: median | p99 | longest | still waiting at the end, s "
         "| weights a plant, fewest, most | trainings a second | trainer, cores |",
