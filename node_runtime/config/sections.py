@@ -27,20 +27,20 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 # Upper limits are far above every honest use. A log brings its configuration along: memory and time are taken by it.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
-"""How many of something, each of which takes memory or time."""
+"""A number of things that take memory or time each."""
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000), unit("ms")]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e6), unit("s")]
 LONGEST_PERIOD = 1e6
 Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
-"""Two of them differ by so little that rounding leaves a covariance positive."""
+"""Limited so that rounding leaves a covariance of two of them positive."""
 LONGEST_HORIZON = 1000
 DEAD_TIME = "dead_time"
-"""In `plant.truth`, beside the parameters of the equations."""
+"""The key of the dead time in `plant.truth`, beside the parameters of the equations."""
 MOST_DEAD_PERIODS = 50
-"""Of a simulated plant, as `lbmpc.model` has it for a controller."""
+"""Largest dead time of a simulated plant, in periods. `lbmpc.model` has the same limit for a controller."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
-"""What may be part of a key on the bus."""
+"""Pattern of a name that is part of a key on the bus."""
 Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
 
 
@@ -59,9 +59,9 @@ Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1e3), HALF_WIDTHS]
 Instant = Annotated[float, msgspec.Meta(ge=0, le=1e6), unit("s")]
-"""Seconds from a beginning, or 0."""
+"""Seconds, 0 included."""
 Shares = Share | dict[str, Share]
-"""Shares of half-widths: one for every state, or by the state's name, and then 0 for those that are not named."""
+"""Shares of half-widths: one for every state, or a table by state in which states that are not named have 0."""
 
 
 class SensorsConfig(Section, frozen=True):
