@@ -93,8 +93,10 @@ def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Is
 
 def renew(
     role: str, folder: Path, hosts: Sequence[str], days: int, drawer: Path | None
-) -> tuple[Issued, Issued]:
-    """A new key and certificate for one role; returns the old one and the new one.
+) -> tuple[Issued | None, Issued]:
+    """Issue a new key and certificate for one role; return the old one and the new one.
+
+    The old one is None for a role that these keys do not have yet: a later version may know more roles.
 
     folder: the plant's; hosts: more names for the router, beside those that it has; drawer: where the authority is,
     None: in the folder.
@@ -109,20 +111,21 @@ def renew(
         ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
         raise Refused(f"{place / KEY}: is not the key of {CERTIFICATE} beside it")
-    old = _issued(folder / role)
-    if old is None:
-        raise Refused(f"{folder / role / CERTIFICATE}: not there; is {folder} a plant's folder of keys?")
     _, plant = _role_and_plant(authority)
-    if plant != old.plant:
+    old = _issued(folder / role)
+    if old is None and not any(one.plant == plant for one in found(folder)):
+        raise Refused(f"{folder}: has no certificate of {plant}; is it the plant's folder of keys?")
+    if old is not None and plant != old.plant:
         raise Refused(f"{place}: is the authority of {plant}, and {folder / role} is of {old.plant}")
     left = (authority.not_valid_after_utc - datetime.now(UTC)).days
     if not 1 <= days < left:
         raise Refused(f"--days {days}: at least 1, and less than the {left} that the authority has left")
     if hosts and role != "router":
         raise Refused(f"--host: only the router's certificate names hosts, not the {role}'s")
-    names = _host_names([*old.hosts, *hosts]) if role == "router" else []
+    names = _host_names([*(ALWAYS if old is None else old.hosts), *hosts]) if role == "router" else []
     with _refused_where_it_cannot_write(folder):
-        issue(folder / role, common_name(role, old.plant), key, authority, days, names)
+        (folder / role).mkdir(mode=0o700, exist_ok=True)
+        issue(folder / role, common_name(role, plant), key, authority, days, names)
     new = _issued(folder / role)
     assert new is not None
     return old, new

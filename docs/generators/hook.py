@@ -8,13 +8,12 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
-from docs.generators import outside
+from docs.generators import cli, configuration, messages, outside
 
 GENERATED = {
-    "reference/cli.md": lambda: "# Command line\n",
-    "reference/configuration.md": lambda: "# Configuration\n",
-    "reference/messages.md": lambda: "# Topics and messages\n",
-    "reference/python.md": lambda: "# Python\n",
+    "reference/cli.md": cli.page,
+    "reference/configuration.md": configuration.page,
+    "reference/messages.md": messages.page,
 }
 # Files outside docs/ that mkdocs.yml lists.
 IN_THE_NAVIGATION = ("examples/README.md",)
@@ -32,10 +31,12 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made from the code, and the files outside docs/ that pages link to."""
-    pages = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
+    pages = {f"docs/{file.src_uri}": file.content_string for file in files.documentation_pages()}
     for uri, make in GENERATED.items():
-        files.append(File.generated(config, uri, content=make()))
-    for path in outside.linked_files([*pages, *IN_THE_NAVIGATION]):
+        pages[f"docs/{uri}"] = make()
+        files.append(File.generated(config, uri, content=pages[f"docs/{uri}"]))
+    pages |= {path: outside.as_page(path) for path in IN_THE_NAVIGATION}
+    for path in outside.linked_files(pages):
         uri = outside.site_path(path)
         if uri.endswith(".md"):
             level = InclusionLevel.INCLUDED if path in IN_THE_NAVIGATION else InclusionLevel.NOT_IN_NAV
@@ -48,9 +49,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Point links out of docs/ to where the linked file stands in the site."""
-    if page.file.src_uri in GENERATED:
-        return markdown
-    return outside.with_site_links(markdown, outside.repository_path(page.file.src_uri))
+    uri = page.file.src_uri
+    source = f"docs/{uri}" if uri in GENERATED else outside.repository_path(uri)
+    return outside.with_site_links(markdown, source)
 
 
 def _pages_of(folder: str) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,18 +54,22 @@ def with_site_links(text: str, page: str) -> str:
     return "".join([*parts, _LINK.sub(one, text[end:])])
 
 
-def linked_files(pages: Iterable[str]) -> list[str]:
-    """Return all existing files outside docs/ that these pages link to, directly or through one another."""
-    waiting = list(pages)
+def linked_files(pages: Mapping[str, str]) -> list[str]:
+    """Return all existing files outside docs/ that these pages link to, directly or through one another.
+
+    Args:
+        pages: Markdown by the path of the page in the repository; pages outside docs/ are among what is returned.
+    """
+    waiting = dict(pages)
     found = {page for page in waiting if not page.startswith("docs/")}
     while waiting:
-        page = waiting.pop()
-        for target in links((ROOT / page).read_text(encoding="utf-8"), page):
+        page, text = waiting.popitem()
+        for target in links(text, page):
             if target in found or target.startswith(("docs/", "..")) or not (ROOT / target).is_file():
                 continue
             found.add(target)
             if target.endswith(".md"):
-                waiting.append(target)
+                waiting[target] = as_page(target)
     return sorted(found)
 
 

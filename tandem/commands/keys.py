@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tandem.certificate_authority import Issued
 
-ROLE = "router|plant|controller|trainer|recorder|operator|commander"
+ROLE = "router|plant|controller|trainer|recorder|viewer|commander"
 
 
 class Shows(Command):
@@ -87,7 +87,7 @@ class KeysCreate(Shows):
 
 @dataclass(frozen=True, kw_only=True)
 class KeysRenew(Command):
-    """Make one role's key and certificate anew, from the authority that there is."""
+    """Make one role's key and certificate anew, or for the first time, from the authority that there is."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """The plant's folder: keys/NAME."""
@@ -116,9 +116,11 @@ class KeysRenew(Command):
             hosts = self.host if role == "router" or len(self.role) == 1 else []
             old, new = certificate_authority.renew(role, self.folder, hosts, self.days, self.authority)
             renewed.append(new)
+            was = "" if old is None else f", was {old.valid_until:%Y-%m-%d}"
+            still = "" if old is None else " The old certificate works until its end."
             self.say(
-                f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}, was {old.valid_until:%Y-%m-%d}. Copy the "
-                f"folder to the {role}'s machine and start the {role} again. The old certificate works until its end.",
+                f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}{was}. Copy the folder to the {role}'s machine "
+                f"and start the {role} again.{still}",
             )
         self.emit({"certificates": [_plain(one) for one in renewed]})
         return 0

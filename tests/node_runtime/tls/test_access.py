@@ -97,7 +97,7 @@ def test_who_was_denied_is_known_after_any_number_of_sessions():
         refusals.read(
             head
             + f"{k:x} on Interface(lo)"
-            + who.format("operator.jet1", "")
+            + who.format("viewer.jet1", "")
             + "Put (ingress) on tandem/jet1/x"
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
