@@ -269,4 +269,4 @@ def test_the_check_says_what_is_wrong(
 
 
 def test_the_page_shows_the_example() -> None:
-    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "architectures.md").read_text()
+    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "tutorials/architectures.md").read_text()
