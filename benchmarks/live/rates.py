@@ -89,7 +89,7 @@ def _table(settings: Rates) -> Iterator[str]:
     head = [
         *conditions(command, "Each row is the run"),
         "",
-        *("```", run, "```"),
+        *("```text", run, "```"),
         "",
         f"| {' | '.join(COLUMNS)} |",
         f"| {' | '.join(['---:'] * len(COLUMNS))} |",
