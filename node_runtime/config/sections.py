@@ -27,20 +27,20 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 # Upper limits are far above any useful value. A log contains its configuration, which then costs memory and time.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
-"""How many of something, each of which takes memory or time."""
+"""A number of things that take memory or time each."""
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000), unit("ms")]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e6), unit("s")]
 LONGEST_PERIOD = 1e6
 Variance = Annotated[float, msgspec.Meta(ge=1e-6, le=1e3)]
-"""Limits keep the ratio of two variances small enough for a covariance to stay positive under rounding."""
+"""Limited so that rounding leaves a covariance of two of them positive."""
 LONGEST_HORIZON = 1000
 DEAD_TIME = "dead_time"
-"""Key in `plant.truth`, besides the parameters of the equations."""
+"""The key of the dead time in `plant.truth`, beside the parameters of the equations."""
 MOST_DEAD_PERIODS = 50
-"""Largest dead time of a simulated plant in periods, the same as for a controller in `lbmpc.model`."""
+"""Largest dead time of a simulated plant, in periods. `lbmpc.model` has the same limit for a controller."""
 Unit = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 PLANT_NAME = r"^[A-Za-z0-9_-]{1,40}$"
-"""Characters that may be part of a key on the bus."""
+"""Pattern of a name that is part of a key on the bus."""
 Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
 
 
@@ -59,9 +59,9 @@ Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1e3), HALF_WIDTHS]
 Instant = Annotated[float, msgspec.Meta(ge=0, le=1e6), unit("s")]
-"""Seconds from a beginning, or 0."""
+"""Seconds, 0 included."""
 Shares = Share | dict[str, Share]
-"""Shares of half-widths: one number for all states, or numbers by state name with 0 for the others."""
+"""Shares of half-widths: one for every state, or a table by state in which states that are not named have 0."""
 
 
 class SensorsConfig(Section, frozen=True):
