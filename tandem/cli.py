@@ -75,6 +75,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return output.exit_code(code)
 
 
+def parse(argv: Sequence[str]) -> Command:
+    """Return the command that these arguments ask for, without running it.
+
+    Raises:
+        SystemExit: after `--help`, or a mistake in the arguments.
+    """
+    parsed: Any = tyro.cli(
+        AnyCommand,
+        prog="tandem",
+        description="Learning-based model predictive control that learns while it runs. --version says which this is.",
+        args=argv,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    return getattr(parsed, "action", parsed)
+
+
 def _do(argv: Sequence[str]) -> int:
     from tandem import terminal
 
@@ -83,14 +99,7 @@ def _do(argv: Sequence[str]) -> int:
 
         terminal.write(f"tandem {version('tandem-control')}\n")
         return 0
-    parsed: Any = tyro.cli(
-        AnyCommand,
-        prog="tandem",
-        description="Learning-based model predictive control that learns while it runs. --version says which this is.",
-        args=argv,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
-    command: Command = getattr(parsed, "action", parsed)
+    command = parse(argv)
     from node_runtime.config.strict import ConfigError
     from run_log.errors import LogError
 
