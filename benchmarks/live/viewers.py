@@ -1,4 +1,4 @@
-"""What a live view costs the loop: tick times with and without one, in turns within one run.
+"""Tick times with and without a live view, in turns within one run.
 
     python -m benchmarks.live.viewers --rate 20
 
@@ -34,14 +34,14 @@ FIGURES = ("tick_ms", "solve_ms", "lateness_ms")
 
 @dataclass(frozen=True)
 class Viewers:
-    """How long, and how many look."""
+    """Length of the measurement, and number of viewers."""
 
     rate: float = 20.0
     """Samples a second."""
     turns: int = 6
-    """Of each kind."""
+    """Number of turns with a view, and of turns without."""
     seconds: float = 15.0
-    """Counted of each turn."""
+    """Seconds of each turn that are counted."""
     viewers: int = 1
     set: list[str] = field(default_factory=list)
     """More section.key=value for `tandem run`."""
@@ -86,7 +86,6 @@ def _alternate(settings: Viewers, log: Path) -> Iterator[tuple[bool, float, floa
         while b"the first command" not in (line := run.stdout.readline()):
             if not line:
                 raise RuntimeError("the run ended before its first command")
-        # Nobody reads what it says, and it goes on.
         for turn in range(2 * settings.turns):
             viewed = turn % 2 == 1
             live = _tandem("live", *options) if viewed else None

@@ -127,7 +127,11 @@ class Run(Configured):
         return self.seconds
 
     def _live(self, config: Config) -> bool:
-        """Whether to serve the run to browsers. Says where, or why not. Raises `Refused`: a package is missing."""
+        """Return whether to serve the run to browsers, and print where, or why not.
+
+        Raises:
+            Refused: a package is missing.
+        """
         if not self.live:
             return False
         if find_spec("websockets") is None:

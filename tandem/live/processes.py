@@ -41,7 +41,7 @@ TABLE = (
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
 LIVE = Process("live-view", "live", "go on", 0.0, optional=True)
-"""Beside the table, where `tandem run --live` asks for it. It publishes nothing, so nobody hears that it is ready."""
+"""Started beside the table by `tandem run --live`. It publishes nothing, so it cannot say that it is ready."""
 # In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
 # unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
 # them.

@@ -7,7 +7,7 @@ import socket
 from node_runtime.config.sections import Config
 
 HOST = "127.0.0.1"
-"""Nothing leaves the machine: whoever reaches the port may read."""
+"""Loopback only: every client that reaches the port may read."""
 
 
 def address(config: Config) -> str:

@@ -1,4 +1,4 @@
-"""Who looks at the moment, and what waits to be sent to each: bounded, the oldest gives way. No I/O."""
+"""The connected viewers, and a bounded queue of frames for each. No I/O."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from run_log.views.channel import Channel
 from tandem.web import foxglove_protocol as protocol
 
 WAITING_BYTES = 2 * 1024 * 1024
-"""Of messages that wait for one viewer; beyond it the oldest is dropped."""
+"""Bytes of messages that may wait for one viewer. Beyond that the oldest message is dropped."""
 
 
 class Viewer:
@@ -59,7 +59,7 @@ class Viewer:
 
 @dataclass
 class _Advertised:
-    """A channel as it was advertised, and its latest messages for those who come later."""
+    """A channel as it was advertised, and its latest messages for new subscribers."""
 
     id: int
     channel: Channel
@@ -67,13 +67,13 @@ class _Advertised:
 
 
 class Audience:
-    """All viewers and all channels.
+    """The viewers and the channels of one server.
 
     Args:
         name: what a viewer shows as the source.
         session: the same for as long as this server runs.
-        metadata: for whoever reads it.
-        keep: how many of a topic's latest messages a viewer gets that subscribes later.
+        metadata: facts about the system, by name.
+        keep: number of the latest messages of a topic that a new subscriber receives.
     """
 
     def __init__(self, name: str, session: str, metadata: dict[str, str], keep: Callable[[str], int]):
@@ -85,7 +85,7 @@ class Audience:
         self.viewers: set[Viewer] = set()
 
     def advertise(self, channel: Channel) -> _Advertised:
-        """Make a channel known to all viewers; one of the same topic with other fields takes the former's place."""
+        """Make a channel known to all viewers. It replaces a channel of the same topic that has other fields."""
         before = self._by_topic.get(channel.topic)
         if before is not None and before.channel is channel:
             return before
@@ -102,14 +102,14 @@ class Audience:
         return now
 
     def publish(self, channel: Channel, time_ns: int, data: bytes) -> None:
-        """Show a message to all viewers of its channel."""
+        """Send a message to all subscribers of its channel."""
         advertised = self.advertise(channel)
         advertised.kept.append((time_ns, data))
         for viewer in self.viewers:
             viewer.show(advertised.id, time_ns, data)
 
     def enter(self) -> Viewer:
-        """A viewer has come: it is greeted, and hears of all channels."""
+        """Add a viewer, and tell it about the server and all channels."""
         viewer = Viewer()
         viewer.say(self._greeting)
         viewer.say(protocol.advertise((one.id, one.channel) for one in self._by_id.values()))
@@ -117,11 +117,11 @@ class Audience:
         return viewer
 
     def leave(self, viewer: Viewer) -> None:
-        """A viewer has gone."""
+        """Remove a viewer."""
         self.viewers.discard(viewer)
 
     def obey(self, viewer: Viewer, text: str | bytes) -> None:
-        """Do what a viewer asks for, or tell it that this is not offered."""
+        """Carry out a request of a viewer, or answer that it is not offered."""
         if isinstance(text, bytes):
             viewer.say(
                 protocol.refusal("this server accepts no messages: it shows a bus and publishes nothing")

@@ -1,4 +1,4 @@
-"""The Foxglove WebSocket protocol, as far as a server needs it that publishes JSON channels and accepts nothing. Pure.
+"""The part of the Foxglove WebSocket protocol that a read-only server of JSON channels needs. Pure.
 
 Text frames are JSON objects with an `op`. A binary frame is one message of one channel.
 """
@@ -13,16 +13,16 @@ import msgspec
 from run_log.views.channel import Channel
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Both names of the protocol. They differ in nothing that is used here."""
+"""Both names of the protocol. The parts that are used here are equal in both."""
 MESSAGE_DATA = 0x01
 HEADER = struct.Struct("<BIQ")
-"""Of a binary frame: opcode, subscription, time of the message in ns."""
+"""Head of a binary frame: opcode, subscription, time of the message in ns."""
 ERROR = 2
 """Level of a status that a viewer shows as an error."""
 
 
 class Subscription(msgspec.Struct, frozen=True):
-    """What a client wants to hear, and the number that it gives to it."""
+    """A channel that a client asks for, and the number of the subscription, which the client chooses."""
 
     id: int
     channelId: int
@@ -48,7 +48,7 @@ _unknown = msgspec.json.Decoder(Unknown)
 
 
 def request_of(text: str | bytes) -> Request:
-    """Return what a client asks for.
+    """Return the request of a client.
 
     Raises:
         ValueError: the text is no request of this protocol.
@@ -73,7 +73,7 @@ def server_info(name: str, session: str, metadata: Mapping[str, str]) -> str:
     Args:
         name: what a viewer shows as the source.
         session: the same for as long as this server runs; a client that reconnects keeps its data then.
-        metadata: for whoever reads it.
+        metadata: facts about the system, by name.
     """
     return _text(
         {

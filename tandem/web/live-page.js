@@ -42,7 +42,9 @@ function take(channel, t, message) {
   if (!follow(name, t, message.run_id)) return;
   latest[name] = message;
   if (name === "plant/state") streams.state.push(t, {...under("x", message.x), ...under("applied", message.applied)});
-  if (name === "controller/timing") streams.timing.push(t, {solve: message.solve_ms, tick: message.tick_ms, lateness: message.lateness_ms});
+  if (name === "controller/timing") {
+    streams.timing.push(t, {solve: message.solve_ms, tick: message.tick_ms, lateness: message.lateness_ms});
+  }
   if (name === "targets") streams.targets.push(t, {...under("x", message.x), ...under("u", message.u)});
   if (name === "controller/tick") countTick(t, message);
   if (name === "controller/result") {
@@ -107,11 +109,13 @@ function build() {
       {stream: state, column: `applied.${name}`, label: "applied", color: "measured"}]});
   }
   if (shared.margin) {
-    add({title: "margin", meaning: "to the certified sets, in half-widths", unit: "1", bounds: () => [0, null], series: [
+    add({title: "margin", meaning: "to the certified sets, in half-widths", bounds: () => [0, null], series: [
       {stream: result, column: "margin", label: "margin", color: "measured"}]});
   }
   const period = 1000 / Number(metadata.rate);
-  add({title: "tick", meaning: "how long it takes, and how late it starts", unit: "ms", zero: true, bounds: () => [null, fitsPeriod(period) ? period : null], series: [
+  const late = () => [null, isNear(period) ? period : null];
+  const meaning = "how long it takes, and how late it starts";
+  add({title: "tick", meaning, unit: "ms", zero: true, bounds: late, series: [
     {stream: timing, column: "lateness", label: "lateness", color: "target"},
     {stream: timing, column: "solve", label: "solver", color: "other"},
     {stream: timing, column: "tick", label: "tick", color: "measured"}]});
@@ -124,7 +128,7 @@ function build() {
 }
 
 // The period is a bound of what a tick may take, shown where a tick comes near it.
-function fitsPeriod(period) {
+function isNear(period) {
   const {timing} = streams;
   const recent = timing.columns.get("tick")?.slice(-100) ?? [];
   return period > 0 && Math.max(0, ...recent) > 0.2 * period;
@@ -135,7 +139,7 @@ const shownSeconds = () => Math.max(WINDOW_S, WINDOW_SAMPLES * (streams.state.in
 let drawn = 0;
 function frame() {
   const begun = performance.now();
-  // Where the drawing takes long, or nobody looks, it is done less often.
+  // Slow drawing is done less often, and a hidden page is not drawn.
   if (begun >= drawn && newest !== null && !document.hidden && !paused) {
     const time = newest + Math.min(1, begun / 1000 - arrived);
     for (const plot of plots) if (plot.visible) plot.draw(time - shownSeconds(), time, fit);
@@ -168,7 +172,8 @@ function showTitle(name) {
 function showAbout() {
   const {model, oracle, rate} = metadata;
   const run = runs["controller/result"]?.run;
-  $("about").textContent = [model, oracle, rate && `${rate} Hz`, run && `run ${run.replace(/^controller-/, "")}`].filter(Boolean).join(" · ");
+  const facts = [model, oracle, rate && `${rate} Hz`, run && `run ${run.replace(/^controller-/, "")}`];
+  $("about").textContent = facts.filter(Boolean).join(" · ");
 }
 
 function showLink() {
@@ -187,11 +192,13 @@ function showProcesses() {
     const now = newest + Math.max(0, performance.now() / 1000 - arrived);
     const silent = known && now - known.at > SILENT_S;
     const status = !known ? "not heard of" : silent ? "silent" : known.message.status;
-    const row = element("li", undefined, `state ${CALM.includes(status) ? "good" : status === "failed" ? "bad" : known ? "wait" : ""}`);
+    const tone = CALM.includes(status) ? "good" : status === "failed" ? "bad" : known ? "wait" : "";
+    const row = element("li", undefined, `state ${tone}`);
     row.append(element("b", name), ` ${status}`);
     const note = known?.message.note;
     if (note && !CALM.includes(status)) row.append(element("span", `: ${note}`, "note"));
-    if (known) row.title = [note, ...Object.entries(known.message.counters).map(([key, count]) => `${key}: ${count}`)].filter(Boolean).join("\n");
+    const counters = Object.entries(known?.message.counters ?? {}).map(([key, count]) => `${key}: ${count}`);
+    row.title = [note, ...counters].filter(Boolean).join("\n");
     return row;
   });
   $("processes").replaceChildren(...rows);
@@ -217,11 +224,15 @@ function figures() {
   const first = ticks[0], last = ticks[ticks.length - 1];
   const rate = ticks.length > 1 && last.t > first.t ? (last.seq - first.seq) / (last.t - first.t) : null;
   const shown = [["Tick", tick ? String(tick.seq) : "–", rate === null ? "" : ` ${rate.toPrecision(3)} Hz`]];
-  shown.push(["Tick takes", ...spread("tick")], ["Solver takes", ...spread("solve")], ["Lateness", ...spread("lateness")]);
+  for (const [title, column] of [["Tick takes", "tick"], ["Solver takes", "solve"], ["Lateness", "lateness"]]) {
+    shown.push([title, ...spread(column)]);
+  }
   shown.push(["Late, skipped", `${late}, ${skipped}`, "", late || skipped ? "warn-text" : ""]);
-  shown.push(["Command from", result?.mode.replaceAll("_", " ") ?? "–", "", result && result.mode !== "solver" ? "bad-text" : ""]);
-  shown.push(["Input from", state?.source ?? "–", "", ["safe", "plan"].includes(state?.source) ? "bad-text" : ""]);
-  if (result?.set_margin !== undefined) shown.push(["Margin", short(result.set_margin), "", result.set_margin < 0 ? "bad-text" : ""]);
+  const tone = (bad) => (bad ? "bad-text" : "");
+  shown.push(["Command from", result?.mode.replaceAll("_", " ") ?? "–", "", tone(result && result.mode !== "solver")]);
+  shown.push(["Input from", state?.source ?? "–", "", tone(["safe", "plan"].includes(state?.source))]);
+  const margin = result?.set_margin;
+  if (margin !== undefined) shown.push(["Margin", short(margin), "", tone(margin < 0)]);
   shown.push(["Prediction error", short(result?.prediction_error)]);
   if (result) shown.push(["Weights", result.hidden_version < 0 ? "initial" : `version ${result.hidden_version}`]);
   if (result?.slack > 1e-6) shown.push(["Slack", short(result.slack), ` ${result.slack_row}`, "warn-text"]);

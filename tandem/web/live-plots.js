@@ -103,7 +103,8 @@ class Plot {
   }
 
   options(width, unit) {
-    const axis = {stroke: () => color("dim"), font: FONT, ticks: {show: false}, grid: {stroke: () => color("line"), width: 1}};
+    const grid = {stroke: () => color("line"), width: 1};
+    const axis = {stroke: () => color("dim"), font: FONT, ticks: {show: false}, grid};
     const nearest = (u, which, row) => {
       const values = u.data[which];
       if (which === 0 || row === null || values[row] != null) return row;
@@ -119,8 +120,8 @@ class Plot {
       cursor: {sync: {key: "time"}, drag: {x: true, y: false}, points: {size: 6}, dataIdx: nearest},
       axes: [
         {...axis, size: 22, space: 80, values: (_u, splits) => splits.map((one) => clock(one))},
-        {...axis, size: 54, space: 26, label: unit && unit !== "1" ? unit : undefined, labelSize: 16, labelFont: FONT, labelGap: 0,
-          values: (_u, splits) => splits.map(tickLabel)},
+        {...axis, size: 54, space: 26, values: (_u, splits) => splits.map(tickLabel),
+          label: unit && unit !== "1" ? unit : undefined, labelSize: 16, labelFont: FONT, labelGap: 0},
       ],
       series: [
         {label: "at", value: (_u, t) => (t == null ? "" : clock(t, 2))},

@@ -1,10 +1,10 @@
-// The bus over the Foxglove WebSocket protocol: connects, subscribes, and connects again for as long as the page is open.
+// A client of the Foxglove WebSocket protocol. It subscribes, and connects again as long as the page is open.
 
 const SUBPROTOCOLS = ["foxglove.sdk.v1"];
 const AGAIN_MS = [250, 500, 1000, 2000];
 
 class Socket {
-  // wanted(channel): whether to subscribe to it. on: what to do with what comes, {info, channel, message, link}.
+  // wanted(channel): whether to subscribe to it. on: the handlers {info, channel, message, link}.
   constructor(url, wanted, on) {
     this.url = url;
     this.wanted = wanted;
@@ -40,7 +40,7 @@ class Socket {
         for (const {id, topic, schemaName, schema} of word.channels) {
           const channel = {id, topic, schemaName, schema: JSON.parse(schema)};
           if (!this.wanted(channel)) continue;
-          // The number of a subscription is free: it is that of its channel.
+          // The client chooses the number of a subscription: that of its channel.
           this.channels.set(id, channel);
           this.on.channel(channel);
           subscriptions.push({id, channelId: id});

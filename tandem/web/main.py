@@ -1,4 +1,4 @@
-"""`tandem live`: shows the bus of one plant in a browser, in a process of its own."""
+"""`tandem live`: serves the bus of one plant to browsers, in a process of its own."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from tandem.web.server import Document, serving
 log = logging.getLogger(__name__)
 
 GATHER_S = 0.02
-"""Messages are fetched together: to wake for each costs more than to show it."""
+"""Messages are fetched together, because waking for each one costs more than showing it."""
 BREATH = 200
-"""Messages after which the server's other work has a turn."""
+"""Number of messages after which the server's other tasks get a turn."""
 VIEW_HZ = 100.0
 EVENTS_KEPT = 200
 EVENTS, BOUNDS = f"{VIEW}events", f"{VIEW}bounds"
@@ -108,7 +108,7 @@ async def _follow(
 
 
 def _kept(topic: str) -> int:
-    """How many of a channel's latest messages a viewer gets that comes later: what does not come again soon."""
+    """Return the number of a channel's latest messages that a new viewer gets: those of slow channels."""
     if topic in (EVENTS, BOUNDS):
         return EVENTS_KEPT if topic == EVENTS else 1
     known = topics.BY_NAME.get(topic.removeprefix(VIEW))

@@ -1,4 +1,4 @@
-"""Which pages may read the socket: a browser lets every page of the web connect to this machine. Pure."""
+"""The pages that may read the socket. A browser lets every page of the web connect to this machine. Pure."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from urllib.parse import urlsplit
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 APPS = ("https://app.foxglove.dev",)
-"""Viewers on the web that may be used with it."""
+"""Viewers on the web that may connect."""
 FILE = "file://"
 """Origin of an application that is installed here: the desktop applications of Foxglove and Lichtblick."""
 
 
 def may_connect(origin: str | None) -> bool:
-    """Return whether a socket may be opened by who sends this `Origin` header.
+    """Return whether a client with this `Origin` header may open a socket.
 
     A program sends none. A browser sends that of the page: only a page that comes from this machine, or from one of
     `APPS`, may connect. "null" is that of a sandboxed frame of any page of the web.
@@ -29,7 +29,7 @@ def may_connect(origin: str | None) -> bool:
 def is_own_name(host: str | None) -> bool:
     """Return whether a `Host` header names this machine as loopback; the port may be that of a tunnel.
 
-    The page of another name that was made to resolve to 127.0.0.1 (DNS rebinding) sends its own name.
+    A page whose name was made to resolve to 127.0.0.1 (DNS rebinding) sends that name.
     """
     try:
         return urlsplit(f"//{host or ''}").hostname in LOOPBACK

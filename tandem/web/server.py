@@ -30,7 +30,7 @@ LARGEST_REQUEST = 256 * 1024
 
 
 class Document(NamedTuple):
-    """What is served at one path."""
+    """A document that is served at one path."""
 
     kind: str
     """Its media type."""
@@ -44,7 +44,7 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
     """Serve on loopback until the block ends; yields the port.
 
     Args:
-        audience: who looks, and what they are shown.
+        audience: the viewers and the channels.
         documents: by path, as "/".
         port: 0 takes any.
 
@@ -86,7 +86,7 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
         compression=None,
         max_size=LARGEST_REQUEST,
         server_header=None,
-        # What breaks off inside a handshake is the browser's to say.
+        # Broken handshakes are no events of the system.
         logger=_quiet(),
     ) as server:
         yield next(iter(server.sockets)).getsockname()[1]
@@ -116,7 +116,7 @@ def respond(request: Request, documents: Mapping[str, Document], viewers: int) -
 
 
 def _only(headers: Headers, name: str) -> str | None:
-    """The value of a header; None where it is missing or there are several."""
+    """Return the value of a header; None if it is missing or given twice."""
     values = headers.get_all(name)
     return values[0] if len(values) == 1 else None
 

@@ -55,7 +55,7 @@ def test_the_wheel_names_its_extras(wheel: Path):
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
         said = archive.read(name).decode().splitlines()
     extras = {line.partition(": ")[2] for line in said if line.startswith("Provides-Extra: ")}
-    assert extras == {"trainer", "log", "experiment", "examples", "dev"}
+    assert extras == {"trainer", "log", "live", "experiment", "examples", "docs", "dev"}
 
 
 def test_shipped_files_are_found_through_the_link():

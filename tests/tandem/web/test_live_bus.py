@@ -76,7 +76,7 @@ def state(bus: Bus, seq: int) -> m.PlantState:
 
 
 async def keep_saying(bus: Bus) -> None:
-    """Until it is heard: a message that is sent before somebody listens reaches nobody."""
+    """Publish states until cancelled: the first ones are sent before the server subscribes."""
     for seq in range(LAST):
         bus.publish(topics.PLANT_STATE, state(bus, seq))
         await asyncio.sleep(0.05)
