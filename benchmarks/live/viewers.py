@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 import tempfile
@@ -21,13 +22,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
 
 from benchmarks.live.ports import free_port
 from node_runtime import provenance
 from protocol import topics
 from run_log.reading.reader import read_run
 
-SETTLE_S = 8.0
+SETTLE_S = 5.0
 """Seconds at the beginning of a turn that are not counted."""
 FIGURES = ("tick_ms", "solve_ms", "lateness_ms")
 
@@ -89,6 +91,8 @@ def _alternate(settings: Viewers, log: Path) -> Iterator[tuple[bool, float, floa
         for turn in range(2 * settings.turns):
             viewed = turn % 2 == 1
             live = _tandem("live", *options) if viewed else None
+            if live is not None:
+                _await_port(port)
             time.sleep(SETTLE_S)
             begin = time.time()
             if live is not None:
@@ -108,19 +112,29 @@ def _tandem(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
+def _await_port(port: int) -> None:
+    """Wait until the server answers."""
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+
+
 async def _look(port: int, settings: Viewers) -> None:
     await asyncio.gather(*(_view(port, settings.seconds) for _ in range(settings.viewers)))
 
 
 async def _view(port: int, seconds: float) -> None:
     """Subscribe to everything, and read for so long."""
-    async with connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
+    at = f"ws://localhost:{port}"
+    async with connect(at, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as client:
         try:
             async with asyncio.timeout(seconds):
-                async for frame in socket:
+                async for frame in client:
                     if isinstance(frame, str) and (word := json.loads(frame))["op"] == "advertise":
                         asked = [{"id": one["id"], "channelId": one["id"]} for one in word["channels"]]
-                        await socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+                        await client.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
         except TimeoutError:
             pass
 
