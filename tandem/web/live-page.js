@@ -85,6 +85,7 @@ function build() {
   const key = JSON.stringify([states, inputs, Boolean(shared.margin)]);
   if (!Object.keys(states).length || !Object.keys(inputs).length || key === built) return;
   built = key;
+  plots.forEach(({u}) => u.destroy());
   plots.length = 0;
   $("plots").replaceChildren();
   const {state, result, targets, timing} = streams;
@@ -267,7 +268,8 @@ function addEvent({timestamp, level, message, name}) {
 $("pause").onclick = () => setPaused(!paused);
 $("fit").onclick = () => { fit = !fit; $("fit").setAttribute("aria-pressed", fit); };
 $("plots").ondblclick = () => setPaused(false);
-matchMedia("(prefers-color-scheme: dark)").onchange = () => plots.forEach(({u}) => u.redraw());
+// The legends have colours of their own.
+matchMedia("(prefers-color-scheme: dark)").onchange = () => { built = ""; build(); };
 
 setInterval(() => {
   showLink();

@@ -117,7 +117,7 @@ class Plot {
     return {
       width, height: 150, padding: [8, 28, 0, 0],
       scales: {x: {time: true, auto: false}, y: {auto: false}},
-      cursor: {sync: {key: "time"}, drag: {x: true, y: false}, points: {size: 6}, dataIdx: nearest},
+      cursor: {y: false, sync: {key: "time"}, drag: {x: true, y: false}, points: {size: 6}, dataIdx: nearest},
       axes: [
         {...axis, size: 22, space: 80, values: (_u, splits) => splits.map((one) => clock(one))},
         {...axis, size: 54, space: 26, values: (_u, splits) => splits.map(tickLabel),

@@ -130,7 +130,8 @@ def test_it_plots_and_survives_a_restart_of_every_process(system: System, page: 
     page.click("#pause")
     until(page, f"plots[0].u.scales.x.max > {held}")
 
-    for width in (390, 1280):
+    for width, scheme in ((390, "dark"), (1280, "light")):
+        page.emulate_media(color_scheme=scheme)
         page.set_viewport_size({"width": width, "height": 844})
         page.wait_for_timeout(500)
         assert page.evaluate("document.documentElement.scrollWidth") == width
