@@ -101,6 +101,7 @@ def test_a_channel_with_more_fields_takes_the_place_of_the_former(audience: Audi
     (now,) = come["channels"]
     assert now["id"] not in (1, 2)
     assert json.loads(now["schema"]) == wider.schema
+    assert viewer.subscriptions == {}
     # The viewer has to subscribe again, and misses nothing of what is kept.
     subscribe(audience, viewer, (9, now["id"]))
     assert frames(viewer) == [(9, 1, b"old"), (9, 2, b"new")]
