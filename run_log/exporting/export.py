@@ -69,7 +69,9 @@ def export(
         for writer in writers:
             writer.close()
     except OSError as error:
-        raise LogError(f"{error.filename or 'output'}: cannot be written: {error.strerror or error}") from error
+        raise LogError(
+            f"{error.filename or 'output'}: cannot be written: {error.strerror or error}"
+        ) from error
     return Exported(
         log=[str(part) for part in source.parts],
         tables=tables.rows,

@@ -35,7 +35,9 @@ class ParquetFolder:
     def __init__(self, folder: Path, about: Mapping[str, Any]):
         self.files: list[Path] = []
         self._folder = folder
-        self._about = {f"tandem.{name}": json.dumps(value, ensure_ascii=False) for name, value in about.items()}
+        self._about = {
+            f"tandem.{name}": json.dumps(value, ensure_ascii=False) for name, value in about.items()
+        }
         self._tables: dict[str, Table] = {}
         self._open: dict[str, pq.ParquetWriter] = {}
 
@@ -60,7 +62,9 @@ class ParquetFolder:
         return self._folder / f"{table.stem}.parquet"
 
     def _begin(self, table: Table) -> None:
-        self._open[table.name] = pq.ParquetWriter(self._path(table), self._schema(table), compression=COMPRESSION)
+        self._open[table.name] = pq.ParquetWriter(
+            self._path(table), self._schema(table), compression=COMPRESSION
+        )
 
     def _widen(self, table: Table) -> None:
         """Add the new columns, which are null in the rows so far."""
@@ -74,12 +78,16 @@ class ParquetFolder:
             for i in range(file.num_row_groups):
                 rows = file.read_row_group(i)
                 for field in schema.names[rows.num_columns :]:
-                    rows = rows.append_column(schema.field(field), pa.nulls(len(rows), schema.field(field).type))
+                    rows = rows.append_column(
+                        schema.field(field), pa.nulls(len(rows), schema.field(field).type)
+                    )
                 self._open[table.name].write_table(rows.cast(schema))
         old.unlink()
 
     def _schema(self, table: Table) -> pa.Schema:
-        return pa.schema([_field(column) for column in table.columns], {**self._about, "tandem.table": table.name})
+        return pa.schema(
+            [_field(column) for column in table.columns], {**self._about, "tandem.table": table.name}
+        )
 
 
 def _field(column: Column) -> pa.Field:

@@ -17,7 +17,9 @@ from run_log.file_format import CONFIG, RAW, check_header
 from run_log.reading.mcap_scan import Scan
 from run_log.reading.reader import interpret, take_metadata
 from run_log.run import Entry, Run
-from run_log.writing.parts import REPEATED, existing_parts, part_path
+from run_log.writing.parts import REPEATED, existing_parts
+
+RUN_INFO = frozenset(topic.name for topic in topics.RUN_INFO.values())
 
 
 class Logged(NamedTuple):
@@ -120,7 +122,9 @@ class Source:
         if part.continued is None:
             later = existing_parts(self.run.path)
             if part.truncated and later and later[-1] not in self.parts:
-                self.notes.append(f"{part.path} does not say whether it goes on; {later[-1].name} is not exported")
+                self.notes.append(
+                    f"{part.path} does not say whether it goes on; {later[-1].name} is not exported"
+                )
             return None
         # A log says a name, and no other folder.
         path = part.path.with_name(Path(part.continued).name or "?")
@@ -148,13 +152,13 @@ def _opening(path: Path) -> Run:
             case Message() if CONFIG in run.attachments:
                 break
             case Message():
-                topic = topics.BY_NAME.get(names.get(record.channel_id, "").removeprefix(RAW))
-                if topic in topics.RUN_INFO.values():
+                name = names.get(record.channel_id, "").removeprefix(RAW)
+                if name in RUN_INFO:
                     try:
-                        info = codec.decode(topic, record.data)
+                        info = codec.decode(topics.BY_NAME[name], record.data)
                     except codec.BadMessage:
                         continue
-                    run.streams[topic.name] = [Entry(record.log_time, record.data, info)]
+                    run.streams[name] = [Entry(record.log_time, record.data, info)]
                     break
     if not header:
         raise LogError(f"{path}: ends before anything was written to it; there is nothing to export")

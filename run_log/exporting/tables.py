@@ -83,7 +83,9 @@ class _Rows:
                     taken = {column.name for column in TIMES} | {f.column.name for f in self._fields.values()}
                     self._fields[path] = _field(self._name, path, one, taken)
         values = msgspec.json.decode(shown.data)
-        self.batch.append([log_time, since_start, *(_value(values, field) for field in self._fields.values())])
+        self.batch.append(
+            [log_time, since_start, *(_value(values, field) for field in self._fields.values())]
+        )
 
     def take(self) -> tuple[Table, Batch]:
         """The table and the rows that waited; these are no longer there then."""

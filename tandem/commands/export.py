@@ -44,7 +44,10 @@ class Export(Command):
         parts = f" from {len(made.log)} parts" if len(made.log) > 1 else ""
         written = [str(path) for path in (self.csv, self.parquet, self.rrd) if path is not None]
         self.say(f"{' and '.join(written)}: {len(made.tables)} tables, {rows} rows{parts}")
-        not_exported = {**made.bad, **{f"unknown topic {key}": count for key, count in made.strangers.items()}}
+        not_exported = {
+            **made.bad,
+            **{f"unknown topic {key}": count for key, count in made.strangers.items()},
+        }
         notes = [*made.notes, *(f"without a row: {count} x {what}" for what, count in not_exported.items())]
         self.say(*(f"note: {note}" for note in notes), style="yellow")
         self.say(*made.damage, style="red")

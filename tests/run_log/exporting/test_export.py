@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,10 +18,10 @@ from lbmpc.plants import get_plant
 from node_runtime.config.loading import override, to_json
 from node_runtime.config.sections import Config
 from protocol import codec, topics
-from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
 from run_log.exporting import tables
 from run_log.exporting.export import Exported, export
+from run_log.file_format import READABLE
 from run_log.reading.reader import read_run
 from run_log.run import Run
 from run_log.writing.parts import PartedLog, existing_parts
@@ -247,6 +245,15 @@ def test_a_fast_loop_is_exported_at_its_full_rate(messages: list[Logged], tmp_pa
     found = export(path, csv=tmp_path / "csv")
     assert found.tables["plant/state"] == found.tables["controller/result"] == STEPS
     assert found.tables["user/wind"] == STEPS
+
+
+@pytest.mark.parametrize("number", READABLE)
+def test_logs_of_all_readable_formats_are_exported(
+    number: int, config: Config, messages: list[Logged], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("run_log.writing.writer.LIBRARY", f"tandem log {number}; test")
+    path = write_log(tmp_path / "run.mcap", config, messages[:100])
+    assert export(path, csv=tmp_path / "csv").tables["bounds"] == 1
 
 
 def test_a_log_in_parts_is_exported_as_one(
