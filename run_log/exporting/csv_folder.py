@@ -16,8 +16,9 @@ TEXTS: dict[Kind, Callable[[Any], str]] = {"boolean": json.dumps, "numbers": jso
 
 
 class CsvFolder:
-    """Numbers are the shortest text that reads back to the same bits. Flags are true and false, lists JSON. What is absent
-    is empty.
+    """Numbers are the shortest text that reads back to the same bits, flags are true and false, and lists are JSON.
+
+    An absent value is empty.
 
     Args:
         folder: is there, and empty.
