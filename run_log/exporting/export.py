@@ -62,9 +62,10 @@ def export(
     """
     source = Source(Path(log))
     plant = plant_of(source.run)
-    writers = _writers(source.run, plant, csv, parquet, rrd)
-    tables, bad = Tables(writers), dict[str, int]()
+    bad: dict[str, int] = {}
     try:
+        writers = _writers(source.run, plant, csv, parquet, rrd)
+        tables = Tables(writers)
         _write(source, plant, tables, bad)
         for writer in writers:
             writer.close()

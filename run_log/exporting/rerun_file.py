@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 
 from lbmpc.plants import Description
 from run_log.exporting.table import LOG_TIME, SINCE_START, TIMES, Batch, Column, Table
@@ -39,7 +42,8 @@ class RerunFile:
         self.files: list[Path] = []
         # Rerun gives every file a recording of its own.
         self._stream = rr.RecordingStream(APPLICATION)
-        self._stream.save(path, default_blueprint=_layout(plant))
+        with _refused(path):
+            self._stream.save(path, default_blueprint=_layout(plant))
         self.files.append(path)
         self._said: dict[str, str] = {}
         """By entity, its newest text."""
@@ -55,8 +59,12 @@ class RerunFile:
             self._write_series(table, rows)
 
     def close(self) -> None:
-        self._stream.flush()
-        self._stream.disconnect()
+        path = self.files[0]
+        with _refused(path):
+            self._stream.flush()
+            self._stream.disconnect()
+            # Rerun writes in a thread of its own, and a full disk is only a warning there: a whole file has an index.
+            RrdReader(path).store()
 
     def _write_events(self, table: Table, rows: Batch) -> None:
         stamps, since, *others = zip(*rows, strict=True)
@@ -98,6 +106,15 @@ class RerunFile:
                 self._said[entity] = text
                 found.append(i)
         return found
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Errors of Rerun, which are `RuntimeError`, become the `OSError` that a `Writer` raises."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(errno.EIO, f"the Rerun file is not whole: {error}", str(path)) from error
 
 
 def _times(stamps: Sequence[int], since: Sequence[float]) -> list[rr.TimeColumn]:

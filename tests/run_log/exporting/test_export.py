@@ -323,6 +323,15 @@ def test_the_command_writes_and_refuses_in_words(
         export(log, rrd=tmp_path / "nowhere" / "run.rrd")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_is_an_error(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("run_log.exporting.export._new_file", lambda path: Path("/dev/full"))
+    code, _, error = command(capsys, str(log), "--rrd", str(tmp_path / "run.rrd"))
+    assert (code, "/dev/full: cannot be written" in error, "No space left" in error) == (2, True, True)
+
+
 def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
     code = main(["export", *words])
     said = capsys.readouterr()
