@@ -1,4 +1,4 @@
-"""The plant as a real process: it goes on alone, ends cleanly, and says why."""
+"""The plant as a real process: it continues without commands, ends cleanly, and reports the reason."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.plant_sim.commands import PLANT, U, command
 
 
 @pytest.mark.live
-def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
-    # The stranger must stay one, however slow this machine is.
+def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
+    # The foreign sender must not take over, however slow this machine is.
     config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]", "bus.follow_silence=60.0")
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
@@ -47,7 +47,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
     assert order[0] == "hold"
     assert "command" in order
     assert order[-2:] == ["plan", "safe"]
-    # Where this test was kept waiting for longer than a plan lasts, a period may begin under the safe input.
+    # If this test is delayed for longer than a plan, a period may begin with the safe input.
     driven = [after for before, after in pairwise(states) if "safe" not in (before.source, after.source)]
     applied = {state.applied[0] for state in driven if state.applied}
     assert applied
@@ -57,7 +57,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
 
 
 @pytest.mark.live
-def test_a_plant_whose_motion_ends_says_why() -> None:
+def test_a_plant_whose_motion_ends_logs_the_reason() -> None:
     config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
     high = float(PLANT.u_max[0])
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
@@ -66,7 +66,7 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
             failed = health_of("plant", status="failed")
             wait_for(lambda: matched(bus, topics.COMMAND))
             health, seq = None, 0
-            # Until it has had one in time: a command that answers an old state is refused.
+            # Repeat until a command is in time, because a command for an old state is refused.
             while not isinstance(health, m.Health):
                 health = ear.until(lambda message: isinstance(message, m.PlantState) or failed(message))
                 if isinstance(health, m.PlantState):
@@ -83,7 +83,7 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
             assert "pressure y" in process.said
 
 
-def test_a_wrong_plant_is_a_message_for_a_person(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_plant_gives_a_readable_error(caplog: pytest.LogCaptureFixture) -> None:
     assert node.main(live_config('plant.model="moore"')) == 2
     assert node.main(live_config("plant.x0=[1.0]")) == 2
     assert "did you mean 'moore_greitzer'?" in caplog.text
@@ -101,7 +101,7 @@ def test_a_plant_without_a_router_can_be_stopped() -> None:
 
 
 def wait_for_words(process: Process, words: str) -> None:
-    """Read what the process says up to a line with these words."""
+    """Read the process's output up to a line with these words."""
     for line in process.lines():
         if words in line:
             return
