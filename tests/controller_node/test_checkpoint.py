@@ -50,7 +50,7 @@ def batch(run_id: str, seqs: range) -> m.Samples:
     return m.Samples(run_id=run_id, seq=seqs[-1], samples=[sample(seq) for seq in seqs])
 
 
-class Anybody:
+class AnyController:
     """A controller that continues with any checkpoint that belongs to it."""
 
     def __init__(self, belongs: dict[str, str]):
@@ -64,7 +64,7 @@ class Anybody:
         assert run_id == "controller-a"
 
 
-ME = Anybody(BELONGS)
+ME = AnyController(BELONGS)
 
 
 def counts() -> dict[str, int]:
@@ -147,7 +147,7 @@ def test_another_controllers_file_is_refused_with_the_differences_and_renamed(
     written(path)
     with pytest.raises(OtherController):
         read(path, {**BELONGS, "rate": "50.0"})
-    assert resume(Anybody({**BELONGS, "rate": "50.0"}), path) is None
+    assert resume(AnyController({**BELONGS, "rate": "50.0"}), path) is None
     assert "rate is 20.0 there and 50.0 here" in caplog.text
     assert "plant" not in caplog.text
     assert (tmp_path / "memory.other").exists()
@@ -386,7 +386,7 @@ def test_a_pipe_or_a_link_as_checkpoint_does_not_block_and_is_kept(
     path = tmp_path / "checkpoint"
     make(path)
     kind = path.lstat().st_mode
-    assert resume(Anybody(BELONGS), path) is None
+    assert resume(AnyController(BELONGS), path) is None
     counts_ = counts()
     with CheckpointWriter(path, BELONGS, Outbox("controller-1"), 100, counts_) as writer:
         writer.offer(memory())

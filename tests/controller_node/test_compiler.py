@@ -171,7 +171,7 @@ def test_new_weights_recompile_nothing(tmp_path: Path) -> None:
 # -- damaged libraries ---------------------------------------------------------------------------------------
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
-SOMEBODY = 12345
+OTHER_USER = 12345
 
 
 def built(cache: Path) -> Path:
@@ -301,8 +301,8 @@ def all_may_write(path: Path) -> None:
     path.chmod(0o777)
 
 
-def somebody_elses(path: Path) -> None:
-    os.chown(path, SOMEBODY, -1)
+def of_another_user(path: Path) -> None:
+    os.chown(path, OTHER_USER, -1)
 
 
 def a_link(path: Path) -> None:
@@ -318,9 +318,9 @@ def a_link(path: Path) -> None:
         ("folder", a_link, "is a link"),
         ("above", all_may_write, "which all users can write to"),
         ("library", group_may_write, "can be written by others (mode 0620): chmod go-w"),
-        pytest.param("folder", somebody_elses, "belongs to user 12345", marks=needs_root),
-        pytest.param("above", somebody_elses, "which belongs to user 12345", marks=needs_root),
-        pytest.param("library", somebody_elses, "belongs to user 12345", marks=needs_root),
+        pytest.param("folder", of_another_user, "belongs to user 12345", marks=needs_root),
+        pytest.param("above", of_another_user, "which belongs to user 12345", marks=needs_root),
+        pytest.param("library", of_another_user, "belongs to user 12345", marks=needs_root),
     ],
 )
 def test_files_that_others_can_write_are_not_loaded(
@@ -343,7 +343,7 @@ def test_a_cache_of_our_own_below_a_sticky_folder_is_used(
     assert runs_compiled(tmp_path / "cache", caplog)
 
 
-@pytest.mark.parametrize("change", [a_link, pytest.param(somebody_elses, marks=needs_root), all_may_write])
+@pytest.mark.parametrize("change", [a_link, pytest.param(of_another_user, marks=needs_root), all_may_write])
 def test_the_temporary_folder_is_checked_without_following_links(
     change: Callable[[Path], None],
     tmp_path: Path,

@@ -34,7 +34,7 @@ class Script:
         self.run_id = run_id
         self.seq = -1
         self.key = topics.PLANT_STATE.key(config.name)
-        self.stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        self.foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
         self.began = clock.now()
 
     def state(self, **changes: object) -> m.PlantState:
@@ -56,7 +56,7 @@ class Script:
         return state
 
     def forge(self, payload: bytes | m.Message) -> None:
-        self.stranger.put(self.key, payload if isinstance(payload, bytes) else codec.encode(payload))
+        self.foreign.put(self.key, payload if isinstance(payload, bytes) else codec.encode(payload))
 
     def period(self, config: Config) -> None:
         """Wait until the next state is due."""
@@ -64,7 +64,7 @@ class Script:
         clock.sleep_until(float(due))
 
     def close(self) -> None:
-        self.stranger.close()
+        self.foreign.close()
         self.bus.close()
 
 

@@ -123,8 +123,8 @@ def test_a_machine_follows_only_valid_commands_and_is_safe_without() -> None:
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
         hand = Controller(bus, ear)
-        stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
-        with stranger, served(machine, config):
+        foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        with foreign, served(machine, config):
             ear.until(health_of("plant", status="ready", note="safe input until the first command"))
             wait_for(lambda: matched(bus, topics.COMMAND))
             # The input is written and known from the start, so that labels can be made.
@@ -148,7 +148,7 @@ def test_a_machine_follows_only_valid_commands_and_is_safe_without() -> None:
                 codec.encode(msgspec.structs.replace(good, u=[0.5, 0.5], plan=[[0.5, 0.5]])),
             ]
             for payload in payloads:
-                stranger.put(topics.COMMAND.key(config.name), payload)
+                foreign.put(topics.COMMAND.key(config.name), payload)
             reasons = (
                 "wrong period",
                 "foreign",

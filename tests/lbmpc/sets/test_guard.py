@@ -138,10 +138,10 @@ def test_a_wrong_oracle_stays_in_the_sets_with_a_constant_delay(compressor: Clos
 
 
 def test_the_prediction_over_the_delay_ignores_a_wrong_oracle(compressor: ClosedLoop) -> None:
-    liar = ClosedLoop(compressor.certificate, compressor.model, "lying")
+    wrong = ClosedLoop(compressor.certificate, compressor.model, "lying")
     case = Case("bang-bang", 0.0, 0.025)
     # The runs are equal, because the certificate does not depend on the oracle.
-    assert liar.run(case, 1, 40) == compressor.run(case, 1, 40)
+    assert wrong.run(case, 1, 40) == compressor.run(case, 1, 40)
 
 
 def test_the_bounds_are_continuous_at_the_boundary(family: Certificate) -> None:

@@ -141,10 +141,10 @@ def test_control_messages_are_delivered_directly_and_logged_once(config: Config)
 @pytest.mark.live
 def test_a_plant_that_publishes_under_the_plain_key_is_received_at_any_rate(config: Config) -> None:
     slow = override(config, ["rate=20"])
-    with Bus(slow, "plant", "plant-a") as stranger, Bus(config, "controller", "controller-a") as controller:
+    with Bus(slow, "plant", "plant-a") as foreign, Bus(config, "controller", "controller-a") as controller:
         states = controller.queue(topics.PLANT_STATE)
-        wait_for(lambda: matched(stranger, topics.PLANT_STATE))
-        stranger.publish(topics.PLANT_STATE, state(7))
+        wait_for(lambda: matched(foreign, topics.PLANT_STATE))
+        foreign.publish(topics.PLANT_STATE, state(7))
         wait_for(lambda: len(states) == 1)
 
 

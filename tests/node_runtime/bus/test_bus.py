@@ -146,13 +146,13 @@ def test_oversized_messages_are_neither_sent_nor_accepted(
 ) -> None:
     mailbox = controller.everything()
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
-    stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+    foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
     key = topics.PLANT_STATE.key(config.name)
-    publisher = stranger.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    publisher = foreign.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
     wait_for(lambda: publisher.matching_status.matching)
     publisher.put(bytes(topics.PLANT_STATE.max_bytes + 1))
     wait_for(lambda: controller.counters().get("bad plant/state: oversized", 0) == 1)
-    stranger.close()
+    foreign.close()
     note = "x" * topics.HEALTH["plant"].max_bytes
     large = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={}, note=note)
     plant.publish(topics.HEALTH["plant"], large)

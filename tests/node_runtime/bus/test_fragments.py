@@ -125,7 +125,7 @@ def test_many_foreign_writers_cannot_fill_the_memory() -> None:
     """With one byte each, few bytes are held."""
     receiver, small = Receiver(), altered(fragments()[0], size=FRAGMENT_BYTES + 1, index=1, data=b"x")
     for k in range(INCOMPLETE + 500):
-        receiver.take(altered(small, writer=f"stranger-{k}"))
+        receiver.take(altered(small, writer=f"foreign-{k}"))
     assert receiver.reassembler.held == INCOMPLETE
     assert receiver.bad.counters() == {"bad x: pieces lost": 500}
     assert receiver.take(*fragments()) == [MESSAGE]
@@ -134,7 +134,7 @@ def test_many_foreign_writers_cannot_fill_the_memory() -> None:
 def test_a_foreign_writer_cannot_fill_the_memory() -> None:
     receiver = Receiver(limit=8 * FRAGMENT_BYTES)
     for k in range(300):
-        receiver.take(*fragments(writer=f"stranger-{k}")[:2])
+        receiver.take(*fragments(writer=f"foreign-{k}")[:2])
         assert receiver.reassembler.held <= 8 * FRAGMENT_BYTES
     assert receiver.take(*fragments()) == [MESSAGE]
 
@@ -161,10 +161,10 @@ def test_only_fragments_are_sent_and_every_reader_gets_the_message(config: Confi
     with (
         Bus(config, "controller", "controller-a") as controller,
         Bus(config, "recorder", "recorder-a") as recorder,
-        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as stranger,
+        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as foreign,
     ):
         all_of_it, one = recorder.everything(), recorder.queue(topics.KEYFRAME)
-        stranger.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
+        foreign.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
         wait_for(lambda: matched(controller, topics.KEYFRAME))
         controller.publish(topics.KEYFRAME, sent)
         wait_for(lambda: len(one) == 1 and len(all_of_it) == 1)

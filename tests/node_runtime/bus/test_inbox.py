@@ -59,7 +59,7 @@ def test_another_incarnation_takes_over_only_after_silence() -> None:
 def test_refused_messages_do_not_keep_a_sender_in_control() -> None:
     follower = Follower(silence=1.0)
     follower.accept("a", 2**60, 0.0)
-    # A forged number must not exclude the true sender for ever.
+    # A forged number must not exclude the true sender permanently.
     assert [follower.accept("a", k, 0.3 * k) for k in range(1, 5)] == ["out of order"] * 3 + ["ok"]
 
 
@@ -138,9 +138,9 @@ def buses() -> Iterator[tuple[Bus, zenoh.Session]]:
     """Return a bus, and a foreign session that can send any bytes."""
     config = live_config("bus.follow_silence=30.0")
     with open_router(config), Bus(config, "controller", "controller-x") as bus:
-        stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
-        yield bus, stranger
-        stranger.close()
+        foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        yield bus, foreign
+        foreign.close()
 
 
 class Sender:
@@ -216,7 +216,7 @@ def test_garbage_behind_a_good_message_does_not_hide_it(buses: tuple[Bus, zenoh.
 
 @pytest.mark.live
 def test_a_jumped_clock_is_accepted_after_a_silence(buses: tuple[Bus, zenoh.Session]) -> None:
-    """A machine that was suspended must not be excluded for ever."""
+    """A machine that was suspended must not be excluded permanently."""
     sender = Sender(buses)
     sender.inbox.follower = Follower(silence=0.2)
     seqs, heard = itertools.count(), []

@@ -24,7 +24,7 @@ from protocol.topics import Topic
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import discovery
 from trainer_node.fleet.discovery import LastHeard, SharedRouter
-from trainer_node.fleet.fleet import SAY_EVERY_S, Fleet, _Followed, seed_of
+from trainer_node.fleet.fleet import LOG_EVERY_S, Fleet, _Followed, seed_of
 from trainer_node.node import COUNTERS, TrainerNode
 from trainer_node.training import Draw, Trainer, use_one_thread
 from trainer_node.training_round import MOST_STACKED, train_round
@@ -136,7 +136,7 @@ def test_invented_names_do_not_fill_the_memory() -> None:
     assert len(heard.present(0.0)) == discovery.MOST_PLANTS
 
 
-class Nobody(SharedRouter):
+class NoPlants(SharedRouter):
     """A router without plants."""
 
     def __init__(self) -> None:
@@ -145,8 +145,8 @@ class Nobody(SharedRouter):
 
 def test_a_fleet_without_plants_logs_regularly(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    fleet = Fleet(Nobody())
-    for now in (0.0, 1.0, SAY_EVERY_S - 1.0, SAY_EVERY_S + 1.0):
+    fleet = Fleet(NoPlants())
+    for now in (0.0, 1.0, LOG_EVERY_S - 1.0, LOG_EVERY_S + 1.0):
         fleet.turn(now)
     assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
 
@@ -154,7 +154,7 @@ def test_a_fleet_without_plants_logs_regularly(caplog: pytest.LogCaptureFixture)
 def test_a_plant_with_new_lanes_is_added_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """This happens after a round of training that took longer than the renewal of a certificate."""
 
-    class Renewed(Nobody):
+    class Renewed(NoPlants):
         def present(self, now: float) -> list[str]:
             return ["jet1"]
 
@@ -163,7 +163,7 @@ def test_a_plant_with_new_lanes_is_added_again(monkeypatch: pytest.MonkeyPatch) 
     fleet, end = Fleet(Renewed()), ExitStack()
     end.callback(ended.append, "jet1")
     fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Lanes, "those before"), end)
-    monkeypatch.setattr(Fleet, "_take_in", lambda _fleet, name: taken.append(name))
+    monkeypatch.setattr(Fleet, "_add_plant", lambda _fleet, name: taken.append(name))
     fleet._update_plants(0.0)
     assert (ended, taken) == (["jet1"], ["jet1"])
 

@@ -110,7 +110,7 @@ def test_a_refusing_router_delays_no_other_plant_and_is_retried(
 def test_an_unexpected_error_of_one_plant_does_not_end_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("trainer_node.fleet.fleet.LEFT_ALONE_S", 0.5)
+    monkeypatch.setattr("trainer_node.fleet.fleet.PAUSE_S", 0.5)
     listen = TrainerNode.listen
     looks: list[float] = []
 
