@@ -2,7 +2,7 @@
 
 An architecture maps the last k pairs (x, u), oldest first, to the activations of its last hidden layer. It uses a few
 operations that numpy, CasADi and torch each provide, so the controller's network and the trainer's compute the same
-function. Derivatives follow from the operations. docs/architectures.md shows a complete example.
+function. Derivatives follow from the operations. docs/tutorials/architectures.md shows a complete example.
 """
 
 from __future__ import annotations

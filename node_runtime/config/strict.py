@@ -115,7 +115,7 @@ def _type_info(kind: type) -> inspect.Type:
 def _reject_unknown(value: Any, kind: inspect.Type, fail: Fail, path: str) -> None:
     """Report unknown keys. msgspec rejects them too, but does not suggest the nearest one."""
     within = f"{path}." if path else ""
-    match _without_none(kind), value:
+    match _bare(kind), value:
         case inspect.StructType(fields=fields), dict():
             known = {field.name: field.type for field in fields}
             for key, below in value.items():
@@ -152,7 +152,7 @@ def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
                 wanted, value = item, value[int(index)]
             case _:  # a place outside these types: use msgspec's text
                 return key, f"{key}: {found['text']}"
-        wanted = _without_none(wanted)
+        wanted = _bare(wanted)
     given = f"{key} = {_shown(value)}"
     if isinstance(wanted, inspect.LiteralType):
         choices = [str(choice) for choice in wanted.values]
@@ -182,11 +182,11 @@ def _allowed(kind: inspect.Type) -> str:
             length = (
                 f" of {kind.min_length}" if kind.min_length and kind.min_length == kind.max_length else ""
             )
-            return f"a list{length}, each entry {_allowed(_without_none(kind.item_type))}"
+            return f"a list{length}, each entry {_allowed(_bare(kind.item_type))}"
         case inspect.DictType():
-            return f"a table, each entry {_allowed(_without_none(kind.value_type))}"
+            return f"a table, each entry {_allowed(_bare(kind.value_type))}"
         case inspect.UnionType(types=types):
-            return " or ".join(_allowed(option) for option in types)
+            return " or ".join(_allowed(_bare(option)) for option in types)
     return f"a {type(kind).__name__.removesuffix('Type').lower()}"
 
 
@@ -196,12 +196,14 @@ def _range(kind: inspect.IntType | inspect.FloatType) -> str:
     return said and f" {said}"
 
 
-def _without_none(kind: inspect.Type) -> inspect.Type:
-    """Return T of `T | None`."""
+def _bare(kind: inspect.Type) -> inspect.Type:
+    """Return T of `T | None`, without the unit that it may have."""
+    if isinstance(kind, inspect.Metadata):
+        return _bare(kind.type)
     if isinstance(kind, inspect.UnionType):
         rest = [option for option in kind.types if not isinstance(option, inspect.NoneType)]
         if len(rest) == 1:
-            return rest[0]
+            return _bare(rest[0])
     return kind
 
 

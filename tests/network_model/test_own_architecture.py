@@ -268,5 +268,5 @@ def test_the_check_reports_the_fault(
     assert said in printed.out + printed.err
 
 
-def test_the_documentation_contains_the_example() -> None:
-    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "architectures.md").read_text()
+def test_the_page_shows_the_example() -> None:
+    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "tutorials/architectures.md").read_text()

@@ -97,7 +97,7 @@ def test_a_denied_sender_is_named_after_many_sessions():
         refusals.read(
             head
             + f"{k:x} on Interface(lo)"
-            + who.format("operator.jet1", "")
+            + who.format("viewer.jet1", "")
             + "Put (ingress) on tandem/jet1/x"
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")

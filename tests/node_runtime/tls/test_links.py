@@ -47,10 +47,10 @@ def test_controller_and_plant_can_be_remote_and_a_recorder_receives_all(site: Si
         Bus(site.far("plant"), "plant", "p-1") as plant,
         Bus(site.far("controller"), "controller", "c-1") as controller,
         Bus(site.far("recorder"), "recorder", "r-1") as recorder,
-        Bus(site.far("operator"), "monitor", "m-1") as operator,
+        Bus(site.far("viewer"), "monitor", "m-1") as viewer,
     ):
         states, commands = controller.queue(topics.PLANT_STATE), plant.queue(topics.COMMAND)
-        logged, seen = recorder.everything(), operator.everything()
+        logged, seen = recorder.everything(), viewer.everything()
         wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(controller, topics.COMMAND))
         loop = {topic.key("jet1") for topic in (topics.PLANT_STATE, topics.COMMAND)}
         keys: dict[Mailbox, set[str]] = {box: set() for box in (logged, seen)}

@@ -23,9 +23,9 @@ FOREIGN = [
     ("controller", topics.HIDDEN_WEIGHTS),
     ("controller", topics.PLANT_STATE),
     ("recorder", topics.HIDDEN_WEIGHTS),
-    ("operator", topics.COMMAND),
-    ("operator", topics.OVERRIDE),
-    ("operator", topics.REFERENCE),
+    ("viewer", topics.COMMAND),
+    ("viewer", topics.OVERRIDE),
+    ("viewer", topics.REFERENCE),
     ("commander", topics.COMMAND),
     ("nobody", topics.HIDDEN_WEIGHTS),
     ("neighbour", topics.HIDDEN_WEIGHTS),
@@ -52,7 +52,7 @@ def _until(mailbox: Mailbox, key: str, timeout_s: float = HANG_S) -> list[str]:
 @pytest.mark.parametrize("role", dict.fromkeys(role for role, _ in FOREIGN))
 def test_messages_without_the_right_to_publish_are_not_delivered(site: Site, role: str):
     """The last message is allowed, so all messages before it have either arrived or never will."""
-    with Bus(site.local, "operator", "o-1") as ear, site.session(role) as session:
+    with Bus(site.local, "viewer", "o-1") as ear, site.session(role) as session:
         heard, block = ear.everything(), zenoh.CongestionControl.BLOCK
         fast = ear._lanes.session("bulk").declare_subscriber(topics.COMMAND.direct_key("jet1"))
         # Now the router knows the subscriber.

@@ -180,7 +180,9 @@ def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> No
     text = refused(capsys, str(tmp_path / "short.mcap"))
     assert re.search("19 samples are too few: .* has 4 numbers .*, and 40 samples are the least", text)
     save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
-    assert "is not explained by any model, like measurement noise" in refused(capsys, str(tmp_path / "noisy.mcap"))
+    assert "is not explained by any model, like measurement noise" in refused(
+        capsys, str(tmp_path / "noisy.mcap")
+    )
 
 
 def test_what_cannot_be_given_together_is_refused(logs: list[str], tmp_path: Path, capsys: Capture) -> None:
