@@ -199,7 +199,7 @@ class TrainerNode:
             return False
         self._asks, self._sent_at = False, None
         if judged not in self._explained:
-            # A decision is evaluated once, whoever sent the set.
+            # A decision is evaluated once, no matter which process sent the set.
             self._explained.append(judged)
         if followed and trainer is self._trainer:
             return True

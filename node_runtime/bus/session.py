@@ -151,8 +151,7 @@ def connect(
     Raises:
         OpenInterrupted: `stop` was set.
         ConfigError: the endpoint is not valid, our certificate cannot be used, or either side refuses the other, so
-        that
-            waiting cannot help. The text says why.
+            that waiting cannot help. The text says why.
     """
     tls = None
     if secure(config.bus.endpoint):

@@ -219,12 +219,12 @@ def test_a_tilde_in_a_name_or_a_log_is_kept():
     assert load(None, ["log.path=~backup.mcap"]).log.path == "~backup.mcap"
     assert load(None, ["log.path=a/~/b.mcap"]).log.path == "a/~/b.mcap"
     # The configuration in a log belongs to another machine, so this machine's folders are not inserted.
-    assert from_json('{"log": {"path": "~nobody-at-all/x.mcap"}}').log.path == "~nobody-at-all/x.mcap"
+    assert from_json('{"log": {"path": "~no-such-user/x.mcap"}}').log.path == "~no-such-user/x.mcap"
 
 
 def test_the_home_of_an_unknown_user_is_refused():
-    said = message("bus.tls.keys=~nobody-at-all/keys")
-    assert "no home folder of ~nobody-at-all is known" in said
+    said = message("bus.tls.keys=~no-such-user/keys")
+    assert "no home folder of ~no-such-user is known" in said
     assert said.startswith("--set bus.tls.keys")
 
 

@@ -85,8 +85,8 @@ def test_bounds_are_written_and_read_back(tmp_path: Path):
             'plant.truth = {"slope":"a"} is not a table, each entry a number or a string',
         ),
         (
-            "plant.model=~nobody-at-all/a.py:A",
-            "--set plant.model=~nobody-at-all/a.py:A: plant.model = ~nobody-at-all/",
+            "plant.model=~no-such-user/a.py:A",
+            "--set plant.model=~no-such-user/a.py:A: plant.model = ~no-such-user/",
         ),
     ],
 )

@@ -200,5 +200,5 @@ def test_absolute(here: Path, monkeypatch: pytest.MonkeyPatch):
     assert absolute("/elsewhere/tanks.py:TANKS", here) == "/elsewhere/tanks.py:TANKS"
     assert absolute("~/tanks.py:TANKS", here) == "/home/me/tanks.py:TANKS"
     assert absolute("mypackage.module:PLANT", here) == "mypackage.module:PLANT"
-    with pytest.raises(ConfigError, match="no home folder of ~nobody-of-that-name is known"):
-        absolute("~nobody-of-that-name/tanks.py:TANKS", here)
+    with pytest.raises(ConfigError, match="no home folder of ~no-such-user is known"):
+        absolute("~no-such-user/tanks.py:TANKS", here)

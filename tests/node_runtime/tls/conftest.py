@@ -22,7 +22,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     own = certificate_authority.create("jet2", [], folder / "jet2", 30)
     assert own
     issue(folder / "jet1", "expired", "trainer.jet1", -0.5)
-    issue(folder / "jet1", "nobody", "nobody.jet1", 30)
+    issue(folder / "jet1", "stranger", "stranger.jet1", 30)
     issue(folder / "jet1", "neighbour", "trainer.jet2", 30)
     remote = free_endpoint().replace("tcp/", "tls/")
     config = live_config(f'bus.remote="{remote}"', f'bus.tls.keys="{folder / "jet1" / "router"}"')

@@ -84,7 +84,7 @@ def test_zenohs_internal_checks_are_not_denials():
         "bad from trainer.jet1: denied, put controller/tick": 1,
         "bad from trainer.jet1: denied, put elsewhere": 1,
     }
-    assert not refusals.read("a line of somebody else")
+    assert not refusals.read("a line of another program")
 
 
 def test_a_denied_sender_is_named_after_many_sessions():
