@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
+
+from node_runtime import provenance
+
+WIDTH = 120
 
 
 class DocumentError(Exception):
@@ -49,3 +54,15 @@ class Marks:
                 f"{document}: the figures go between two lines that it lacks: {self.begin} and {self.end}"
             )
         return before, after
+
+
+def conditions(command: str, *notes: str) -> list[str]:
+    """Return the lines above a table: the command that measured it, then the machine and the notes, wrapped."""
+    machine = provenance.describe()
+    where = f"Measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}."
+    return ["```", command, "```", "", *wrapped(" ".join([where, *notes]))]
+
+
+def wrapped(text: str) -> list[str]:
+    """Return a paragraph as lines of at most 120 characters; no word and no option is broken."""
+    return wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False)

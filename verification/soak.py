@@ -28,9 +28,8 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage, stalls
-from node_runtime import provenance
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
@@ -276,10 +275,9 @@ def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
 def _table(
     memory: dict[str, Memory], lateness: Lateness, replays: list[str], run: dict[str, Any], picture: str
 ) -> list[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "verification.soak", *sys.argv[1:]])
     lines = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}.",
+        *conditions(command),
         "",
         f"![Resident memory of every process over time]({picture})",
         "",
@@ -299,14 +297,21 @@ def _table(
     return [
         *lines,
         "",
-        f"{lateness.ticks:,} ticks, {lateness.late} of them late or skipped, {lateness.by_machine} of these while the "
-        f"machine itself stood still: an empty loop on each core, above all of Tandem, woke more than 2 ms late "
-        f"{lateness.stalls} times, at most by {lateness.longest_stall_ms:.1f} ms. "
-        f"Solve {_spread(solve)}, tick {_spread(tick)} ms (p50, p99, largest). "
-        f"These, constraint violations, {run.get('constraint_violations')}, and ticks lost to the log, "
-        f"{run.get('lost_ticks')}, are of its first part.",
+        "| lateness | |",
+        "| --- | ---: |",
+        f"| ticks | {lateness.ticks:,} |",
+        f"| late or skipped | {lateness.late} |",
+        f"| of these during a stall of the machine | {lateness.by_machine} |",
+        f"| times that an empty loop above all of Tandem woke more than 2 ms late | {lateness.stalls} |",
+        f"| longest stall | {lateness.longest_stall_ms:.1f} ms |",
+        f"| solve, first part of the log: p50, p99, largest | {_spread(solve)} ms |",
+        f"| tick, first part of the log: p50, p99, largest | {_spread(tick)} ms |",
+        f"| constraint violations, first part of the log | {run.get('constraint_violations')} |",
+        f"| ticks lost to the log, first part of the log | {run.get('lost_ticks')} |",
         "",
-        f"Replay of the log's {len(replays)} parts: {'; '.join(replays)}.",
+        f"Replay of the log's {len(replays)} parts:",
+        "",
+        *(f"- {part}" for part in replays),
     ]
 
 

@@ -1,6 +1,6 @@
 """One trainer for many plants: time from samples to weights, and the savings of a stack.
 
-    python -m benchmarks.live.fleet --document docs/tutorials/fleet.md
+    python -m benchmarks.live.fleet --document docs/results/fleet.md
 
 A real router and a real `tandem trainer --plants 'plant*'` run. The controllers are simulated, all in this process.
 Each publishes ten samples and its K twice a second, as a loop at 20 Hz does, answers the trainer's questions, and
@@ -23,7 +23,7 @@ import tyro
 import zenoh
 from rich.console import Console
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage
 from benchmarks.live.ports import free_port
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
@@ -153,7 +153,7 @@ def main() -> int:
     except DocumentError as error:
         console.print(str(error), markup=False)
         return 2
-    rows, text = [], [_command(settings)]
+    rows, text = [], _command(settings)
     text += _ratios(settings, console)
     for batch in settings.batch:
         for plants in settings.plants:
@@ -166,10 +166,9 @@ def main() -> int:
     return 0
 
 
-def _command(settings: Fleet) -> str:
-    told = provenance.describe()
+def _command(settings: Fleet) -> list[str]:
     words = "" if settings.seconds == Fleet.seconds else f" --seconds {settings.seconds:g}"
-    return f"`python -m benchmarks.live.fleet{words}`, on {told['processor']}, {told['cores']} cores, {told['system']}."
+    return conditions(f"python -m benchmarks.live.fleet{words}")
 
 
 # -- the trainer as a process ------------------------------------------------------------------------------
@@ -292,8 +291,8 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
 
 def _table(rows: list[Row], settings: Fleet) -> list[str]:
     lines = [
-        f"Of {settings.seconds:g} s with so many plants, after {settings.warm:g} s of warming up; a training is "
-        f"{TrainerConfig().steps} steps.",
+        f"Each row: {settings.seconds:g} s with this number of plants, after {settings.warm:g} s of warming up. "
+        f"A training has {TrainerConfig().steps} steps.",
         "",
         "| plants | samples drawn | from samples to weights, s: median | p99 | longest | still waiting at the end, s "
         "| weights a plant, fewest, most | trainings a second | trainer, cores |",

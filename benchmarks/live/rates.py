@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage
 from node_runtime import provenance
 from node_runtime.config.literals import SolverMode
@@ -45,8 +45,8 @@ COLUMNS = (
     "late",
     "skipped",
     "empty loop on time, %",
-    "late ones beside its misses, %",
-    "others, %",
+    "late ticks beside a miss, %",
+    "other ticks beside a miss, %",
     "tick p50 / p99, ms",
     "solve p50 / p99, ms",
     "of a core: controller, plant, router, others",
@@ -83,12 +83,13 @@ def main(settings: Rates) -> int:
 
 
 def _table(settings: Rates) -> Iterator[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "benchmarks.live.rates", *sys.argv[1:]])
     overrides = " ".join(f"--set {override}" for override in _overrides(settings, "SOLVER"))
     run = f"tandem run --rate RATE --seconds {settings.seconds:g} {overrides}"
     head = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}. Each row is `{run}`.",
+        *conditions(command, "Each row is the run"),
+        "",
+        *("```text", run, "```"),
         "",
         f"| {' | '.join(COLUMNS)} |",
         f"| {' | '.join(['---:'] * len(COLUMNS))} |",

@@ -94,7 +94,7 @@ class Block:
         while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
             del words[0]
         known = PLACEHOLDERS | self.placeholders
-        pattern = re.compile(rf"(?<![\w-])({'|'.join(known)})(?![\w-])")
+        pattern = re.compile(rf"(?<![\w.-])({'|'.join(known)})(?![\w-])")
         return [pattern.sub(lambda match: known[match[0]], word) for word in words]
 
 

@@ -22,7 +22,7 @@ from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.interpreter import imported
 from tests.helpers.paths import DOCS
 
-PAGE = DOCS / "python.md"
+PAGE = DOCS / "tutorials/python.md"
 PLANT = get_plant("moore_greitzer")
 QUICK: dict[str, Any] = {
     "oracle": "dnn",

@@ -99,8 +99,8 @@ def test_the_table_names_the_failed_checks(tmp_path: Path) -> None:
     text = table.markdown({ALL[0].name: [table.Pair(one, CALM) for one in (good, bad, dead)]}, ALL, ["head"])
     row = next(line for line in text.splitlines() if line.startswith(f"| {ALL[0].name}"))
     assert row.split(" | ")[1:5] == ["3", "1", "2, 0", "3.0, 0.0"]
-    assert "run 1 at 1.00 s: 2 samples outside, 0 without the fault" in text
-    assert "run 2 at 1.00 s: no first command" in text
+    assert "| 1 | 1.00 | 2 samples outside, 0 without the fault |" in text
+    assert "| 2 | 1.00 | no first command |" in text
     document = tmp_path / "faults.md"
     document.write_text(f"before\n{table.MARKS.begin}\nold\n{table.MARKS.end}\nbehind\n")
     table.MARKS.put(document, text)

@@ -26,7 +26,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from benchmarks.document_block import DocumentError
+from benchmarks.document_block import DocumentError, conditions
 from node_runtime import provenance
 from verification.faults import table
 from verification.faults.catalogue import ALL, Fault, Stage
@@ -182,12 +182,8 @@ def _say(bar: Progress, outcome: Outcome, why: list[str]) -> None:
 
 
 def _head(settings: Suite) -> list[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "verification.faults", *sys.argv[1:]])
-    return [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}. "
-        f"Load at the end: {provenance.load():.1f}.",
-    ]
+    return conditions(command, f"Load at the end: {provenance.load():.1f}.")
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def control_back(run: Facts, calm: Facts) -> str | None:
     if run.control_after is None:
         return "control did not come back"
     if run.control_after > CONTROL_BACK_S:
-        return f"control came back {run.control_after:.2f} s after what was hurt"
+        return f"control came back {run.control_after:.2f} s after the process or link"
     return None
 
 

@@ -87,11 +87,11 @@ def _replays(replays: list[Replayed]) -> str:
 
 
 def reasons(pairs: dict[str, list[Pair]]) -> Iterator[str]:
-    """List the failed checks, by fault."""
+    """Table rows of the failed checks, by fault."""
     for name, found in pairs.items():
         for pair in found:
             for why in pair.outcome.not_held:
-                yield f"- {name}, run {pair.outcome.index} at {pair.outcome.at:.2f} s: {why.splitlines()[0][:200]}"
+                yield f"| {name} | {pair.outcome.index} | {pair.outcome.at:.2f} | {why.splitlines()[0][:200]} |"
 
 
 def markdown(pairs: dict[str, list[Pair]], faults: Sequence[Fault], head: list[str]) -> str:
@@ -100,5 +100,14 @@ def markdown(pairs: dict[str, list[Pair]], faults: Sequence[Fault], head: list[s
     rule = ["---", *["---:"] * (len(COLUMNS) - 2), "---"]
     lines = [*head, "", *(f"| {' | '.join(row)} |" for row in (list(COLUMNS), rule, *cells))]
     failed = list(reasons(pairs))
-    lines += ["", "What did not hold:" if failed else "Everything held.", *([""] if failed else []), *failed]
+    if not failed:
+        return "\n".join([*lines, "", "All checks passed."])
+    lines += [
+        "",
+        "Checks that failed:",
+        "",
+        "| fault | run | fault at, s | check |",
+        "| --- | ---: | ---: | --- |",
+    ]
+    lines += failed
     return "\n".join(lines)

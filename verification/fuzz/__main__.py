@@ -20,8 +20,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from benchmarks.document_block import DocumentError, Marks
-from node_runtime import provenance
+from benchmarks.document_block import DocumentError, Marks, conditions
 from verification.fuzz.targets import ACCEPTED
 from verification.fuzz.work import Finding, Report, Work, merge
 
@@ -105,13 +104,12 @@ def growth(report: Report) -> int:
 
 def table(reports: list[Report], settings: Fuzz) -> list[str]:
     """Return the figures as Markdown."""
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "verification.fuzz", *sys.argv[1:]])
     found = merge(reports)
+    payloads = sum(report.payloads for report in reports)
+    seconds = max((report.seconds for report in reports), default=0.0)
     lines = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}: "
-        f"{sum(report.payloads for report in reports):,} payloads in {settings.jobs} processes, "
-        f"{max((report.seconds for report in reports), default=0.0):.0f} s.",
+        *conditions(command, f"{payloads:,} payloads in {settings.jobs} processes, {seconds:.0f} s."),
         "",
         "| reader | payloads | accepted | refused | slowest, ms | crashed |",
         "| --- | ---: | ---: | --- | ---: | ---: |",
@@ -132,9 +130,9 @@ def table(reports: list[Report], settings: Fuzz) -> list[str]:
             else []
         )
         after = f"{growth(report) / 1024:+.1f} MB after its first tenth"
-        lines.append(f"Memory of a process, first and last: {' and '.join(rss)} MB, {after}.")
+        lines.append(f"- Memory of a process, first and last: {' and '.join(rss)} MB, {after}.")
         if not report.ended:
-            lines.append("A process did not end: it hung or died.")
+            lines.append("- A process did not end: it hung or died.")
     return lines
 
 
