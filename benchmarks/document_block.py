@@ -1,4 +1,4 @@
-"""Figures that a command writes into a document, between two lines that say which command."""
+"""Blocks of a document that a command writes, between two marks that name the command."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ WIDTH = 120
 
 
 class DocumentError(Exception):
-    """The document cannot take the figures; the text says why and what to do."""
+    """The document cannot take the block; the text says why and what to do."""
 
 
 @dataclass(frozen=True)
 class Marks:
-    """The two lines; what stands outside them is left alone."""
+    """The two marks; text outside them does not change."""
 
     begin: str
     end: str
 
     @classmethod
     def of(cls, name: str, command: str) -> Marks:
-        """Those of a table called `name` that `command` writes."""
+        """Return the marks of a table called `name` that `command` writes."""
         return cls(f"<!-- {name}: begin, written by `{command}` -->", f"<!-- {name}: end -->")
 
     def check(self, document: Path | None) -> None:
-        """Raises `DocumentError` unless `document` is None or has both lines, in order: before anything is measured."""
+        """Raise `DocumentError` unless `document` is None or has both marks, in order. Call it before measuring."""
         if document is not None:
             self._around(document)
 
     def put(self, document: Path | None, text: str) -> None:
-        """Replace what stands between the lines; None: nowhere.
+        """Replace the text between the marks; None: do nothing.
 
         Raises:
             DocumentError: no such file, or it lacks the lines.

@@ -1,4 +1,4 @@
-"""The suite's outcomes as a Markdown table, and into the document between its two marks."""
+"""Write the suite's outcomes as a Markdown table into the document between its two marks."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ COLUMNS = (
 
 
 class Pair(msgspec.Struct, frozen=True):
-    """A run and the one without the fault, same seed."""
+    """A run and the one without the fault, with the same seed."""
 
     outcome: Outcome
     calm: Facts
 
 
 def rows(pairs: dict[str, list[Pair]], faults: Sequence[Fault]) -> Iterator[list[str]]:
-    """The cells of each fault that was run."""
+    """Return the cells of each fault that was run."""
     for fault in faults:
         found = pairs.get(fault.name, [])
         if not found:
@@ -70,7 +70,7 @@ def _figures(fault: Fault, ran: list[tuple[Facts, Facts]]) -> list[str]:
 
 
 def _most(values: list[float | None]) -> str:
-    """Median and largest; what never came is said."""
+    """Format median and largest; say so if a value never came."""
     known = [value for value in values if value is not None]
     if not known:
         return ""
@@ -87,7 +87,7 @@ def _replays(replays: list[Replayed]) -> str:
 
 
 def reasons(pairs: dict[str, list[Pair]]) -> Iterator[str]:
-    """Table rows of the failed checks, by fault."""
+    """Return the table rows of the failed checks, by fault."""
     for name, found in pairs.items():
         for pair in found:
             for why in pair.outcome.not_held:

@@ -1,4 +1,4 @@
-"""`make fuzz`: millions of bad payloads through every reader; nothing may crash, hang or grow.
+"""`make fuzz`: send millions of bad payloads through every reader; none may crash, hang or grow.
 
 python -m verification.fuzz --payloads 10000000 --document docs/results/faults.md
 """
@@ -26,12 +26,12 @@ from verification.fuzz.work import Finding, Report, Work, merge
 
 MARKS = Marks.of("fuzz", "make fuzz")
 GROWTH_KB = 8 * 1024
-"""What a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
+"""kB that a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
 
 
 @dataclass(frozen=True)
 class Fuzz:
-    """Bad payloads through everything that reads bytes from outside."""
+    """Send bad payloads through every reader of bytes from outside."""
 
     payloads: int = 10_000_000
     """In all."""
@@ -39,13 +39,13 @@ class Fuzz:
     """Processes."""
     seed: int = 0
     out: Path = Path("runs/fuzz")
-    """Where the figures go, and payloads that were not dealt with."""
+    """Folder of the figures, and of payloads that caused a failure."""
     document: Path | None = None
-    """Where the table goes between its two marks."""
+    """Document that receives the table between its two marks."""
 
 
 def main(settings: Fuzz) -> int:
-    """0 when nothing crashed, hung or grew; 1 when something did; 2 when the document lacks the marks."""
+    """Return 0 if nothing crashed, hung or grew, 1 if something did, 2 if the document lacks the marks."""
     console = Console(stderr=True)
     try:
         MARKS.check(settings.document)
@@ -65,7 +65,7 @@ def main(settings: Fuzz) -> int:
 
 
 def measure(settings: Fuzz, console: Console) -> list[Report]:
-    """One report a process; what a process that hung or died had done until then is in its own."""
+    """One report a process; the work of a process that hung or died is in its own report."""
     share = settings.payloads // settings.jobs
     context = multiprocessing.get_context("spawn")
     latest: dict[Connection, Report] = {}
@@ -97,13 +97,13 @@ def measure(settings: Fuzz, console: Console) -> list[Report]:
 
 
 def growth(report: Report) -> int:
-    """kB from after the first tenth to the end."""
+    """Growth in kB from after the first tenth to the end."""
     kept = report.rss_kb[max(1, len(report.rss_kb) // 10) :]
     return kept[-1] - kept[0] if len(kept) > 1 else 0
 
 
 def table(reports: list[Report], settings: Fuzz) -> list[str]:
-    """The figures as Markdown."""
+    """Return the figures as Markdown."""
     command = shlex.join(["python", "-m", "verification.fuzz", *sys.argv[1:]])
     found = merge(reports)
     payloads = sum(report.payloads for report in reports)
