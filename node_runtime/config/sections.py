@@ -1,8 +1,8 @@
-"""The sections of the configuration: typed, strict, one tree for all processes. `loading` reads and checks it.
+"""The sections of the configuration: typed and strict, one tree for all processes. `loading` reads and checks it.
 
-A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file and
-the nearest right key or the allowed values. Defaults are the paper's experiment, with settled values for what
-the paper leaves out.
+A misspelt key, a wrong type or a value out of range raises `ConfigError`, which names the key, the file, and the
+nearest known key or the allowed values. The defaults are those of the paper's experiment, with values found by
+experiment where the paper gives none.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PLANT_UNITS = unit("plant units")
 HALF_WIDTHS = unit("half-widths")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-# Upper limits are far above every honest use. A log brings its configuration along: memory and time are taken by it.
+# Upper limits are far above any useful value. A log contains its configuration, which then costs memory and time.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
 """A number of things that take memory or time each."""
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=3_600_000), unit("ms")]
@@ -45,8 +45,8 @@ Name = Annotated[str, msgspec.Meta(pattern=PLANT_NAME)]
 
 
 AWAKE_BELOW = 0.01
-"""Seconds. Waking a sleeping core takes up to a few tenths of a millisecond: little of a longer period, but power all
-the time if it is avoided."""
+"""Seconds. Below this period, cores are kept awake. Waking a core takes up to a few tenths of a millisecond, which is
+small compared with a longer period, and keeping it awake costs power all the time."""
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -54,7 +54,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 Bounds = Annotated[list[float | None], msgspec.Meta(min_length=2, max_length=2)]
-"""Lower and upper; None: there is none. In TOML that is -inf or inf."""
+"""Lower and upper bound; None for no bound. In TOML, no bound is written -inf or inf."""
 
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1e3), HALF_WIDTHS]
@@ -88,7 +88,7 @@ class SensorsConfig(Section, frozen=True):
 
     @property
     def random(self) -> bool:
-        """Whether two seeds are two different measurements."""
+        """Whether measurements depend on the seed."""
         return bool(self.noise or self.dropouts)
 
 
@@ -122,6 +122,7 @@ class PlantConfig(Section, frozen=True):
     plan_patience: Annotated[float, msgspec.Meta(gt=0, le=1e6), unit("periods")] = 1.25
     """Time without a fresh command after which the plant follows the next entry of the last plan."""
     sensors: SensorsConfig = SensorsConfig()
+    """Measurement errors of the simulated plant."""
 
 
 class SolverConfig(Section, frozen=True):
@@ -189,7 +190,9 @@ class ControllerConfig(Section, frozen=True):
     checkpoint: str = ""
     """File from which a controller that starts again takes its memory. "": none."""
     solver: SolverConfig = SolverConfig()
+    """The solver."""
     backup: BackupConfig = BackupConfig()
+    """The backup policy."""
 
 
 class EstimatorConfig(Section, frozen=True):
@@ -209,7 +212,7 @@ class EstimatorConfig(Section, frozen=True):
 
 
 class ReferenceConfig(Section, frozen=True):
-    """Where the plans lead: to the equilibrium, or to a rest of the plant as it has been learned."""
+    """The reference: the equilibrium, or a rest of the plant according to the learned model."""
 
     outputs: list[str] | None = None
     """States with set-points. []: no set-points, plans lead to the rest of least cost. Without it plans lead to the
@@ -246,7 +249,7 @@ class RefitConfig(Section, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=1, le=100_000), unit("samples")] = 200
     """Newest samples that the controller keeps for the fit."""
     ridge: Positive = 1e-4
-    """Weight that holds K where it was."""
+    """Weight of the previous K in the refit."""
 
 
 class TrialConfig(Section, frozen=True):
@@ -300,8 +303,11 @@ class AdaptationConfig(Section, frozen=True):
     at_adoption: literals.AdoptionName = "keep"
     """K when hidden layers are adopted: kept, as in the paper, or fitted to the newest samples."""
     kalman: KalmanConfig = KalmanConfig()
+    """The Kalman filter of the last layer."""
     refit: RefitConfig = RefitConfig()
+    """The refit of K."""
     trial: TrialConfig = TrialConfig()
+    """The trial of hidden weights."""
 
 
 class ConstantConfig(Section, frozen=True):
@@ -351,7 +357,7 @@ class TrainerConfig(Section, frozen=True):
     batch: Annotated[Count, unit("samples")] = 512
     """M, the samples drawn at random from the buffer for one training."""
     steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 300
-    """Adam steps in one training, each on all M samples."""
+    """Number of Adam steps in one training, each on all M samples."""
     learning_rate: Positive = 1e-3
     """Learning rate of Adam."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -375,10 +381,11 @@ class BusConfig(Section, frozen=True):
     """Where the router listens; all other processes are its clients. tls/HOST:PORT needs `tls.keys`
     (docs/tutorials/remote.md)."""
     remote: str | None = None
-    """Where the router listens for other machines as well: tls/0.0.0.0:7448. Only the router reads it."""
+    """Additional address of the router for other machines, such as tls/0.0.0.0:7448. Only the router uses it."""
     insecure: bool = False
     """true: no warning that anyone who reaches a tcp/ endpoint beyond this machine may command the plant."""
     tls: TlsConfig = TlsConfig()
+    """The certificate."""
     lease_ms: Milliseconds = 1500
     """A controller or plant that sends nothing for so long counts as disconnected; readers after at least 10 s."""
     follow_silence: Seconds = 1.0
@@ -442,11 +449,11 @@ class Config(Section, frozen=True):
 
     @property
     def awake(self) -> bool:
-        """Whether `realtime.awake` keeps the cores from sleeping at this rate."""
+        """Whether `realtime.awake` keeps cores from sleeping at this rate."""
         mode = self.realtime.awake
         return mode == "always" or (mode == "auto" and self.fast)
 
     @property
     def fast(self) -> bool:
-        """Whether the loops have a priority and so little time that their cores matter."""
+        """Whether the loops have a priority and a period so short that their cores matter."""
         return self.realtime.priority > 0 and self.period < AWAKE_BELOW

@@ -75,9 +75,9 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
         ("B", [], r"the model's B has shape \(0,\)"),
         ("X", ([1.0], [2.0]), r"the model's X has shape \(2, 1\), not \(2, 4\)"),
         ("g", [1.0], "G has shape"),
-        ("u_upper", [5.0], "not in order, or outside of U"),
-        ("u_upper", [-0.9], "not in order, or outside of U"),
-        ("u_lower", [-5.0], "not in order, or outside of U"),
+        ("u_upper", [5.0], "not in order, or outside U"),
+        ("u_upper", [-0.9], "not in order, or outside U"),
+        ("u_lower", [-5.0], "not in order, or outside U"),
     ],
 )
 def test_forged_sets_are_refused_with_the_reason(part: str, value: Any, says: str) -> None:

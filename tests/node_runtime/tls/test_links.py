@@ -226,7 +226,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
 
         wait_for(both_hear, every=0.05)
         wait_for(lambda: not connected(brief))
-        wait_for(lambda: any("expired on" in text and "our links to" in text for text in caplog.messages))
+        wait_for(lambda: any("expired on" in text and "the links to" in text for text in caplog.messages))
         assert connected(trainer)
         controller._put(topics.SAMPLES, b"later")
         wait_for(lambda: b"later" in [one.payload for one in heard[0].drain()])

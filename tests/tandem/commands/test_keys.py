@@ -193,7 +193,7 @@ def test_keys_that_do_not_fit_are_named(keys: Path, tmp_path: Path):
     with pytest.raises(ConfigError, match=r"is not the key of certificate\.pem"):
         credentials.read(mine)
     os.truncate(mine / "key.pem", 20)
-    with pytest.raises(ConfigError, match="no private key"):
+    with pytest.raises(ConfigError, match="not a private key"):
         credentials.read(mine)
     (mine / "authority.pem").unlink()
     with pytest.raises(ConfigError, match=r"authority\.pem: cannot be read"):
