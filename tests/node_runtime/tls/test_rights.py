@@ -72,7 +72,10 @@ def test_messages_without_the_right_to_publish_are_not_delivered(site: Site, rol
         arrived = [key for _ in range(1 if own else 2) for key in _until(heard, last)]
         assert set(arrived) <= {last, *(f"tandem/jet1/router/{name}" for name in ("health", "run_info"))}
         assert fast.try_recv() is None
-    named = {"stranger": "a certificate without rights here", "neighbour": "a certificate without rights here"}
+    named = {
+        "stranger": "a certificate without rights here",
+        "neighbour": "a certificate without rights here",
+    }
     site.router.heard(named.get(role, f"bad from {role}.jet1: denied, put"))
 
 
