@@ -41,7 +41,7 @@ def require_fit(values: Values, plant: Description, where: str) -> None:
 
 
 def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
-    """`cycles` cycles of so many seconds, and one more, so that a plan at the end of the last one has the same preview."""
+    """`cycles` cycles of so many seconds, and one more, so that plans at the end of the last one have a preview."""
     parts = len(next(iter(values.values())))
     turns = np.arange((cycles + 1) * parts)
     times = np.repeat(seconds / parts * np.append(turns, turns[-1] + 1), 2)[1:-1]
@@ -54,7 +54,7 @@ def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
 def rests(
     values: Values, steps: int, true: TrueMotion, plant: Description, period: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The true plant's equilibrium at each set-point: (steps, d) and (steps, m) of a cycle's `steps` ticks, plant units.
+    """The true plant's equilibrium at each set-point: (steps, d) and (steps, m) of a cycle's ticks, plant units.
 
     values: as of `require_fit`: with as many outputs as inputs a rest is unique.
 
