@@ -82,7 +82,7 @@ def test_words_follow_from_the_figures() -> None:
     assert "keeps all constraints at samples in 0 of 4 runs, against 4 of 4 runs" in said[3]
 
 
-def test_regret_is_signed_and_a_page_says_where_the_true_h_is_beaten() -> None:
+def test_regret_is_signed_and_the_page_names_cases_below_the_true_h() -> None:
     better, worse = a_result("better", [19.0, 23.0]), a_result("worse", [20.0, 21.0])
     assert better.values("regret") == pytest.approx([-0.05, 0.15])
     (said,) = findings.below_perfect([better, worse])
@@ -137,7 +137,7 @@ def test_the_picture_of_episodes_has_a_line_for_each_oracle_and_a_panel_for_all_
     assert high > 50.0
 
 
-def test_what_is_lost_not_settled_or_not_known_are_three_things() -> None:
+def test_lost_unsettled_and_unknown_are_distinguished() -> None:
     settled = a_result("fine", [20.0, 21.0], overshoot=0.1)
     assert settled.median("overshoot") == pytest.approx(0.1)
     assert settled.median("settled_s") == 5.0
@@ -185,7 +185,7 @@ def test_a_plant_with_one_performance_state_has_every_picture(kind: Picture, sta
     assert "angle" in _table(found, plant).note
 
 
-def test_a_record_that_lacks_what_is_wanted_is_not_taken(tmp_path: Path) -> None:
+def test_a_record_that_lacks_a_requested_result_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     path.write_bytes(msgspec.json.encode(a_record(1.0, 0.0)))
     assert read(path, detail=False) is not None

@@ -53,7 +53,7 @@ def test_figures_do_not_depend_on_the_number_of_processes(finished: tuple[Path, 
         ).read_bytes()
 
 
-def test_the_summary_has_what_it_promises(finished: tuple[Path, Finished]) -> None:
+def test_the_summary_has_its_documented_figures(finished: tuple[Path, Finished]) -> None:
     _folder, made = finished
     told = json.loads(made.summary.read_text())
     assert len(told["rows"]) == 10
@@ -71,7 +71,7 @@ def test_the_summary_has_what_it_promises(finished: tuple[Path, Finished]) -> No
         assert row["regret_by_episode"] == [row["regret"]]
 
 
-def test_the_page_needs_nothing_else(finished: tuple[Path, Finished]) -> None:
+def test_the_page_needs_no_other_file(finished: tuple[Path, Finished]) -> None:
     _folder, made = finished
     html = made.report.read_text()
     links = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"'>)\s]+)""", html)
@@ -110,7 +110,7 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
 
 
 @pytest.mark.long
-def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
+def test_an_interrupted_experiment_continues(small: Path, tmp_path: Path) -> None:
     # The other process reads the code anew; so must this one, where somebody edits while tests run.
     code_version.cache_clear()
     small.write_text(SMALL.replace("steps = 30", "steps = 150"))

@@ -36,7 +36,7 @@ vary."controller.oracle" = ["perfect", "linear"]
 """
 
 
-def test_a_wave_goes_on_for_one_cycle_more_than_is_counted() -> None:
+def test_a_wave_has_one_cycle_more_than_is_counted() -> None:
     asked = wave.reference({"y": [1.65, 1.75]}, 10.0, 1)
     assert asked.times == [0.0, 5.0, 5.0, 10.0, 10.0, 15.0, 15.0, 20.0]
     assert asked.values == [[1.65], [1.65], [1.75], [1.75]] * 2
@@ -60,7 +60,7 @@ def test_values_where_the_true_plant_has_no_rest_are_refused(tmp_path: Path) -> 
         work(job, job.key, tmp_path, False, [])
 
 
-def test_an_episode_is_a_cycle_and_the_plant_goes_on(tmp_path: Path) -> None:
+def test_an_episode_is_a_cycle_and_the_plant_continues(tmp_path: Path) -> None:
     path = tmp_path / "wave.toml"
     path.write_text(WAVE)
     found = {}
@@ -100,7 +100,7 @@ def test_to_stay_where_the_true_plant_rests_costs_nothing(tmp_path: Path) -> Non
         ("{ y = [1.65, 7.0] }", "not within its bounds"),
     ],
 )
-def test_what_is_no_wave_of_this_plant_is_refused(tmp_path: Path, values: str, why: str) -> None:
+def test_an_invalid_wave_of_this_plant_is_refused(tmp_path: Path, values: str, why: str) -> None:
     path = tmp_path / "wave.toml"
     path.write_text(WAVE.replace("{ y = [1.65, 1.7] }", values))
     with pytest.raises(ConfigError, match=why):
