@@ -34,6 +34,7 @@ from node_runtime import provenance
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
+from run_log import raw_message
 from run_log.errors import LogError
 from run_log.reading.mcap_scan import Scan
 from run_log.reading.reader import read_run
@@ -222,7 +223,7 @@ def _timed(parts: list[Path]) -> Iterator[m.Message]:
             if isinstance(record, Channel) and record.topic in names:
                 channels[record.id] = names[record.topic]
             if isinstance(record, Message) and record.channel_id in channels:
-                yield codec.decode(channels[record.channel_id], record.data)
+                yield codec.decode(channels[record.channel_id], raw_message.unwrap(record.data))
 
 
 def replayed(parts: list[Path]) -> list[str]:
