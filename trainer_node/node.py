@@ -55,12 +55,12 @@ COUNTERS = (
     "trainings",
     "published",
     "adopted",
-    "not adopted",
-    "rolled back",
-    "others' sets",
-    "gaps filled",
+    "not_adopted",
+    "rolled_back",
+    "others_sets",
+    "gaps_filled",
     "joined",
-    "samples of other runs",
+    "samples_of_other_runs",
 )
 """Of a node, beside those of its `Trainer`."""
 WAITING = "waiting for a controller with a network"
@@ -228,19 +228,19 @@ class TrainerNode:
         if held > ours or judged not in self._explained:
             text = "the controller was sent hidden weights version %d by another trainer; it holds version %d"
             log.warning(text, judged[0] if judged not in self._explained else held, held)
-            self._count("others' sets")
+            self._count("others_sets")
             # A version that a controller would not take must not become ours.
             self._trainer.leap(judged[0])
         elif sent is None or (judged == sent and held >= ours):
-            self._count("rolled back")
+            self._count("rolled_back")
             log.info("the controller went back from hidden weights version %d; going on from there", ours)
             self._join_at = 0.0
         elif judged == sent:
-            self._count("not adopted")
+            self._count("not_adopted")
             log.info("the controller refused hidden weights version %d; going on from version %d", ours, held)
             self._join_at = 0.0
         elif clock.now() - (self._sent_at or 0.0) > self._patience:
-            self._count("not adopted")
+            self._count("not_adopted")
             log.warning("hidden weights version %d were never judged; going on from version %d", ours, held)
             self._trainer.leap()
         else:
@@ -278,7 +278,7 @@ class TrainerNode:
         """Add live samples. Where one may have been lost before them, the outbox will be asked."""
         if self._trainer is None or batch.run_id != self._run:
             # Not lost: once that run's K has come, joining it asks its outbox for all of them.
-            self._count("samples of other runs")
+            self._count("samples_of_other_runs")
             return
         last = self._trainer.buffer.last(self._run)
         # Ticks that the controller missed leave gaps too; then the outbox has nothing more either.
@@ -303,7 +303,7 @@ class TrainerNode:
             # A controller that was started again keeps samples of its earlier runs.
             new += self._add(SAMPLES_ANSWER, batch)
         if new:
-            self._count("gaps filled")
+            self._count("gaps_filled")
         if self._trainer.buffer.last(self._run) <= since:
             # No answer, but nothing came after the gap either: nothing is known to be missing.
             self._gap = None
@@ -340,7 +340,7 @@ class TrainerNode:
 
     def rest(self, now: float, took: float) -> None:
         """Not to be trained again too soon after a round that began at `now` and took this long, in seconds."""
-        self._counts["last training, ms"] = round(took * 1e3)
+        self._counts["last_training_ms"] = round(took * 1e3)
         self._train_at = now + max(TRAIN_EVERY, took / SHARE)
 
     def finish(self, draw: Draw, descent: Descent) -> None:

@@ -64,7 +64,7 @@ def test_what_is_no_measurement_is_none(
     one = guarded(read)
     for _ in range(3):
         assert one.read(0.0) is None
-    assert one.counts["reads failed"] == 3
+    assert one.counts["reads_failed"] == 3
     assert said in one.trouble()
     # Once for a person, however many there are.
     assert len(caplog.records) == 1
@@ -83,7 +83,7 @@ def test_with_an_estimator_some_states_may_have_no_number() -> None:
 def test_an_input_that_could_not_be_written_is_not_known_to_act() -> None:
     one = guarded(write=raising(TimeoutError("bus")))
     assert one.write(np.zeros(1), 0.0) is None
-    assert one.counts["writes failed"] == 1
+    assert one.counts["writes_failed"] == 1
     assert one.trouble() == "write failed: TimeoutError: bus"
 
 
@@ -123,7 +123,7 @@ def test_a_call_takes_effect_when_it_is_made_and_a_simulated_one_when_it_was_due
 def test_a_slow_call_is_counted() -> None:
     one = guarded(write=lambda u: clock.sleep_until(clock.now() + 0.02), period=0.01)
     one.write(np.zeros(1), 0.0)
-    assert (one.counts["writes slow"], one.counts["reads slow"]) == (1, 0)
+    assert (one.counts["writes_slow"], one.counts["reads_slow"]) == (1, 0)
 
 
 def test_a_call_that_does_not_return_is_a_trouble_that_others_see(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,5 +147,5 @@ def test_a_sample_that_is_lost_on_purpose_is_no_failure() -> None:
     for simulated in (True, False):
         one = Guarded(lost, lambda _u: None, 2, 0.05, simulated)
         assert one.read(0.0) is None
-        assert one.counts["reads failed"] == 0
+        assert one.counts["reads_failed"] == 0
         assert one.trouble() == ""

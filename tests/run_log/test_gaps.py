@@ -74,7 +74,7 @@ def test_what_never_arrived_is_counted_by_the_recorder_and_said_in_the_figures(t
         for topic, message, log_time in kept:
             writer.write(topic.name, codec.encode(message), log_time)
         assert writer.lost == {"controller/tick": 7, "controller/result": 8}
-        assert writer.counters["lost ticks"] == 8
+        assert writer.counters["lost_ticks"] == 8
     run = read_run(tmp_path / "run.mcap")
     assert lost_ticks(run) == [(RUN, 20, 7), (RUN, 40, 1)]
     assert summarise(run).lost_ticks == 8

@@ -44,7 +44,7 @@ def test_shows_what_matters(monitor: Monitor):
         "1 fallback",
         "1 soft ticks",
         "1 adopted",
-        "bad plant/state: not finite 2",
+        "bad plant state not finite 2",
         "2.5 / 20 s",
         "●",
     ):
