@@ -88,6 +88,10 @@ class Growing:
         self._names: dict[str, None] = {}
         self._grown = 0
 
+    def __bool__(self) -> bool:
+        """Whether a field is declared."""
+        return bool(self._names)
+
     @property
     def schema(self) -> Json:
         return object_schema(dict.fromkeys(self._names, self._leaf)) | {"description": self._description}

@@ -132,11 +132,9 @@ class Events:
         if tick.skipped:
             slots = "1 slot was" if tick.skipped == 1 else f"{tick.skipped} slots were"
             yield self._say("skipped", Level.WARNING, "controller", f"{slots} skipped before {who}")
-        if (before := self._change("state", tick.state_verdict, "fresh")) is not None:
+        if self._change("state", tick.state_verdict, "fresh") is not None:
             level = Level.INFO if tick.state_verdict == "fresh" else Level.WARNING
-            yield self._say(
-                "state", level, "controller", f"{who}: the sample is {tick.state_verdict} ({before} before)"
-            )
+            yield self._say("state", level, "controller", f"{who}: the sample is {tick.state_verdict}")
         if tick.truth:
             new = ", ".join(f"{name} = {value:g}" for name, value in tick.truth.items())
             yield self._say(

@@ -219,15 +219,18 @@ class View:
         grown = False
         for name, growing in self._growing.items():
             grown |= growing.grow(values[name])
-            values[name] = growing.declared(values[name])
+            values[name] = growing.declared(values[name]) or None
         if grown:
             self.channel = self._channel()
 
     def _channel(self) -> Channel:
         # What may be absent stands last in a schema.
         optional = [name for name, kind in self._kinds.items() if isinstance(kind, inspect.UnionType)]
-        required = [name for name in self._kinds if name not in optional]
-        schemas = {name: self._schema(name, self._kinds[name]) for name in (*required, *optional)}
+        required = [name for name in self._kinds if name not in optional and name not in self._growing]
+        # An object of which no field is known yet is no part of the schema.
+        growing = [name for name, one in self._growing.items() if one]
+        names = (*required, *growing, *optional)
+        schemas = {name: self._schema(name, self._kinds[name]) for name in names}
         schema = document(f"{self.topic.type.__name__} (view)", schemas, required)
         return Channel(self.topic.name, schema)
 
