@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from protocol import topics
 from protocol.topics import COMMANDER, Topic
 
-OPERATOR = "operator"
-"""Whoever looks: `tandem health`, a live view. It publishes nothing."""
+VIEWER = "viewer"
+"""The role of `tandem health` and `tandem live`: it reads everything and publishes nothing."""
 USER = topics.USER
-"""Whoever publishes topics of their own, below `user/` and nowhere else. It reads nothing."""
-ROLES = (*topics.PROCESSES, OPERATOR, COMMANDER, USER)
-READS_ALL = ("recorder", OPERATOR, COMMANDER)
+"""The role of a publisher of own topics: it publishes below `user/` and nowhere else, and reads nothing."""
+ROLES = (*topics.PROCESSES, VIEWER, COMMANDER, USER)
+READS_ALL = ("recorder", VIEWER, COMMANDER)
 QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
 
 _READS: dict[str, tuple[Topic, ...]] = {
@@ -71,8 +71,8 @@ def rights_of(role: str) -> Rights:
 
 
 def role_of(process: str) -> str:
-    """The role in which a process of this name speaks: its own, or the operator's."""
-    return process if process in (*topics.PROCESSES, COMMANDER, USER) else OPERATOR
+    """The role in which a process of this name speaks: its own, or the viewer's."""
+    return process if process in (*topics.PROCESSES, COMMANDER, USER) else VIEWER
 
 
 def common_name(role: str, plant: str) -> str:

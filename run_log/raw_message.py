@@ -42,6 +42,19 @@ def unwrap(data: bytes) -> bytes:
     raise NotRaw(f"{len(data)} bytes that are no message of {SCHEMA_NAME}")
 
 
+def payload_of(encoding: str, data: bytes) -> bytes:
+    """Return the payload of a message of a raw channel. Before format 3 it was not wrapped.
+
+    Args:
+        encoding: the channel's message encoding.
+        data: the message.
+
+    Raises:
+        NotRaw: the channel's messages are wrapped, and this one is not.
+    """
+    return unwrap(data) if encoding == ENCODING else data
+
+
 def schema() -> bytes:
     """Return the `FileDescriptorSet` of the message above, as protobuf."""
     # The numbers are those of google/protobuf/descriptor.proto.

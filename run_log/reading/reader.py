@@ -31,8 +31,8 @@ def read_run(path: str | Path) -> Run:
     path = Path(path)
     scan = Scan(path)
     run = Run(path, Config())
-    names: dict[int, tuple[str, bool]] = {}
-    """By channel: the topic, and whether its bytes are wrapped, as they are since format 3."""
+    names: dict[int, tuple[str, str]] = {}
+    """By channel: the topic, and the encoding of its messages."""
     header: Header | None = None
     for record in scan:
         match record:
@@ -42,10 +42,9 @@ def read_run(path: str | Path) -> Run:
             case Attachment():
                 run.attachments[record.name] = record.data
             case Metadata():
-                _take_metadata(run, record)
+                take_metadata(run, record)
             case Channel() if record.topic.startswith(RAW):
-                wrapped = record.message_encoding == raw_message.ENCODING
-                names[record.id] = record.topic.removeprefix(RAW), wrapped
+                names[record.id] = record.topic.removeprefix(RAW), record.message_encoding
             case Message() if record.channel_id in names:
                 _take(run, *names[record.channel_id], record)
     if header is None:
@@ -58,16 +57,26 @@ def read_run(path: str | Path) -> Run:
         )
     elif run.continued is not None:
         run.note = f"{path} is part {run.part} of its log, which goes on in {run.continued}."
-    run.config = _config(path, run)
+    interpret(run)
+    return run
+
+
+def interpret(run: Run) -> None:
+    """Take the configuration and the plant from what was read so far.
+
+    Raises:
+        LogError: there is no usable configuration, or the plant's record cannot be used.
+    """
+    run.config = _config(run.path, run)
     if PLANT in run.attachments:
         try:
             run.plant, run.files = decode(run.attachments[PLANT])
         except PlantRecordError as error:
-            raise LogError(f"{path}: {PLANT}: {error}") from error
-    return run
+            raise LogError(f"{run.path}: {PLANT}: {error}") from error
 
 
-def _take_metadata(run: Run, record: Metadata) -> None:
+def take_metadata(run: Run, record: Metadata) -> None:
+    """Note in `run` what one metadata record says of its log."""
     if record.name == RECOVERED:
         run.recovered = True
     elif record.name == CONTINUED:
@@ -76,9 +85,9 @@ def _take_metadata(run: Run, record: Metadata) -> None:
         run.part = int(part)
 
 
-def _take(run: Run, name: str, wrapped: bool, record: Message) -> None:
+def _take(run: Run, name: str, encoding: str, record: Message) -> None:
     try:
-        payload = raw_message.unwrap(record.data) if wrapped else record.data
+        payload = raw_message.payload_of(encoding, record.data)
     except raw_message.NotRaw:
         _count_bad(run, f"{name}: not wrapped")
         return

@@ -9,7 +9,7 @@ from typing import Any
 import jsonschema
 import msgpack
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lbmpc.plants import get_plant
@@ -69,6 +69,7 @@ def test_a_field_is_declared_when_it_comes_and_keeps_its_kind() -> None:
     assert shown(view, b'{"b": 3, "a": 4}') == {"a": 4}
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     st.lists(
         st.binary(max_size=60)
@@ -91,7 +92,7 @@ def test_no_payload_breaks_a_view(payloads: list[bytes]) -> None:
 def test_fields_and_schemas_are_bounded() -> None:
     view, channels = UserView("user/x"), set()
     for k in range(10 * MOST_SCHEMAS):
-        shown(view, json.dumps({f"f{k}_{i}": i for i in range(3)}).encode())
+        view.render(json.dumps({f"f{k}_{i}": i for i in range(3)}).encode())
         channels.add(view.channel)
     assert len(channels) <= MOST_SCHEMAS
     wide = UserView("user/x")
