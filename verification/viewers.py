@@ -63,7 +63,7 @@ def alerts(path: Path) -> dict[Alert, int]:
                 break
             if channel.message_encoding == "json" and schema is not None:
                 if schema.id not in validators:
-                    validators[schema.id] = jsonschema.Draft202012Validator(json.loads(schema.data))
+                    validators[schema.id] = _validator(schema)
                 wrong = _of_json(message.data, validators[schema.id])
                 found.update((channel.topic, text) for text in wrong)
             elif schema is not None and schema.name == raw_message.SCHEMA_NAME:
@@ -116,6 +116,16 @@ def _of_schema(schema: Schema) -> Iterator[str]:
     yield from _fields(tree, schema.name)
 
 
+def _validator(schema: Schema) -> jsonschema.Draft202012Validator:
+    """Of its messages; one that accepts them all where the schema itself is an alert."""
+    try:
+        tree = json.loads(schema.data)
+        jsonschema.Draft202012Validator.check_schema(tree)
+    except (ValueError, jsonschema.SchemaError):
+        tree = {}
+    return jsonschema.Draft202012Validator(tree)
+
+
 def _fields(tree: Any, where: str) -> Iterator[str]:
     """What `parseJsonSchema` of Lichtblick refuses in an object, and what we refuse ourselves."""
     if not isinstance(tree, dict) or tree.get("type") != "object":
@@ -157,8 +167,8 @@ def _of_json(data: bytes, validator: jsonschema.Draft202012Validator) -> Iterato
     except ValueError as error:
         yield f"a message is no JSON: {error}"
         return
-    for error in validator.iter_errors(value):
-        yield f"a message does not obey its schema: at {error.json_path}: {error.message[:120]}"
+    for found in validator.iter_errors(value):
+        yield f"a message does not obey its schema: at {found.json_path}: {found.message[:120]}"
 
 
 def main(paths: list[str]) -> int:

@@ -20,9 +20,9 @@ PLAIN = {"type": "object", "properties": {"x": {"type": "number"}}, "additionalP
 
 
 def test_a_log_of_ours_has_no_alert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = override(Config(), ["controller.horizon=10", "network.hidden=[6]", "trainer.steps=5"])
+    config = override(Config(), ["controller.horizon=5", "network.hidden=[6]", "trainer.steps=5"])
     path = tmp_path / "run.mcap"
-    save(simulate(config, 30), path)
+    save(simulate(config, 12), path)
     assert alerts(path) == {}
     assert main([str(path)]) == 0
     assert capsys.readouterr().out == f"{path}: 0 alerts\n"
