@@ -1,7 +1,7 @@
 """The bytes of a message as a protobuf message with one field, which viewers of MCAP files can open.
 
     syntax = "proto3";
-    package tandem;
+    package tandem_log;
     message Raw { bytes payload = 1; }
 
 Viewers refuse a channel whose encoding they do not know, and msgpack is such an encoding. Protobuf puts a tag and a
@@ -10,9 +10,9 @@ length before the bytes and leaves the bytes as they are.
 
 from __future__ import annotations
 
-SCHEMA_NAME = "tandem.Raw"
+SCHEMA_NAME = "tandem_log.Raw"
 ENCODING = "protobuf"
-"""Of the channel and of its schema."""
+"""The encoding of the channel and of its schema."""
 _TAG = b"\x0a"
 """Field 1, of a length that follows."""
 _CONTINUES = 0x80
@@ -21,7 +21,7 @@ _LONGEST_VARINT = 5
 
 
 class NotRaw(ValueError):
-    """Bytes that are no `tandem.Raw`."""
+    """Bytes that are no `tandem_log.Raw`."""
 
 
 def wrap(payload: bytes) -> bytes:
@@ -61,7 +61,7 @@ def schema() -> bytes:
     field = _text(1, "payload") + _number(3, 1) + _number(4, _LABEL_OPTIONAL) + _number(5, _TYPE_BYTES)
     message = _text(1, SCHEMA_NAME.rpartition(".")[2]) + _bytes(2, field + _text(10, "payload"))
     file = (
-        _text(1, "tandem/raw.proto")
+        _text(1, "tandem_log/raw.proto")
         + _text(2, SCHEMA_NAME.rpartition(".")[0])
         + _bytes(4, message)
         + _text(12, "proto3")

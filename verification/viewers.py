@@ -117,7 +117,7 @@ def _of_schema(schema: Schema) -> Iterator[str]:
 
 
 def _validator(schema: Schema) -> jsonschema.Draft202012Validator:
-    """Of its messages; one that accepts them all where the schema itself is an alert."""
+    """Return a validator of its messages; it accepts everything if the schema itself is an alert."""
     try:
         tree = json.loads(schema.data)
         jsonschema.Draft202012Validator.check_schema(tree)

@@ -56,7 +56,7 @@ def document(title: str, properties: Json, required: Iterable[str]) -> Json:
 
 
 def object_schema(properties: Json, required: Iterable[str] = ()) -> Json:
-    """Of an object that has no other fields than these."""
+    """Return the schema of an object that has no other fields than these."""
     return {
         "type": "object",
         "properties": properties,

@@ -6,9 +6,9 @@ from protocol import topics
 from run_log.views.views import MOST_USER_TOPICS
 
 BYTES_PER_S = 1024 * 1024
-"""Of all these topics together: about what Tandem's own messages take at 1 kHz."""
+"""Limit for all these topics together: about what Tandem's own messages take at 1 kHz."""
 MESSAGES_PER_S = 1000.0
-"""Of all these topics together: as many as the fastest loop has ticks."""
+"""Limit for all these topics together: as many as a 1 kHz loop has ticks."""
 BURST_S = 4.0
 """After a pause so many seconds' worth may come at once."""
 

@@ -74,7 +74,7 @@ def test_a_reader_that_is_not_ours_reads_it_all(whole: Path, messages: list[Logg
                 assert (channel.message_encoding, schema.encoding, schema.name) == (
                     "protobuf",
                     "protobuf",
-                    "tandem.Raw",
+                    "tandem_log.Raw",
                 )
                 assert channel.metadata["payload"] == "msgpack"
                 assert msgpack.unpackb(unwrap(message.data))["run_id"]
