@@ -19,7 +19,7 @@ $(READY): pyproject.toml
 	    { echo "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,experiment,examples,docs,dev]'
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,export,experiment,examples,docs,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
