@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.live import rates
 from benchmarks.document_block import conditions
+from benchmarks.live import rates
 from benchmarks.live.rates import COLUMNS, MARKS, Rates
 
 
