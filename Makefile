@@ -18,7 +18,7 @@ $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,experiment,examples,dev]'
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,experiment,cluster,examples,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s

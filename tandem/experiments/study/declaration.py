@@ -16,6 +16,7 @@ from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
 from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.study.isolated import Limits
 
 Picture = Literal["episodes", "trajectories", "states", "survival", "lemma", "recovery", "rows"]
 ORACLE = "controller.oracle"
@@ -106,6 +107,7 @@ class Declaration(Runs, frozen=True, kw_only=True):
     about: str = ""
     x0s: dict[str, Starts] = msgspec.field(default_factory=dict)
     quick: Quick = Quick()
+    limits: Limits = Limits()
     group: list[Group]
     case: list[Case]
 
