@@ -1,33 +1,18 @@
-"""What runs on a worker: it takes the client's files, says what it is, and makes runs in child processes."""
+"""What a Dask worker does: it takes the client's files, says what it is, and has its child processes make runs."""
 
 from __future__ import annotations
 
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 from distributed import get_worker
 
-from node_runtime import provenance
-from tandem.experiments.cluster.bundle import Bundle, moved, unpack
+from tandem.experiments.cluster.bundle import Bundle, unpack
+from tandem.experiments.cluster.making import Facts, facts, make
 from tandem.experiments.study.isolated import Children, Failure, Limits, Unwanted
-from tandem.experiments.study.plan import PACKAGES, code_version
-from tandem.experiments.study.work import Done, Task, work
 
-NEEDED = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
-"""Packages of the extra `experiment`."""
-PREPARING = Limits(seconds=120.0)
-
-
-class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker is."""
-
-    code: str
-    """`code_version`, of code and packages."""
-    versions: dict[str, str]
-    missing: list[str]
-    """Packages of the extra `experiment` that it does not have."""
+PREPARING = Limits(seconds=300.0)
 
 
 def prepare(bundle: Bundle) -> Facts | Failure:
@@ -35,21 +20,15 @@ def prepare(bundle: Bundle) -> Facts | Failure:
     root = _root(bundle.sha256)
     unpack(bundle, root)
     with _children(root).one() as child:
-        facts: Facts | Failure = child.call(facts_here, limits=PREPARING)
-    return facts
+        found: Facts | Failure = child.call(facts, limits=PREPARING)
+    return found
 
 
-def facts_here() -> Facts:
-    """Facts of this process. A worker may have been started before its packages were changed, so a child answers."""
-    return Facts(
-        code=code_version(),
-        versions=provenance.versions(PACKAGES),
-        missing=[package for package in NEEDED if find_spec(package) is None],
-    )
+def perform(task: bytes, limits: Limits, bundle: str) -> bytes | Failure:
+    """Make one run, unless it is cancelled meanwhile; a pickled `Task` comes in and a pickled `Done` goes out.
 
-
-def perform(task: Task, bundle: str) -> Done | Failure:
-    """Make one run, until it is cancelled. bundle: the hash of the client's files."""
+    bundle: the hash of the client's files.
+    """
     worker, root = get_worker(), _root(bundle)
     key = worker.get_current_task()
 
@@ -59,13 +38,12 @@ def perform(task: Task, bundle: str) -> Done | Failure:
 
     try:
         with _children(root).one() as child:
-            config = moved(task.job.config, root)
-            answer: Done | Failure = child.call(work, task, config, limits=task.limits, wanted=wanted)
+            done: bytes | Failure = child.call(make, task, root, limits=limits, wanted=wanted)
     except Unwanted:
         return Failure(kind="crash", text="cancelled", traceback="")
-    if isinstance(answer, Failure):
-        return msgspec.structs.replace(answer, where=str(worker.name))
-    return answer
+    if isinstance(done, Failure):
+        return msgspec.structs.replace(done, where=str(worker.name))
+    return done
 
 
 def _root(bundle: str) -> Path:

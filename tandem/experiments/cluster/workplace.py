@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import pickle
 from collections.abc import Callable
 from concurrent.futures import Future
 from time import monotonic, sleep
@@ -19,7 +20,8 @@ from distributed.client import Future as DaskFuture
 
 from node_runtime import provenance
 from tandem.experiments.cluster.bundle import Bundle
-from tandem.experiments.cluster.worker import Facts, perform, prepare
+from tandem.experiments.cluster.making import Facts
+from tandem.experiments.cluster.worker import perform, prepare
 from tandem.experiments.study.isolated import Failure
 from tandem.experiments.study.plan import PACKAGES, code_version
 from tandem.experiments.study.runner import Answer, Lost, RunnerError
@@ -90,7 +92,11 @@ class Cluster:
         workers = list(self._accepted)
         try:
             sent = self._client.submit(
-                perform, task, self._bundle.sha256, pure=False, workers=workers, allow_other_workers=False
+                perform,
+                *(pickle.dumps(task), task.limits, self._bundle.sha256),
+                pure=False,
+                workers=workers,
+                allow_other_workers=False,
             )
         except (OSError, RuntimeError) as error:
             future.set_exception(Lost(f"the scheduler is gone: {error}"))
@@ -111,7 +117,8 @@ class Cluster:
         if future is None:
             return
         try:
-            future.set_result(sent.result(timeout=60))
+            answer = sent.result(timeout=60)
+            future.set_result(answer if isinstance(answer, Failure) else pickle.loads(answer))
         except asyncio.CancelledError as error:
             future.set_exception(Lost(str(error)))
         except Exception as error:  # noqa: BLE001 - of Dask, a worker or what either could not unpickle
