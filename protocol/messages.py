@@ -12,6 +12,7 @@ seconds for time), and are listed by name in `RunInfo.units`.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
@@ -37,6 +38,8 @@ ReferenceKind = Literal["set", "hold", "configured"]
 """set: outputs go to values; hold: the plant stays where it is, as far as it can rest there; configured: what the
 configuration says."""
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
+BAD = "bad_"
+"""What the counters of messages that are not obeyed begin with."""
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -311,6 +314,11 @@ class TickResult(Message, frozen=True):
         return "adopted" if outcome == "adopted" else "refused" if outcome == "refused" else "none"
 
 
+def counter_name(*words: str) -> str:
+    """Return a counter's name in snake_case: "bad plant/state: not finite" becomes "bad_plant_state_not_finite"."""
+    return re.sub("[^a-z0-9]+", "_", " ".join(words).lower()).strip("_")
+
+
 def words_of_fault(state: str, fault: str, since: float) -> str:
     """One entry of `TickResult.sensor_faults` that is there since so many seconds, for a person."""
     kind, _, known = fault.partition("; ")
@@ -428,4 +436,5 @@ class Health(Message, frozen=True):
     process: str
     status: ProcessStatus
     counters: dict[str, int]
+    """By names of `counter_name`."""
     note: str

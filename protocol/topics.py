@@ -123,6 +123,10 @@ OUTBOX_QUERY = "controller/outbox"
 """Queryable: `?run=RUN;since=SEQ;last=K` answers with `Samples` batches."""
 HIDDEN_QUERY = "controller/hidden"
 """Queryable: answers with the controller's current `HiddenSnapshot`."""
+USER = "user"
+"""Keys below `tandem/<plant>/user/` are free: anyone's own topics, which are recorded and never obeyed."""
+USER_MAX_BYTES = 256 * 1024
+"""Of one message on such a topic: as large as a command may be."""
 LARGEST_QUESTION = 4096
 """Characters of the parameters of a query."""
 
@@ -130,6 +134,16 @@ LARGEST_QUESTION = 4096
 def below(plant: str, name: str) -> str:
     """The full key of a topic, or of a queryable, of one plant."""
     return f"{PREFIX}/{plant}/{name}"
+
+
+def is_user(name: str) -> bool:
+    """Whether a key below `tandem/<plant>/` is that of a user's own topic."""
+    return name.startswith(f"{USER}/")
+
+
+def user_keys(plant: str) -> str:
+    """The key expression that covers all of the users' own topics."""
+    return below(plant, f"{USER}/**")
 
 
 def everything(plant: str) -> str:

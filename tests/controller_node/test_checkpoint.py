@@ -134,7 +134,7 @@ def test_a_damaged_file_is_named_and_kept_aside(
     path.write_bytes(bad)
     assert resume(ME, path) is None
     assert str(path) in caplog.text
-    assert "starting afresh" in caplog.text
+    assert "starting without memory" in caplog.text
     assert ("sha256 does not match" in caplog.text) is (how not in ("empty", "garbage"))
     assert not path.exists()
     assert (tmp_path / "memory.damaged").read_bytes() == bad
@@ -365,7 +365,7 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
             ear.until(lambda message: isinstance(message, m.Tick))
             process.signal(signal.SIGTERM)
             assert process.end() == 0
-    assert "starting afresh" in process.said
+    assert "starting without memory" in process.said
     if content == "other":
         assert "plant is jet2 there and jet1 here" in process.said
         assert "network is" in process.said
@@ -391,4 +391,4 @@ def test_a_pipe_or_a_link_as_checkpoint_blocks_nothing_and_keeps_its_place(
     assert counts_["checkpoints failed"] == 1
     assert path.lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_bytes() == b"not a checkpoint"
-    assert caplog.text.count("only a regular file is read, replaced or moved") == 2
+    assert caplog.text.count("only regular files are read, replaced or moved") == 2

@@ -214,7 +214,7 @@ def test_a_damaged_library_is_seen_before_it_is_loaded_and_compiled_again(
     replaced(library, damaged(library.read_bytes()))
     assert runs_compiled(tmp_path, caplog)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert f"{library}: is not as it was written" in caplog.text
+    assert f"{library}: its content has changed" in caplog.text
     assert runs_compiled(tmp_path, caplog)
     assert not caplog.records
 
@@ -241,7 +241,7 @@ def test_one_library_under_the_name_of_another_is_not_loaded(
     (other,) = tmp_path.iterdir()
     replaced(library := built(tmp_path), other.read_bytes())
     assert runs_compiled(tmp_path, caplog)
-    assert f"{library}: is not as it was written" in caplog.text
+    assert f"{library}: its content has changed" in caplog.text
 
 
 def test_several_damaged_libraries_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -314,7 +314,7 @@ def a_link(path: Path) -> None:
         ("folder", group_may_write, "can be written by others (mode 0720): chmod go-w"),
         ("folder", all_may_write, "can be written by others (mode 0777): chmod go-w"),
         ("folder", a_link, "is a link"),
-        ("above", all_may_write, "which everybody can write"),
+        ("above", all_may_write, "which all users can write to"),
         ("library", group_may_write, "can be written by others (mode 0620): chmod go-w"),
         pytest.param("folder", somebody_elses, "belongs to user 12345", marks=needs_root),
         pytest.param("above", somebody_elses, "which belongs to user 12345", marks=needs_root),

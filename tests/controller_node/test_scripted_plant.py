@@ -148,7 +148,7 @@ def test_states_that_are_always_late_are_taken_for_punctual_in_the_end() -> None
         assert process.end() == 0
     notes = [health.note for health in ear.of(topics.HEALTH["controller"])]
     assert notes.count("no plant: its states come too late to act on") >= 1
-    assert "taken for punctual" in process.said
+    assert "now count as punctual" in process.said
     late = [tick for tick in ear.of(topics.TICK) if tick.state_verdict == "stale"]
     # The length of the plan, and nothing after it.
     assert len(late) <= config.controller.horizon

@@ -160,7 +160,7 @@ def test_states_that_move_together_are_named() -> None:
     u = rng.standard_normal((300, 1))
     said = refused(Transitions(x, u, x))
     assert "level = +2e-05 pressure + constant" in said
-    assert "they move together only" in said
+    assert "they move only together" in said
 
 
 def test_too_few_samples_are_counted() -> None:
@@ -175,7 +175,7 @@ def test_motion_that_drowns_in_measuring_noise_is_refused() -> None:
     true = Transitions(true.x[200:], true.u[200:], true.after[200:])
     seen = 0.02 * TWO.x_scale * RNG(1).standard_normal((len(true) + 1, 2))
     said = refused(Transitions(true.x + seen[:-1], true.u, true.after + seen[1:]))
-    assert "as measuring noise is" in said
+    assert "like measurement noise" in said
 
 
 def test_a_log_whose_parts_disagree_is_refused() -> None:
@@ -187,4 +187,4 @@ def test_a_log_whose_parts_disagree_is_refused() -> None:
     after[:30, 1] += 0.3 * x[:30, 1]
     said = refused(Transitions(x, u, after))
     assert "what pressure does to" in said
-    assert "too little beside what a linear model leaves out" in said
+    assert "small compared with the error of a linear model" in said

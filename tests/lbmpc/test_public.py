@@ -21,7 +21,7 @@ from tests.helpers.paths import DOCS
 def test_the_solve_of_the_docstring_and_of_the_page_gives_an_input() -> None:
     (block,) = re.findall(r"\n\n((?:    .*\n|\n)+)", lbmpc.__doc__ or "")
     code = textwrap.dedent(block)
-    page = (DOCS / "python.md").read_text()
+    page = (DOCS / "tutorials/python.md").read_text()
     assert f"```python\n{code.strip()}\n```" in page
     names: dict[str, object] = {}
     exec(code, names)

@@ -56,7 +56,7 @@ def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
         assert np.nanmax(differences) <= STEP * (1 + 1e-5)
         assert np.nanmax(differences) > 0.9 * STEP
     assert all(PLANT.u_min[0] <= u <= PLANT.u_max[0] for _t, u in bench.writes)
-    assert sources == {"command", "plan", "safe"}
+    assert sources == {"hold", "command", "plan", "safe"}
 
 
 def test_a_command_that_comes_early_waits_and_loses_nothing() -> None:

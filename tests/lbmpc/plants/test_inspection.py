@@ -59,7 +59,7 @@ FAULTY: dict[str, tuple[Plant, str]] = {
     "a gain on its side": (changed(safe_gain=[[1.0], [2.0]]), "safe_gain is .* a row for each input"),
     "rhs too short": (changed(rhs=lambda x, u: [x[1]]), "rhs returns 1 entries: it needs 2"),
     "rhs of nothing": (changed(rhs=lambda x, u: None), "rhs returns None: it must return a list"),
-    "rhs of words": (changed(rhs=lambda x, u: ["a", 0]), "rhs returns what CasADi cannot take"),
+    "rhs of words": (changed(rhs=lambda x, u: ["a", 0]), "CasADi cannot use the result of rhs"),
     "a symbol from elsewhere": (changed(rhs=lambda x, u: [ca.SX.sym("q"), 0]), r"variables \[q\] are free"),
     "rhs that fails": (changed(rhs=lambda x, u: [x[1], 1 / 0]), r"rhs fails in line \d+: ZeroDivisionError"),
     "a condition on a state": (

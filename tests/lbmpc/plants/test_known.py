@@ -66,7 +66,7 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
     "A in words": ({"a": "fast"}, "A is 'fast': give a square matrix"),
     "A of rows of different lengths": ({"a": [[0.0, 1.0], [2.0]]}, "A is .*: give a square matrix"),
     "A that is not square": ({"a": [[0.0, 1.0]]}, "A is .*: give a square matrix"),
-    "B without columns": ({"b": [0.0, 1.0]}, r"B is \[0.0, 1.0\]: .* of a single input it is \[\[0.0\]"),
+    "B without columns": ({"b": [0.0, 1.0]}, r"B is \[0.0, 1.0\]: .* for one input, for example, \[\[0.0\]"),
     "B of another plant": (
         {"b": [[0.0]]},
         r"B has the shape \(1, 1\): it needs \(2, 1\), a row for each of x1, x2",

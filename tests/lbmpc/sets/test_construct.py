@@ -21,7 +21,7 @@ START = np.array([0.62, 0.0])
 def test_there_is_no_set_where_there_is_none() -> None:
     with pytest.raises(EmptySetError, match=r"kept in X for \d+ steps"):
         construct(MODEL, "given", START, W=np.array([0.05, 1.0]))
-    with pytest.raises(SetError, match="no way of the true plant"):
+    with pytest.raises(SetError, match="no trajectory of the true plant"):
         construct(MODEL, "regions", np.array([0.99, 1.9]))
 
 
@@ -49,4 +49,4 @@ def test_a_plant_without_bounds_is_told_which_it_needs(changes: dict, open_end: 
     plant = replace(PENDULUM, scale={"rate": 2.0, "torque": 3.0}, **changes)
     with pytest.raises(SetError, match=rf"not bounded: {open_end}\. .*Give the plant such bounds") as refused:
         construct(build_model(plant, 0.1), kind, np.zeros(2))
-    assert "`scale` is no bound" in str(refused.value)
+    assert "`scale` is not a bound" in str(refused.value)

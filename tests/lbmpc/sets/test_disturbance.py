@@ -213,7 +213,7 @@ def test_a_region_that_is_none_is_named():
         ),
         (
             lambda x, u: [x[1], u[0] / (1.0 + x[0])],
-            r"a division of an expression in angle .*must not come to 0",
+            r"a division of an expression in angle .*must not reach 0",
         ),
         (lambda x, u: [x[1], u[0] - x[1] * ca.fabs(x[1])], r"`fabs`.*--kind given.*in rate"),
     ],

@@ -80,7 +80,7 @@ def test_with_a_delay_the_predicted_states_stay_inside_whatever_h_does(
 
 def test_what_numbers_cannot_do_is_refused() -> None:
     for kind in ("box", "hull", "regions", "extension"):
-        with pytest.raises(SetError, match=r"is numbers alone, .* sets of the kind `given` take W as it is"):
+        with pytest.raises(SetError, match=r"is given by numbers alone, .* use the kind `given`"):
             construct(MODEL, kind, np.zeros(2))
     with pytest.raises(DisturbanceError, match="give 2 half-widths"):
         construct(MODEL, "given", np.zeros(2), W=np.zeros(3))

@@ -74,4 +74,4 @@ def test_an_interval_with_one_end_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     assert "unbounded" in check(half_open).reason
     complete = checker._bases
     monkeypatch.setattr(checker, "_bases", lambda *a: complete(*a)[:1])
-    assert "edges lead to no vertex" in check(certificate).reason
+    assert "edges do not end at a known vertex" in check(certificate).reason

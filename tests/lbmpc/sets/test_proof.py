@@ -89,7 +89,7 @@ def test_a_budget_ends_what_cannot_be_decided(family: Certificate) -> None:
 
 def test_a_w_that_is_flat_askew_is_refused(family: Certificate) -> None:
     flat = [[-0.1, -0.1], [0.1, 0.1], [0.0, 0.0]]
-    assert "flat in a direction that is no state's" in prove(MODEL, changed(family, 0, W=flat)).reason
+    assert "flat in a direction that is not a state's axis" in prove(MODEL, changed(family, 0, W=flat)).reason
 
 
 def test_a_w_of_no_width_in_a_state_is_proved_to_a_hair(family: Certificate) -> None:
@@ -116,7 +116,7 @@ def test_where_the_plants_equations_do_not_hold_there_is_no_proof() -> None:
         reason = prove(model, wrong).reason
     except DisturbanceError as error:
         reason = str(error)
-    assert "h is outside of W" in reason or "reaches where it is not defined" in reason
+    assert "h is outside of W" in reason or "leaves its domain of definition" in reason
 
 
 def test_what_is_said_of_a_box_holds_at_its_points(family: Certificate) -> None:

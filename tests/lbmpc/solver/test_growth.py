@@ -93,7 +93,7 @@ def test_a_horizon_without_digits_is_refused_with_the_largest_that_has_some(
         require_horizon(model, 60)
     with pytest.raises(ModelError, match="37 steps"):
         build_problem(model, LinearOracle(1, 1), 37)
-    with pytest.raises(ModelError, match="sample faster"):
+    with pytest.raises(ModelError, match="use a higher rate"):
         require_horizon(build_model(unstable(10.0), 2.0), 1)
     require_horizon(compressor(), 1000)
     monkeypatch.setitem(PLANTS, "runaway", unstable(10.0))

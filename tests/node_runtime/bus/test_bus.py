@@ -333,7 +333,7 @@ def test_an_endpoint_that_is_none_is_an_error_for_a_person(endpoint: str) -> Non
 
 def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.LogCaptureFixture) -> None:
     assert router.main(config) == 1
-    assert "is taken: another router may be running" in caplog.text
+    assert "is in use: another router may be running" in caplog.text
     assert config.bus.endpoint in caplog.text
 
 
@@ -361,7 +361,7 @@ def test_of_two_endpoints_the_taken_one_is_named(tmp_path: Path, caplog: pytest.
         taken = f"tls/127.0.0.1:{other.getsockname()[1]}"
         keys = f'bus.tls.keys="{tmp_path}/keys/router"'
         assert router.main(live_config(f'bus.remote="{taken}"', keys)) == 1
-    assert f"{taken} is taken: another router may be running, or another program" in caplog.text
+    assert f"{taken} is in use: another router may be running, or another program" in caplog.text
 
 
 def test_the_router_process_ends_cleanly() -> None:

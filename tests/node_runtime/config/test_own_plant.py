@@ -168,7 +168,7 @@ def test_rows_there_and_back(tmp_path: Path):
         ("{z=1.0}", "no bound"),
         ("{z=1.0,min=0.5,max=0.3}", "min must be below max"),
         ("{z=1.0,max=0.3,priority=0.5}", "whole number"),
-        ("{u=1.0,max=2.0,priority=1}", "an input is never outside of U"),
+        ("{u=1.0,max=2.0,priority=1}", "inputs never leave U"),
         ("{z=1.0,y=-1.0,max=-3.0}", "at x_e"),
         ("{u=1.0,max=1.0}", "at u_e"),
         ("{z=1.0,max=inf}", "plant.rows.few.max is not a finite number"),
@@ -183,7 +183,7 @@ def test_a_plant_whose_rows_are_none():
     for rows in (3, {"x1": {"x1": 1.0, "max": 1.0}}, {"r": [1.0]}, {"r": {"x1": "a", "max": 1.0}}):
         with pytest.raises(PlantDefinitionError, match="row"):
             Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], rows=rows, scale={"x1": 1.0, "u1": 1.0})
-    with pytest.raises(PlantDefinitionError, match="a word of rows"):
+    with pytest.raises(PlantDefinitionError, match="a keyword of rows"):
         Known.from_matrices(
             [[-1.0]],
             [[1.0]],

@@ -17,7 +17,7 @@ from tests.helpers.live import live_config
 
 
 def test_an_address_with_a_zone_is_refused_where_certificates_are_needed() -> None:
-    with pytest.raises(ConfigError, match="no certificate can name an address with a zone"):
+    with pytest.raises(ConfigError, match="a certificate cannot contain an address with a zone"):
         session_config("client", "tls/[fe80::1%2]:7448", 1000)
     session_config("client", "tcp/[fe80::1%2]:7447", 1000)
 
@@ -39,7 +39,7 @@ def test_every_key_that_a_role_may_use_is_of_its_plant():
 
 def test_a_router_lets_other_machines_in_with_certificates_only():
     for assignment, says in (
-        ('bus.remote="tcp/0.0.0.0:7448"', "with certificates only"),
+        ('bus.remote="tcp/0.0.0.0:7448"', "need certificates"),
         ('bus.remote="tls/0.0.0.0:7448"', r"bus\.tls\.keys is missing"),
     ):
         with ExitStack() as stack, pytest.raises(ConfigError, match=says):
@@ -97,7 +97,7 @@ def test_who_was_denied_is_known_after_any_number_of_sessions():
         refusals.read(
             head
             + f"{k:x} on Interface(lo)"
-            + who.format("operator.jet1", "")
+            + who.format("viewer.jet1", "")
             + "Put (ingress) on tandem/jet1/x"
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")

@@ -47,10 +47,10 @@ def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site
         Bus(site.far("plant"), "plant", "p-1") as plant,
         Bus(site.far("controller"), "controller", "c-1") as controller,
         Bus(site.far("recorder"), "recorder", "r-1") as recorder,
-        Bus(site.far("operator"), "monitor", "m-1") as operator,
+        Bus(site.far("viewer"), "monitor", "m-1") as viewer,
     ):
         states, commands = controller.queue(topics.PLANT_STATE), plant.queue(topics.COMMAND)
-        logged, seen = recorder.everything(), operator.everything()
+        logged, seen = recorder.everything(), viewer.everything()
         wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(controller, topics.COMMAND))
         loop = {topic.key("jet1") for topic in (topics.PLANT_STATE, topics.COMMAND)}
         keys: dict[Mailbox, set[str]] = {box: set() for box in (logged, seen)}
@@ -226,7 +226,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
 
         wait_for(both_hear, every=0.05)
         wait_for(lambda: not connected(brief))
-        wait_for(lambda: any("expired on" in text and "our links to" in text for text in caplog.messages))
+        wait_for(lambda: any("expired on" in text and "the links to" in text for text in caplog.messages))
         assert connected(trainer)
         controller._put(topics.SAMPLES, b"later")
         wait_for(lambda: b"later" in [one.payload for one in heard[0].drain()])

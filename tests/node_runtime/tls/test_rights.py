@@ -23,9 +23,9 @@ FOREIGN = [
     ("controller", topics.HIDDEN_WEIGHTS),
     ("controller", topics.PLANT_STATE),
     ("recorder", topics.HIDDEN_WEIGHTS),
-    ("operator", topics.COMMAND),
-    ("operator", topics.OVERRIDE),
-    ("operator", topics.REFERENCE),
+    ("viewer", topics.COMMAND),
+    ("viewer", topics.OVERRIDE),
+    ("viewer", topics.REFERENCE),
     ("commander", topics.COMMAND),
     ("nobody", topics.HIDDEN_WEIGHTS),
     ("neighbour", topics.HIDDEN_WEIGHTS),
@@ -52,7 +52,7 @@ def _until(mailbox: Mailbox, key: str, timeout_s: float = HANG_S) -> list[str]:
 @pytest.mark.parametrize("role", dict.fromkeys(role for role, _ in FOREIGN))
 def test_what_a_role_may_not_publish_reaches_nobody(site: Site, role: str):
     """The last message is one that it may publish, so all before it have arrived or never will."""
-    with Bus(site.local, "operator", "o-1") as ear, site.session(role) as session:
+    with Bus(site.local, "viewer", "o-1") as ear, site.session(role) as session:
         heard, block = ear.everything(), zenoh.CongestionControl.BLOCK
         fast = ear._lanes.session("bulk").declare_subscriber(topics.COMMAND.direct_key("jet1"))
         # Only now does the router know that somebody listens.

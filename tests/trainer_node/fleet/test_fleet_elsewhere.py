@@ -184,4 +184,4 @@ def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
         wait_for(lambda: any("expired on" in text for text in caplog.messages))
         certificate_authority.renew("trainer", folder, [], 30, None)
         plant.until(published, tick=True, ignored=first.run_id)
-    assert any("our links to" in text for text in caplog.messages)
+    assert any("the links to" in text for text in caplog.messages)
