@@ -1,5 +1,5 @@
-# Four images from one file: controller (also router and plant; no torch), recorder, trainer (no CasADi), and worker, the
-# scheduler and the workers of a sweep (torch, CasADi and a compiler).
+# Four images from one file: controller (also router and plant; no torch), recorder, trainer (no CasADi) and worker
+# (scheduler and workers of a sweep; torch, CasADi and a compiler).
 # pip's usual variables pass through as build arguments: PIP_INDEX_URL, PIP_EXTRA_INDEX_URL, PIP_FIND_LINKS.
 # No compiler is in the other three: see "The solver in a container" in docs/tutorials/compose.md.
 

@@ -20,7 +20,7 @@ IDLE_S = 120.0
 
 
 def main() -> int:
-    # Ctrl-C on a terminal reaches every process there. The parent decides what becomes of a run.
+    # Ctrl-C on a terminal reaches every process there. The parent decides whether a run ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(int(sys.argv[1]))
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()

@@ -95,7 +95,7 @@ class Quick(Section, frozen=True):
     seeds: Count = 2
     x0s: Count = 3
     values: Count = 3
-    """Of each `vary`, first, last and some between; of the oracles all."""
+    """Values of each `vary`: first, last and some between; of the oracles all."""
     episodes: Count = 2
 
 

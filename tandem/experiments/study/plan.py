@@ -45,7 +45,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def key(self) -> str:
-        """Of everything that its result depends on: settings and code, somebody's own files too."""
+        """Hash of everything that the result depends on: settings, code, and the user's own files."""
         files = msgspec.json.encode(files_of(self.config))
         return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
 

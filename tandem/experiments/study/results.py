@@ -42,7 +42,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
     J_by_episode: list[float | None]
     regret_by_episode: list[float | None]
-    """Of each episode; null where the plant was lost before its end."""
+    """J and regret of each episode; null where the plant was lost before its end."""
     overshoot: dict[str, float | None] | None
     """Per performance state, as a share of its initial deviation; null for one that began settled."""
     settled_s: float | None
@@ -133,7 +133,7 @@ class CaseResult(NamedTuple):
         return np.array([_value(row, name) for row in self.rows])
 
     def median(self, name: str) -> float:
-        """Of the rows that have this figure; NaN where none has."""
+        """Median of the rows that have this figure; NaN where none has."""
         values = self.values(name)
         values = values[~np.isnan(values)]
         return float(np.median(values)) if values.size else math.nan
@@ -219,7 +219,7 @@ def _row(
 
 
 def _figures(record: Record) -> dict[str, Any]:
-    """Of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
+    """Figures of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
     if record.lost is not None:
         return {}
     return msgspec.structs.asdict(of_episodes(record.episodes[1:] or record.episodes))

@@ -24,7 +24,7 @@ Progress = Callable[[int, int], None]
 Answer = Done | Failure
 
 TRIES = 3
-"""Of a run whose process ended. A run that raises or takes too much would do so again."""
+"""How often a run is tried if its process ends. A run that raises or exceeds a limit would do so again."""
 POLL_S = 0.5
 LONGEST_NAME = 160
 """Letters of a case in a file's name, which may have 255 in all."""

@@ -23,7 +23,7 @@ class Timing(msgspec.Struct, frozen=True):
 
     runs: list[list[float]]
     processor: str
-    """Of the machine that they were measured on."""
+    """Processor of the machine that measured them."""
 
 
 def timing_job(case: Resolved, seed: int, seconds: float) -> Job:

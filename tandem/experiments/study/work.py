@@ -52,7 +52,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     episodes: list[Performance]
     """Those that could be followed to their end; of set-points by turns the cycles."""
     performance: Performance
-    """Of all that could be followed."""
+    """Figures of the whole run, as far as it could be followed."""
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
@@ -165,7 +165,7 @@ def _outcome(job: Job) -> Outcome:
 
 
 def _cycles(run: Run, job: Job, rests: Rests) -> list[Performance]:
-    """Of each that could be followed to its end: dx and du are from where the true plant rests at the set-points."""
+    """Figures of each whole cycle: dx and du are from where the true plant rests at the set-points."""
     plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
     motion, (x, u) = trajectory(run, plant), rests
     outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))

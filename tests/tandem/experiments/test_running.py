@@ -127,7 +127,7 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
 
 @pytest.mark.long
 def test_an_interrupted_experiment_goes_on(small: Path, tmp_path: Path) -> None:
-    # The other process reads the code anew; so must this one, where somebody edits while tests run.
+    # The other process reads the code anew; so must this one, if a file is edited while tests run.
     code_version.cache_clear()
     small.write_text(SMALL.replace("steps = 30", "steps = 150"))
     out = tmp_path / "out"

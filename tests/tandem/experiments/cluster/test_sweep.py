@@ -36,7 +36,7 @@ class Moves:
         return x
 
 def fail():
-    raise RuntimeError("this plant cannot be moved")
+    raise SystemExit("this plant cannot be moved")
 
 STEEP = get_plant("moore_greitzer").varied(slope=SLOPE)
 KILLS = Moves(lambda: os.kill(os.getpid(), 9))
@@ -131,9 +131,9 @@ def test_a_cluster_makes_the_rows_of_one_process_and_a_run_that_fails_fails_alon
     (killed,) = by_kind["crash"]
     assert "SIGKILL" in killed.text
     # One for each of both with the true h, which cannot be had of a plant without equations.
-    raised = [failure for failure in by_kind["error"] if failure.text.startswith("RuntimeError")]
+    raised = [failure for failure in by_kind["error"] if failure.text.startswith("SystemExit")]
     assert (len(raised), len(by_kind["error"])) == (1, 3)
-    assert raised[0].text == "RuntimeError: this plant cannot be moved"
+    assert raised[0].text == "SystemExit: this plant cannot be moved"
     assert 'truth.py", line 14, in fail' in raised[0].traceback
     assert cluster.processes["first"].poll() is cluster.processes["second"].poll() is None
 
