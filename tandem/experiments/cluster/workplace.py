@@ -17,6 +17,7 @@ from typing import Any
 
 from distributed import Client
 from distributed.client import Future as DaskFuture
+from distributed.security import Security
 
 from node_runtime import provenance
 from tandem.experiments.cluster.bundle import Bundle
@@ -64,10 +65,14 @@ class Cluster:
         self._refused: dict[str, str] = {}
         self._under_way: dict[DaskFuture, tuple[Future[Answer], set[str]]] = {}
         self._looked, self._worked = 0.0, monotonic()
+        _require_certificates(address)
         try:
             self._client = Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError, RuntimeError) as error:
-            raise RunnerError(_no_scheduler(address, error)) from error
+        except (OSError, RuntimeError) as error:
+            raise RunnerError(
+                f"no Dask scheduler answers at {address}: is the address right, and is `dask scheduler` running? "
+                f"({error})"
+            ) from error
 
     def room(self) -> int:
         """Two runs for each thread of a worker, so that none waits for the next one."""
@@ -215,10 +220,17 @@ def why_not(facts: Facts | Failure) -> str | None:
     return None
 
 
-def _no_scheduler(address: str, error: Exception) -> str:
-    if address.startswith("tls") and not isinstance(error, OSError):
-        return (
-            f"{address} needs certificates: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE and "
-            f"DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT and __KEY, or a file in ~/.config/dask ({error})"
-        )
-    return f"no Dask scheduler answers at {address}: is the address right, and is `dask scheduler` running? ({error})"
+def _require_certificates(address: str) -> None:
+    """Raises `RunnerError`: Dask's configuration has no certificates that can be used, and the address needs some."""
+    if not address.startswith("tls"):
+        return
+    why = "distributed.comm.tls has no ca-file"
+    try:
+        if Security().get_connection_args("client").get("ssl_context") is not None:
+            return
+    except (OSError, ValueError) as error:  # a file is not there, or is no certificate
+        why = str(error)
+    raise RunnerError(
+        f"{address} needs certificates, and Dask's configuration has none that can be used ({why}): name them in "
+        '~/.config/dask/tls.yaml ("Sweep on a cluster" in the documentation)'
+    )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dask
 import msgspec
 import pytest
 
+from tandem.experiments.cluster.bundle import Bundle
 from tandem.experiments.cluster.making import Facts
 from tandem.experiments.cluster.making import facts as facts_here
-from tandem.experiments.cluster.workplace import why_not
+from tandem.experiments.cluster.workplace import Cluster, why_not
 from tandem.experiments.study.isolated import Failure
+from tandem.experiments.study.runner import RunnerError
 
 OURS = facts_here()
 
@@ -42,3 +45,20 @@ def test_one_that_could_give_other_numbers_is_refused_with_the_reason(
     facts: Facts | Failure, why: str
 ) -> None:
     assert why in (why_not(facts) or "")
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({}, "has no ca-file"),
+        (dict.fromkeys(("ca-file", "client.cert", "client.key"), "/no/such.pem"), "No such file"),
+    ],
+    ids=["none", "missing"],
+)
+def test_tls_without_certificates_is_refused_before_a_connection(settings: dict[str, str], why: str) -> None:
+    configured = {f"distributed.comm.tls.{name}": value for name, value in settings.items()}
+    with (
+        dask.config.set(configured),
+        pytest.raises(RunnerError, match=f"needs certificates.*{why}.*tls.yaml"),
+    ):
+        Cluster("tls://127.0.0.1:1", Bundle({}))
