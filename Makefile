@@ -20,7 +20,7 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
 	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check \
-	    -e '.[trainer,log,experiment,cluster,examples,docs,dev]'
+	    -e '.[trainer,log,export,experiment,cluster,examples,docs,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s

@@ -63,9 +63,9 @@ class Tally:
             counts["weights rolled back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
         if result.sensor_faults or self._faults:
-            self._say_faults(tick, result.sensor_faults)
+            self._report_faults(tick, result.sensor_faults)
 
-    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
+    def _report_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
         """Report changes of the distrusted sensors in health and in this process's log."""
         before = self._faults
         words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}

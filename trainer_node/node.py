@@ -199,7 +199,7 @@ class TrainerNode:
             return False
         self._asks, self._sent_at = False, None
         if judged not in self._explained:
-            # A decision is evaluated once, whoever sent the set.
+            # A decision is evaluated once, no matter which process sent the set.
             self._explained.append(judged)
         if followed and trainer is self._trainer:
             return True
@@ -353,7 +353,7 @@ class TrainerNode:
         """Publish the result of a training if it is an improvement."""
         assert self._trainer is not None
         weights = self._trainer.finish(draw, descent)
-        self._say_worth(self._trainer.worth)
+        self._report_worth(self._trainer.worth)
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)
@@ -361,7 +361,7 @@ class TrainerNode:
         self._explained.append((weights.seq, weights.sha256))
         self._count("published")
 
-    def _say_worth(self, worth: Worth | None) -> None:
+    def _report_worth(self, worth: Worth | None) -> None:
         """Report the benefit of the last training in health, and in the log if it changed."""
         words = f"following {self._run}" + ("" if worth is None else f"; {worth}")
         pays = None if worth is None else worth.pays

@@ -226,7 +226,7 @@ class Bus:
         callback = zenoh.handlers.Callback(arrived, indirect=False)
         self._declared.append(session.declare_subscriber(key, callback))
 
-    # -- questions and answers ---------------------------------------------------------------------------
+    # -- queries -----------------------------------------------------------------------------------------
 
     def serve(self, name: str, handler: Handler) -> None:
         """Answer queries at `tandem/<plant>/<name>` with the payloads of `handler(parameters)`.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
-OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
+OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2", "pyarrow", "rerun")
 """Packages of the extras. If one is missing, the command ends with a message."""
 NO_SETS, INTERRUPTED = 3, 130
 """Exit codes."""
