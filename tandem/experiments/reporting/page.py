@@ -63,6 +63,7 @@ def page(
     command: str,
     code: str,
     quick: bool,
+    failed: int = 0,
 ) -> Page:
     """The whole report as HTML, and its pictures.
 
@@ -74,6 +75,7 @@ def page(
         command: what made this.
         code: version of the code, a hash.
         quick: whether it is the short form.
+        failed: runs that failed and are in no table.
     """
     parts = []
     for group in declared.group:
@@ -92,6 +94,8 @@ def page(
         code=code,
         runs=sum(len(result.rows) for result in results),
         quick=quick,
+        failed=failed,
+        arithmetics=sorted({row.arithmetic for result in results for row in result.rows}),
         squares=_squares(plant),
     )
     return Page(html, {name: png for part in parts for name, png in part.named_pictures()})

@@ -49,6 +49,7 @@ def a_record(cost: float, overshoot: float = 0.0, violations: int = 0, **changes
         error_last=None,
         traces=None,
         lemma=None,
+        arithmetic="a processor",
     )
     changed = msgspec.structs.replace(record, **changes)
     return (
