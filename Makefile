@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+EXTRAS := trainer,log,live,export,experiment,cluster,examples,docs,dev
 # Passed on to tandem, e.g. make run ARGS="--seconds 60 --oracle l2nw"
 ARGS ?=
 
@@ -19,8 +20,7 @@ $(READY): pyproject.toml
 	    { echo "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check \
-	    -e '.[trainer,log,export,experiment,cluster,examples,docs,dev]'
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
