@@ -15,10 +15,14 @@ from tandem.experiments.reporting.style import figure, legend_above
 NEAR = 0.6
 """A bound is drawn when it is this near the lines, as a share of what they span."""
 
+LONG = 26
+"""Characters of a label, from which on the legend has one column."""
+
 
 def chart_figure(chart: Chart) -> Figure:
     """Draw a chart."""
-    made, (ax,) = figure(height=3.2)
+    columns = 2 if max((len(line.legend) for line in chart.lines), default=0) <= LONG else 1
+    made, (ax,) = figure(height=2.8 + 0.17 * -(-len(chart.lines) // columns))
     for line in chart.lines:
         _line(ax, line)
     for level in chart.levels:
@@ -39,7 +43,7 @@ def chart_figure(chart: Chart) -> Figure:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel(words(chart.x_label))
     ax.set_ylabel(words(chart.y_label))
-    legend_above(ax)
+    legend_above(ax, columns=columns)
     if chart.title:
         made.suptitle(words(chart.title), fontsize=9, x=0.02, ha="left")
     return made
@@ -48,7 +52,7 @@ def chart_figure(chart: Chart) -> Figure:
 def _line(ax: Axes, line: Line) -> None:
     look = {"marker": "", **line.look}
     every = len(line.x) // 20, max(1, len(line.x) // 8)
-    label = words(line.label)
+    label = words(line.legend)
     ax.plot(line.x, line.y, **look, linewidth=1.5, markevery=every, markersize=4, label=label)
     if line.low is not None and line.high is not None:
         ax.fill_between(line.x, line.low, line.high, color=look["color"], alpha=0.18, linewidth=0)

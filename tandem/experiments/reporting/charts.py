@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,12 @@ class Line(NamedTuple):
     low: np.ndarray | None = None
     high: np.ndarray | None = None
     """(n,) the smallest and the largest value of all runs."""
+    runs: int = 1
+    """Behind the line, where they differ."""
+
+    @property
+    def legend(self) -> str:
+        return self.label if self.runs == 1 else f"{self.label} ({self.runs} runs)"
 
 
 class Level(NamedTuple):
@@ -69,7 +76,7 @@ class Picture(NamedTuple):
     alt: str
 
 
-def of_runs(result: CaseResult, look: Look, values: list[np.ndarray], label: str | None = None) -> Line | None:
+def of_runs(result: CaseResult, look: Look, values: list[np.ndarray]) -> Line | None:
     """Return the median of several runs over time, with the band of all of them; None where there is no run.
 
     values: one (n,) for each run, from the start on.
@@ -79,15 +86,16 @@ def of_runs(result: CaseResult, look: Look, values: list[np.ndarray], label: str
     runs = np.array(values, dtype=float)
     t = np.arange(runs.shape[1]) * result.case.config.period
     differ = len(runs) > 1 and bool((np.ptp(runs, axis=0) > 0).any())
-    label = (label or result.label) + (f" ({len(runs)} runs)" if differ else "")
     if not differ:
-        return Line(label, look, t, runs[0])
-    return Line(label, look, t, np.median(runs, axis=0), runs.min(axis=0), runs.max(axis=0))
+        return Line(result.label, look, t, runs[0])
+    return Line(result.label, look, t, np.median(runs, axis=0), runs.min(axis=0), runs.max(axis=0), len(runs))
 
 
 def lines_of(results: list[CaseResult], values: Callable[[CaseResult], list[np.ndarray]]) -> list[Line]:
     """Return one line for each case that has runs. values: gives the (n,) of each run of a case."""
-    made = (of_runs(result, look, values(result)) for result, look in zip(results, looks(results), strict=True))
+    made = (
+        of_runs(result, look, values(result)) for result, look in zip(results, looks(results), strict=True)
+    )
     return [line for line in made if line is not None]
 
 
@@ -101,7 +109,7 @@ def reduced(line: Line, most: int = MOST) -> Line:
         return line
     edges = np.linspace(0, len(line.x), most // 2 + 1).astype(int)
     x, y, low, high = [], [], [], []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         part = line.y[first:last]
         x += [line.x[first], line.x[last - 1]]
         if np.isnan(part).all():
@@ -126,7 +134,9 @@ def to_page(chart: Chart) -> dict[str, Any]:
             return None
         found = np.full(len(x), np.nan)
         # A logarithmic axis has no place for 0.
-        found[np.searchsorted(x, line.x)] = np.where(values > 0, values, np.nan) if chart.scale == "log" else values
+        found[np.searchsorted(x, line.x)] = (
+            np.where(values > 0, values, np.nan) if chart.scale == "log" else values
+        )
         return [_rounded(value) for value in found.tolist()]
 
     shown: list[float | None] = [_rounded(value) for value in x.tolist()]
@@ -144,7 +154,8 @@ def to_page(chart: Chart) -> dict[str, Any]:
         "x": shown,
         "lines": [
             {
-                "label": line.label,
+                "name": line.label,
+                "label": line.legend,
                 "color": line.look["color"],
                 "dash": _dash(line.look),
                 "y": column(line, line.y),

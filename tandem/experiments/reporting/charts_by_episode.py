@@ -78,9 +78,8 @@ def _line(result: CaseResult, look: Look) -> Line:
     regret = _regret(result)
     known = ~np.isnan(regret).all(axis=0)
     number, regret = 1.0 + np.flatnonzero(known), regret[:, known]
-    seeds = f" ({len(regret)} runs)" if len(regret) > 1 else ""
-    label = result.case.words.get(ORACLE, result.label) + seeds
+    label = result.case.words.get(ORACLE, result.label)
     if len(regret) < 2:
         return Line(label, look, number, regret[0] if len(regret) else number)
     low, high = np.nanmin(regret, axis=0), np.nanmax(regret, axis=0)
-    return Line(label, look, number, np.nanmedian(regret, axis=0), low, high)
+    return Line(label, look, number, np.nanmedian(regret, axis=0), low, high, len(regret))

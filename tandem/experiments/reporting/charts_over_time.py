@@ -64,7 +64,9 @@ def _solve_time(results: list[CaseResult]) -> Picture:
     )
     runs = max(len(result.timing.runs) for result in results if result.timing is not None)
     many = "one run" if runs == 1 else f"up to {runs} runs"
-    caption = f"Solve time of each tick, measured alone, one process at a time, in {many} of each case. {BAND}"
+    caption = (
+        f"Solve time of each tick, measured alone, one process at a time, in {many} of each case. {BAND}"
+    )
     return Picture(chart, caption, "solve time over time, logarithmic")
 
 
@@ -129,7 +131,12 @@ def lemma(results: list[CaseResult], plant: Description) -> list[Picture]:
         t = np.arange(1, len(found.error) + 1) * result.case.config.period
         lines = [
             Line("accumulated |x̃|²", {"color": BLUE, "linestyle": "-"}, t, found.accumulated),
-            Line("bound (ii), constants of this run", {"color": VERMILION, "linestyle": (0, (5, 1.5))}, t, found.bound),
+            Line(
+                "bound (ii), constants of this run",
+                {"color": VERMILION, "linestyle": (0, (5, 1.5))},
+                t,
+                found.bound,
+            ),
             Line(
                 "bound (iii), constants known before the run",
                 {"color": GREY, "linestyle": (0, (1, 1.2))},
@@ -144,5 +151,7 @@ def lemma(results: list[CaseResult], plant: Description) -> list[Picture]:
             f"W̄ = {found.W_bar:.3g}. The largest ratio of the sum to bound (ii) is {ratio:.2g}."
         )
         chart = Chart(f"Lemma 1: {result.label}", TIME, "sum (units of x²)", lines, scale="log")
-        made.append(Picture(chart, caption, "accumulated squared prediction error beside its bounds, logarithmic"))
+        made.append(
+            Picture(chart, caption, "accumulated squared prediction error beside its bounds, logarithmic")
+        )
     return made

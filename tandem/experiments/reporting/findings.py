@@ -223,7 +223,7 @@ def survival(results: list[CaseResult]) -> list[str]:
 
 
 def counted(number: int, noun: str) -> str:
-    """"1 run", "2 runs"."""
+    """ "1 run", "2 runs"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 

@@ -1,7 +1,10 @@
 "use strict";
 // Draws every chart of the page with uPlot: zoom, values under the cursor, series that can be switched off.
 (() => {
-  const DARK = { "#000000": "#f0f0f0", "#6F6F6F": "#a8a8a8", "#0072B2": "#4fb0ea", "#882255": "#d87aa8", "#D55E00": "#f0813a" };
+  const VERMILION = "#D55E00", GREY = "#6F6F6F";
+  const DARK = {
+    "#000000": "#f0f0f0", "#0072B2": "#7d9bff", "#882255": "#d87aa8", [GREY]: "#a8a8a8", [VERMILION]: "#f0813a",
+  };
   const HEIGHT = 260;
   const scheme = matchMedia("(prefers-color-scheme: dark)");
   let printing = false;
@@ -10,7 +13,8 @@
   const css = (name) => (printing ? { "--ink": "#000", "--soft": "#333", "--grid": "#ddd" }[name]
     : getComputedStyle(document.documentElement).getPropertyValue(name).trim());
   const faint = (name, share) => colour(name) + Math.round(255 * share).toString(16).padStart(2, "0");
-  const shown = (value) => (value == null ? "" : String(Number(value.toPrecision(4))).replace("-", "−"));
+  const text = (value, digits) => String(Number(value.toPrecision(digits))).replace("-", "−");
+  const shown = (value, digits = 4) => (value == null ? "" : text(value, digits));
 
   // The index of the nearest sample that this series has: series of other periods have gaps.
   function nearest(u, series, index) {
@@ -24,7 +28,8 @@
 
   // 1, 2 and 5 of every decade, or every so many decades where there are many.
   function decades(low, high) {
-    const first = Math.floor(Math.log10(low)), last = Math.ceil(Math.log10(high)), every = Math.ceil((last - first) / 8);
+    const first = Math.floor(Math.log10(low)), last = Math.ceil(Math.log10(high));
+    const every = Math.ceil((last - first) / 8);
     const steps = last - first > 3 ? [1] : [1, 2, 5], found = [];
     for (let power = first; power <= last; power++) {
       if ((power - first) % every === 0) found.push(...steps.map((step) => Number(`${step}e${power}`)));
@@ -36,10 +41,12 @@
     return (u, low, high) => {
       if (low == null || high == null) return [0, 1];
       if (chart.scale === "log") {
-        for (const level of chart.levels || []) if (level.y > 0) { low = Math.min(low, level.y); high = Math.max(high, level.y); }
-        return [low / 1.3, high * 1.8];
+        const levels = (chart.levels || []).map((level) => level.y).filter((y) => y > 0);
+        return [Math.min(low, ...levels) / 1.3, Math.max(high, ...levels) * 1.8];
       }
-      if (chart.scale === "asinh") return [Math.min(1.3 * low, -chart.linear / 2), Math.max(1.3 * high, chart.linear / 2)];
+      if (chart.scale === "asinh") {
+        return [Math.min(1.3 * low, -chart.linear / 2), Math.max(1.3 * high, chart.linear / 2)];
+      }
       const reach = 0.6 * (high - low);
       const near = [...(chart.bounds || []), ...(chart.levels || []).map((level) => level.y)]
         .filter((y) => y != null && y > low - reach && y < high + reach);
@@ -61,20 +68,22 @@
         ctx.beginPath(); ctx.moveTo(bbox.left, across(y)); ctx.lineTo(bbox.left + bbox.width, across(y)); ctx.stroke();
       };
       const [low, high] = chart.bounds || [];
-      ctx.fillStyle = faint("#D55E00", 0.13);
-      if (low != null && low > u.scales.y.min) { ctx.fillRect(bbox.left, across(low), bbox.width, bbox.height); line(low, "#D55E00", [6, 3]); }
+      ctx.fillStyle = faint(VERMILION, 0.13);
+      if (low != null && low > u.scales.y.min) {
+        ctx.fillRect(bbox.left, across(low), bbox.width, bbox.height); line(low, VERMILION, [6, 3]);
+      }
       if (high != null && high < u.scales.y.max) {
-        ctx.fillRect(bbox.left, bbox.top, bbox.width, across(high) - bbox.top); line(high, "#D55E00", [6, 3]);
+        ctx.fillRect(bbox.left, bbox.top, bbox.width, across(high) - bbox.top); line(high, VERMILION, [6, 3]);
       }
       if (chart.span) {
         const [first, last] = chart.span.map((t) => u.valToPos(t, "x", true));
-        ctx.fillStyle = faint("#6F6F6F", 0.35);
+        ctx.fillStyle = faint(GREY, 0.35);
         ctx.fillRect(first, bbox.top, Math.max(last - first, 2 * ratio), bbox.height);
       }
       ctx.font = `${12 * ratio}px system-ui, sans-serif`; ctx.textAlign = "left"; ctx.textBaseline = "bottom";
       for (const level of chart.levels || []) {
         if (level.y <= u.scales.y.min || level.y >= u.scales.y.max) continue;
-        line(level.y, "#6F6F6F", [2, 3]);
+        line(level.y, GREY, [2, 3]);
         ctx.fillStyle = css("--soft");
         ctx.fillText(level.label, bbox.left + 4 * ratio, across(level.y) - 2 * ratio);
       }
@@ -87,7 +96,8 @@
     for (const line of chart.lines || []) {
       const own = series.length;
       series.push({
-        label: line.label, stroke: () => colour(line.color), width: 2, dash: line.dash, spanGaps: true,
+        label: line.label, caseName: line.name,
+        stroke: () => colour(line.color), width: 2, dash: line.dash, spanGaps: true,
         points: { show: chart.x.length < 30, size: 6 },
         value: (u, value, s, index) => {
           if (value == null || index == null || !line.low) return shown(value);
@@ -97,14 +107,20 @@
       data.push(line.y);
       if (!line.low) continue;
       for (const edge of [line.high, line.low]) {
-        series.push({ label: line.label, class: "band", stroke: "transparent", width: 0, spanGaps: true, points: { show: false } });
+        series.push({
+          label: line.label, caseName: line.name, class: "band",
+          stroke: "transparent", width: 0, spanGaps: true, points: { show: false },
+        });
         data.push(edge);
       }
       bands.push({ series: [own + 1, own + 2], fill: () => faint(line.color, 0.17) });
     }
-    const axis = (more) => ({ stroke: () => css("--soft"), grid: { stroke: () => css("--grid"), width: 1 }, ticks: { stroke: () => css("--grid") },
-      font: "12px system-ui, sans-serif", labelFont: "13px system-ui, sans-serif", labelSize: 22, ...more });
-    const numbers = (u, values) => values.map((value) => (value == null ? "" : String(Number(value.toPrecision(6))).replace("-", "−")));
+    const grid = () => css("--grid");
+    const axis = (more) => ({
+      stroke: () => css("--soft"), grid: { stroke: grid, width: 1 }, ticks: { stroke: grid },
+      font: "12px system-ui, sans-serif", labelFont: "13px system-ui, sans-serif", labelSize: 22, ...more,
+    });
+    const numbers = (u, values) => values.map((value) => shown(value, 6));
     const y = { label: chart.yLabel, size: 52, values: numbers };
     if (chart.ticks) y.splits = (u, index, low, high) => chart.ticks.filter((tick) => tick >= low && tick <= high);
     else if (chart.scale === "log") y.splits = (u, index, low, high) => decades(low, high);
@@ -114,17 +130,22 @@
     const [first, last] = [chart.x[0], chart.x[chart.x.length - 1]];
     return [{
       width, height: HEIGHT, series, bands, scales: {
-        x: { time: false, range: (u, low, high) => (low === high ? [low - 0.5, high + 0.5] : [Math.max(low, first), Math.min(high, last)]) },
+        x: {
+          time: false,
+          range: (u, low, high) =>
+            (low === high ? [low - 0.5, high + 0.5] : [Math.max(low, first), Math.min(high, last)]),
+        },
         y: { distr: { log: 3, asinh: 4 }[chart.scale] || 1, asinh: chart.linear, range: rangeOfY(chart) },
       },
       axes: [axis(x), axis(y)],
-      cursor: { drag: { x: true, y: false, setScale: true }, dataIdx: nearest, points: { size: 7 }, focus: { prox: 24 } },
-      focus: { alpha: 0.35 },
+      cursor: { drag: { x: true, y: false, setScale: true }, dataIdx: nearest, points: { size: 7 } },
       legend: { live: true, dash: (u, index) => (u.series[index].dash?.length ? "dashed" : "solid") },
       hooks: {
         drawAxes: [background(chart)],
         setScale: [(u, key) => { if (key === "x") linked.zoom(u); }],
-        setSeries: [(u, index, changed) => { if (index != null && changed.show != null) linked.toggle(u, index, changed.show); }],
+        setSeries: [(u, index, changed) => {
+          if (index != null && changed.show != null) linked.toggle(u, index, changed.show);
+        }],
       },
     }, data];
   }
@@ -151,8 +172,12 @@
         }
       }),
       toggle: (from, index, show) => alone(() => {
-        const name = from.series[index].label;
-        for (const u of charts) u.series.forEach((one, i) => { if (i && one.label === name && one.show !== show) u.setSeries(i, { show }); });
+        const name = from.series[index].caseName;
+        for (const u of charts) {
+          u.series.forEach((one, i) => {
+            if (i && one.caseName === name && one.show !== show) u.setSeries(i, { show });
+          });
+        }
       }),
     };
   }
@@ -164,6 +189,7 @@
     if (high > low) u.setScale("x", { min: low, max: high });
   }
 
+  const resize = (u, width) => u.setSize({ width, height: HEIGHT });
   const reset = (u) => { const [min, max] = ends(u); u.setScale("x", { min, max }); };
 
   // One finger moves the cursor, two fingers zoom; a vertical swipe still scrolls the page.
@@ -172,7 +198,9 @@
     let spread = 0;
     const left = (event) => event.clientX - u.over.getBoundingClientRect().left;
     const drop = (event) => { fingers.delete(event.pointerId); spread = 0; };
-    u.over.addEventListener("pointerdown", (event) => { if (event.pointerType === "touch") fingers.set(event.pointerId, left(event)); });
+    u.over.addEventListener("pointerdown", (event) => {
+      if (event.pointerType === "touch") fingers.set(event.pointerId, left(event));
+    });
     u.over.addEventListener("pointermove", (event) => {
       if (!fingers.has(event.pointerId)) return;
       fingers.set(event.pointerId, left(event));
@@ -188,8 +216,11 @@
   function bar(box, chart, of) {
     const head = document.createElement("div"), title = document.createElement("strong");
     head.className = "bar"; title.textContent = chart.title || ""; head.append(title);
-    for (const [text, name, act] of [["+", "zoom in", () => zoomBy(of(), 0.5)], ["−", "zoom out", () => zoomBy(of(), 2)],
-      ["reset", "show all", () => reset(of())]]) {
+    for (const [text, name, act] of [
+      ["+", "zoom in", () => zoomBy(of(), 0.5)],
+      ["−", "zoom out", () => zoomBy(of(), 2)],
+      ["reset", "show all", () => reset(of())],
+    ]) {
       const button = document.createElement("button");
       button.type = "button"; button.textContent = text; button.title = name; button.setAttribute("aria-label", name);
       button.addEventListener("click", act);
@@ -202,7 +233,9 @@
     u.root.querySelectorAll(".u-series:not(.band) th").forEach((cell, i) => {
       if (!i) return;
       cell.tabIndex = 0; cell.setAttribute("role", "button"); cell.title = "show or hide";
-      cell.addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); cell.click(); } });
+      cell.addEventListener("keydown", (event) => {
+        if (event.key === "Enter" || event.key === " ") { event.preventDefault(); cell.click(); }
+      });
     });
   }
 
@@ -215,7 +248,8 @@
     u.unit = chart.xLabel;
     linked.charts.push(u);
     touch(u); keyboard(u);
-    new ResizeObserver(() => { if (!printing && box.clientWidth && box.clientWidth !== u.width) u.setSize({ width: box.clientWidth, height: HEIGHT }); }).observe(box);
+    const fit = () => { if (!printing && box.clientWidth && box.clientWidth !== u.width) resize(u, box.clientWidth); };
+    new ResizeObserver(fit).observe(box);
     return u;
   }
 
@@ -227,8 +261,11 @@
   }
   const redraw = () => plots.forEach((u) => u.redraw());
   scheme.addEventListener("change", redraw);
-  addEventListener("beforeprint", () => { printing = true; plots.forEach((u) => u.setSize({ width: 440, height: HEIGHT })); });
-  addEventListener("afterprint", () => { printing = false; plots.forEach((u) => u.setSize({ width: u.root.parentElement.clientWidth, height: HEIGHT })); });
+  addEventListener("beforeprint", () => { printing = true; plots.forEach((u) => resize(u, 440)); });
+  addEventListener("afterprint", () => {
+    printing = false;
+    plots.forEach((u) => resize(u, u.root.parentElement.clientWidth));
+  });
 
   // Tables that are wider than the page say so.
   function cue(wide) {

@@ -49,6 +49,7 @@ class Part(NamedTuple):
     size: str
     ran: str
     headline: str
+    runs: int
     kept: str
     claims: list[findings.Claim]
     pictures: list[Drawn]
@@ -82,7 +83,11 @@ def page(
     by_group: dict[str, list[CaseResult]] = {}
     for result in results:
         by_group.setdefault(result.case.group, []).append(result)
-    parts = [_part(group, by_group[group.name], plant, command) for group in declared.group if group.name in by_group]
+    parts = [
+        _part(group, by_group[group.name], plant, command)
+        for group in declared.group
+        if group.name in by_group
+    ]
     claimed = [part for part in parts if part.claims]
     statements = list(dict.fromkeys(claim.statement for part in claimed for claim in part.claims))
     environment = jinja2.Environment(
@@ -91,7 +96,7 @@ def page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["prose"] = _prose
+    environment.filters |= {"prose": _prose, "counted": findings.counted}
     html = environment.get_template("page.html.j2").render(
         declared=declared,
         parts=parts,
@@ -129,6 +134,7 @@ def _part(group: Group, results: list[CaseResult], plant: Description, command: 
         size=tables.size(results),
         ran=tables.ran(results),
         headline=tables.headline(group, results),
+        runs=len(records),
         kept=f"{sum(record.kept for record in records)} of {len(records)}",
         claims=findings.claims(results) if group.picture == "trajectories" else [],
         pictures=drawn,
@@ -143,7 +149,10 @@ def _drawn(picture: pictures.Picture) -> Drawn:
     shown = picture.drawn
     if isinstance(shown, Chart):
         return Drawn(_json(to_page(shown)), "", style.png(chart_figure(shown)), picture.caption, picture.alt)
-    return Drawn("", style.data_uri(shown), style.png(shown), picture.caption, picture.alt)
+    png = style.png(shown)
+    # The layout is found: to find it again takes as long as to draw.
+    shown.set_layout_engine("none")
+    return Drawn("", style.data_uri(shown), png, picture.caption, picture.alt)
 
 
 def _named_pictures(part: Part) -> list[tuple[str, bytes]]:
@@ -163,7 +172,8 @@ def _json(values: Any) -> str:
 def _prose(text: str) -> Markup:
     """Text of the experiment's file, with what stands between backticks as code."""
     code = Markup("<code>{}</code>").format
-    return Markup("").join(code(part) if i % 2 else escape(part) for i, part in enumerate(" ".join(text.split()).split("`")))
+    parts = " ".join(text.split()).split("`")
+    return Markup("").join(code(part) if i % 2 else escape(part) for i, part in enumerate(parts))
 
 
 def _text(name: str) -> str:

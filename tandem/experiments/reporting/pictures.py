@@ -68,8 +68,12 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
     caption = f"{name[0].upper()}{name[1:]} of every run (strokes) and the median (dot)."
     if any(result.case.name == reference for result in shown):
         caption += " Diamond and dashed line: the case that the others are compared with."
+    if any(not record.kept for result in shown for record in result.records):
+        caption += " At the right: runs that leave the bounds."
     if left_out:
-        caption += f" The picture shows {MOST} cases: the lowest and the highest medians. The table has all cases."
+        caption += (
+            f" The picture shows {MOST} cases: the lowest and the highest medians. The table has all cases."
+        )
     return [Picture(made, caption, f"{name} by case")]
 
 
@@ -92,15 +96,21 @@ def _strip(ax: Axes, i: int, result: CaseResult, values: np.ndarray, right: floa
     shown = np.minimum(values, right)
     middle = min(float(np.median(values)), right)
     colour = BLUE if own else "black"
-    ax.plot([shown.min(), shown.max()], [i, i], color=colour, linewidth=3.5, alpha=0.25, solid_capstyle="butt")
+    ax.plot(
+        [shown.min(), shown.max()], [i, i], color=colour, linewidth=3.5, alpha=0.25, solid_capstyle="butt"
+    )
     strokes = shown if len(shown) <= STROKES else np.quantile(shown, np.linspace(0, 1, STROKES))
     ax.plot(strokes, np.full(len(strokes), i), "|", color=colour, markersize=6, alpha=0.7)
     ax.plot(middle, i, "D" if own else "o", color=colour, markersize=5)
     broken = sum(not record.kept for record in result.records)
     if broken:
-        place: Any = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
-        said = f"{broken} of {len(result.records)} leave the bounds"
-        ax.annotate(said, (shown.max(), i), **place, fontsize=8, color=VERMILION)
+        place: Any = {
+            "xycoords": ("axes fraction", "data"),
+            "va": "center",
+            "fontsize": 8.5,
+            "color": VERMILION,
+        }
+        ax.annotate(f" {broken} of {len(result.records)}", (1.0, i), **place)
     if own:
         ax.axvline(middle, color=BLUE, linewidth=0.9, linestyle=(0, (4, 2)), zorder=0)
 
@@ -168,8 +178,8 @@ def states(results: list[CaseResult], plant: Description) -> list[Picture]:
     caption = (
         f"Initial states. {named(plant, first)}"
         + ("" if second is None else f" across, {named(plant, second)} up")
-        + ". Dot: every run from there keeps all true constraints at samples. Cross: no run does. Number: this many runs "
-        "do. The axes end at the bounds. The plus marks the equilibrium."
+        + ". Dot: every run from there keeps all true constraints at samples. Cross: no run does. "
+        "Number: this many runs do. The axes end at the bounds. The plus marks the equilibrium."
     )
     if len(results) > MOST:
         caption += f" The picture shows the first {MOST} cases."
@@ -207,6 +217,6 @@ def survival(results: list[CaseResult], plant: Description) -> list[Picture]:
     ax.set_xlabel(words(f"{what_varies(next(iter(families.values())), plant)} (steps are not even)"))
     legend_above(ax, columns=1)
     caption = (
-        "Share of the runs that keep all true constraints at samples. Lines are drawn side by side where they are equal."
+        "Share of the runs that keep all true constraints at samples. Equal lines are drawn side by side."
     )
     return [Picture(made, caption, "share of runs kept, by value and oracle")]

@@ -33,7 +33,7 @@ class Table(NamedTuple):
     @property
     def heads(self) -> list[tuple[str, int]]:
         """The headings of the first row, and how many columns each spans."""
-        found = []
+        found: list[tuple[str, int]] = []
         for above, columns in groupby(self.columns, key=lambda column: column.above):
             members = list(columns)
             found += [(above, len(members))] if above else [("", 1)] * len(members)
@@ -54,7 +54,9 @@ def cases_table(results: list[CaseResult], plant: Description) -> Table:
         Column("", "case", [result.label for result in results]),
         Column("", "runs", [str(len(result.rows)) for result in results]),
         Column("constraints", "kept in runs", [kept(result) for result in results]),
-        Column("constraints", "worst excess (%)", [_percent(r.worst("excess_between_samples")) for r in results]),
+        Column(
+            "constraints", "worst excess (%)", [_percent(r.worst("excess_between_samples")) for r in results]
+        ),
     ]
     if several:
         made.append(Column("first episode", "J", [_number(r.median("J_first")) for r in results]))
@@ -80,7 +82,11 @@ def cases_table(results: list[CaseResult], plant: Description) -> Table:
     if timed:
         spreads = [None if r.timing is None else spread(r.timing) for r in results]
         made += [
-            Column("solve time (ms)", name, ["–" if one is None else f"{getattr(one, name):.2g}" for one in spreads])
+            Column(
+                "solve time (ms)",
+                name,
+                ["–" if one is None else f"{getattr(one, name):.2g}" for one in spreads],
+            )
             for name in ("p50", "p99")
         ]
     return Table(made)
@@ -120,16 +126,22 @@ def ran(results: list[CaseResult]) -> str:
         said.append(f"{text}.")
     else:
         said.append("No case draws at random: one run for each initial state is exact.")
-    said.append(f"{counted(len({tuple(row.x0) for result in results for row in result.rows}), 'initial state')}.")
+    said.append(
+        f"{counted(len({tuple(row.x0) for result in results for row in result.rows}), 'initial state')}."
+    )
     lengths = list(dict.fromkeys(_length(result) for result in results))
-    said.append("; ".join(lengths) + "." if len(lengths) <= SETTINGS else f"{len(lengths)} different lengths of runs.")
+    said.append(
+        "; ".join(lengths) + "." if len(lengths) <= SETTINGS else f"{len(lengths)} different lengths of runs."
+    )
     return " ".join(said)
 
 
 def _length(result: CaseResult) -> str:
     case = result.case
     what = "episode" if case.set_points is None else "cycle"
-    length = f"{counted(case.steps, 'tick')} ({case.steps * case.config.period:g} s at {case.config.rate:g} Hz)"
+    length = (
+        f"{counted(case.steps, 'tick')} ({case.steps * case.config.period:g} s at {case.config.rate:g} Hz)"
+    )
     return f"{counted(case.episodes, what)} of {length}" if case.episodes > 1 else length
 
 
@@ -168,7 +180,10 @@ def headline(group: Group, results: list[CaseResult]) -> str:
         name = "deviation"
     known = {r.label: r.median(name) for r in (learned if name == "regret" else results)}
     shown = {
-        label: (value, f"{_percent(value)}{NBSP}%" if name == "regret" and np.isfinite(value) else _number(value))
+        label: (
+            value,
+            f"{_percent(value)}{NBSP}%" if name == "regret" and np.isfinite(value) else _number(value),
+        )
         for label, value in known.items()
         if not np.isnan(value)
     }
@@ -220,8 +235,8 @@ def terms(plant: Description) -> list[tuple[str, str]]:
         ),
         (
             "ticks",
-            "Iteration limit: ticks whose solve ended at the limit of iterations. Soft: ticks that needed slack in a soft "
-            "constraint. Fallback: ticks whose input is not the solver's.",
+            "Iteration limit: ticks whose solve ended at the limit of iterations. Soft: ticks that needed slack in a "
+            "soft constraint. Fallback: ticks whose input is not the solver's.",
         ),
         (
             "solve time",
