@@ -37,6 +37,17 @@
     return found.filter((tick) => tick >= low && tick <= high);
   }
 
+  // Leaves out the labels that would touch the one before.
+  function apart(u, splits) {
+    let last = Infinity;
+    return splits.map((split) => {
+      const at = u.valToPos(split, "y");
+      if (Math.abs(last - at) < 13) return null;
+      last = at;
+      return split;
+    });
+  }
+
   function rangeOfY(chart) {
     return (u, low, high) => {
       if (low == null || high == null) return [0, 1];
@@ -124,7 +135,7 @@
     const y = { label: chart.yLabel, size: 52, values: numbers };
     if (chart.ticks) y.splits = (u, index, low, high) => chart.ticks.filter((tick) => tick >= low && tick <= high);
     else if (chart.scale === "log") y.splits = (u, index, low, high) => decades(low, high);
-    if (y.splits) y.filter = (u, splits) => splits;
+    if (y.splits) y.filter = (u, splits) => apart(u, splits);
     const x = { label: chart.xLabel, values: numbers, size: 30 };
     if (chart.whole) x.incrs = [1, 2, 5, 10, 20, 50, 100, 1000];
     const [first, last] = [chart.x[0], chart.x[chart.x.length - 1]];

@@ -89,7 +89,7 @@ def cases_table(results: list[CaseResult], plant: Description) -> Table:
             )
             for name in ("p50", "p99")
         ]
-    return Table(made)
+    return Table([column for column in made if set(column.cells) != {"–"}])
 
 
 def survival_table(results: list[CaseResult], plant: Description) -> Table:
