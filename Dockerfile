@@ -1,6 +1,6 @@
 # Three small images from one file: controller (also router and plant; no torch), recorder, trainer (no CasADi).
 # pip's usual variables pass through as build arguments: PIP_INDEX_URL, PIP_EXTRA_INDEX_URL, PIP_FIND_LINKS.
-# No compiler is in any image: see "The solver in a container" in docs/compose.md.
+# No compiler is in any image: see "The solver in a container" in docs/tutorials/compose.md.
 
 FROM python:3.11-slim AS base
 # The root file system is read-only and the user has no home: what wants to write a cache writes to /tmp.

@@ -7,7 +7,7 @@ ARGS ?=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run simulate paper examples bench test test-long compose-test wheel-test remote-test
-.PHONY: faults fuzz soak lint format clean
+.PHONY: faults fuzz soak docs docs-test lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -15,10 +15,11 @@ help:  ## this list
 setup: $(READY)  ## a virtual environment in .venv with everything in it
 
 $(READY): pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11")'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,experiment,examples,dev]'
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,export,experiment,examples,docs,dev]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
@@ -46,8 +47,8 @@ examples: $(READY)  ## every example, one of them live, with pictures into runs/
 	$(BIN)/python examples/replay/what_if.py $(EXAMPLES)/tanks.mcap controller.oracle=linear --out $(EXAMPLES)/what_if.png
 	$(BIN)/tandem simulate --set network.architecture=examples/architecture/gru.py:GRU --set network.hidden='[16,16]'
 
-bench: $(READY)  ## time the solver beside others, and rewrite docs/performance.md: about 10 minutes
-	$(BIN)/python -m benchmarks.solver --document docs/performance.md $(ARGS)
+bench: $(READY)  ## time the solver beside others, and rewrite docs/results/performance.md: about 10 minutes
+	$(BIN)/python -m benchmarks.solver --document docs/results/performance.md $(ARGS)
 
 test: $(READY)  ## the tests; for some, .venv/bin/pytest PATH
 	$(BIN)/pytest -n auto --dist loadfile -m "not live and not long"
@@ -65,17 +66,23 @@ compose-test: $(READY)  ## the containers for real; needs a Docker engine
 wheel-test: $(READY)  ## the wheel, built and installed in bare environments, in an empty folder: some minutes
 	$(BIN)/pytest -x -s tests/packaging/live_wheel.py $(ARGS)
 
-remote-test: $(READY)  ## docs/remote.md to the letter, the trainer in another network namespace: 2 minutes; needs root
+remote-test: $(READY)  ## docs/tutorials/remote.md, the trainer in another network namespace: 2 minutes; needs root
 	$(BIN)/pytest -x -s tests/remote/live_remote.py $(ARGS)
 
-faults: $(READY)  ## kill, freeze, cut off and attack real processes, into docs/faults.md: hours; root; ARGS=--list names them
-	$(BIN)/python -m verification.faults --document docs/faults.md $(ARGS)
+faults: $(READY)  ## faults on real processes, into docs/results/faults.md: hours; root; ARGS=--list names them
+	$(BIN)/python -m verification.faults --document docs/results/faults.md $(ARGS)
 
-fuzz: $(READY)  ## 10 million bad payloads through everything that reads bytes, into docs/faults.md: minutes
-	$(BIN)/python -m verification.fuzz --document docs/faults.md $(ARGS)
+fuzz: $(READY)  ## 10 million bad payloads through all readers of bytes, into docs/results/faults.md: minutes
+	$(BIN)/python -m verification.fuzz --document docs/results/faults.md $(ARGS)
 
-soak: $(READY)  ## 30 minutes live at 50 Hz: memory and lateness, into docs/faults.md; ARGS="--minutes 1" for a look
-	$(BIN)/python -m verification.soak --document docs/faults.md $(ARGS)
+soak: $(READY)  ## 30 minutes live at 50 Hz, into docs/results/faults.md; ARGS="--minutes 1" for a short one
+	$(BIN)/python -m verification.soak --document docs/results/faults.md $(ARGS)
+
+docs: $(READY)  ## the site, into site/: open site/index.html; for one that follows edits, .venv/bin/mkdocs serve
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+docs-test: $(READY)  ## every command of every page, run: 20 minutes; ARGS="-k first-plant" for one page
+	$(BIN)/pytest -x -s tests/docs/live_pages.py $(ARGS)
 
 lint: $(READY)  ## style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -1,1 +1,1 @@
-"""Measurements of the solver beside others, on the same recorded states, in one run."""
+"""Measurements of the solver and of live loops; each compares within one run."""

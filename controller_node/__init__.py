@@ -1,1 +1,1 @@
-"""The real-time controller: a thin shell around `lbmpc.controller.step`."""
+"""The real-time controller: a thin layer around `lbmpc.controller.step`."""

@@ -1,4 +1,4 @@
-"""What somebody asks of a controller, checked against its plant: `Reference` in plant units to a `Change`."""
+"""Checks a requested `Reference` in plant units against the plant, and converts it to a `Change`."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from lbmpc.references import FOR_EVER, Change
 from protocol import messages as m
 
 LATEST = 1e6
-"""Seconds from now: the last point of a trajectory at most."""
+"""Latest time of a trajectory's last point, in seconds from now."""
 FARTHEST = 1e6
-"""Half-widths from the equilibrium, where X has no bound: a reference beyond is none."""
+"""Largest distance of a reference from the equilibrium in half-widths, for states without a bound in X."""
 
 
 class RefusedReference(ValueError):
-    """A reference that this plant cannot have; the text says what is wrong with it."""
+    """A reference that is not valid for this plant. The text says why."""
 
 
 def change_of(reference: m.Reference, plant: Description, period: float) -> Change:
-    """What a controller of this plant makes of it; `period` in seconds.
+    """Convert a reference for a controller of this plant; `period` in seconds.
 
     Raises:
-        RefusedReference: what is wrong.
+        RefusedReference: the reference is not valid.
     """
     lease = FOR_EVER
     if reference.lease is not None:
@@ -80,7 +80,7 @@ def change_of(reference: m.Reference, plant: Description, period: float) -> Chan
 
 
 def verdict_on(reference: m.Reference, plant: Description, period: float) -> str:
-    """What a `TickResult` says of it: "taken", or "refused: " and why."""
+    """Return the verdict for a `TickResult`: "taken", or "refused: " and the reason."""
     try:
         change_of(reference, plant, period)
     except RefusedReference as error:
@@ -95,5 +95,5 @@ def _require(holds: bool, otherwise: str) -> None:
 
 @lru_cache(maxsize=16)
 def source_of(run_id: str) -> int:
-    """A number for a run id, the same in every process."""
+    """Return a number for a run id, the same in every process."""
     return int.from_bytes(hashlib.sha256(run_id.encode()).digest()[:7], "little")

@@ -1,4 +1,4 @@
-"""From a configuration to the objects of the science."""
+"""Builds the objects of `lbmpc` from a configuration."""
 
 from __future__ import annotations
 
@@ -38,43 +38,43 @@ from node_runtime.config.strict import ConfigError
 from protocol.topics import WEIGHTS_LIMIT
 
 WEIGHTS = WEIGHTS_LIMIT // 4
-"""Hidden weights at most, float32 each."""
+"""Largest number of hidden weights, float32 each."""
 FILTERED = 512
-"""Features of a last layer with a filter at most: its covariance is in the state of every tick, and in keyframes."""
+"""Largest number of features with a filter in the last layer, whose covariance is in every state and keyframe."""
 COARSE = 0.05
-"""Share of a time scale. K_0 stands for nothing yet; where a period is longer it would move predictions far."""
+"""Share of a time scale. It limits the scale of K_0 for long periods, because K_0 is random and must not dominate."""
 MEMORY, NOISY_MEMORY, REACH, WATCH = 2.0, 10.0, 4.0, 1.0
-"""Time scales of the plant: what the last layer's filter remembers of exact labels, and of noisy ones; how far the
-samples reach back on which hidden weights are tried, and how long these are watched."""
+"""Time scales of the plant: memory of the last layer's filter for exact and for noisy labels, time covered by the
+samples of a trial, and time for which adopted weights are observed."""
 FEWEST = 20
-"""Samples in a memory or a watch of so many time scales: a slow loop has few in one."""
+"""Smallest number of samples in a memory or an observation, because a slow loop has few samples in a time scale."""
 SHORTEST_WATCH = 8
-"""Samples, whatever was asked for."""
+"""Smallest number of samples of an observation for any configuration."""
 
 
 @dataclass(frozen=True)
 class GivenPlant:
-    """What stands for the plant that a configuration names, as it is configured: of a log, which loads nothing."""
+    """A plant that replaces the configured one, for example from a log, which loads no files."""
 
     known: Known | Plant
-    """What the controller knew."""
+    """The plant as the controller knew it."""
     equations: Plant | None = None
-    """Those that `known` was linearised from, where whoever reads the log has them."""
+    """The equations that `known` was linearised from, if the reader of the log has them."""
     truth: Known | Plant | TrueMotion | None = None
-    """How it really moved, likewise."""
+    """The true motion, if the reader of the log has it."""
 
 
 def build_plant(config: Config) -> Known | Plant:
-    """The plant named by the configuration, as the model knows it; its lengths fit. Raises `ConfigError`."""
+    """Return the configured plant as the model knows it, with checked lengths. Raises `ConfigError`."""
     return plant_of(config, get_plant)
 
 
 def describe_network(config: Config, model: Model) -> NetworkDescription:
-    """The network of the configuration for this model; inputs and h are scaled by the half-widths.
+    """Return the configured network for this model. Inputs and h are scaled by the half-widths.
 
     Raises:
-        ValueError: the sizes or the options do not fit the architecture, there is none of that name, or the network
-            is larger than a message.
+        ValueError: sizes or options do not fit the architecture, the architecture is unknown, or the network is too
+            large for a message.
     """
     network, plant = config.network, model.plant
     name = name_of(network.architecture)
@@ -93,12 +93,12 @@ def describe_network(config: Config, model: Model) -> NetworkDescription:
     )
     weights = sum(rows * columns for rows, columns in description.layer_shapes)
     if weights > WEIGHTS:
-        raise ValueError(f"{weights} hidden weights, and {WEIGHTS} is the most: they travel in one message")
+        raise ValueError(f"{weights} hidden weights; at most {WEIGHTS} fit into one message")
     return description
 
 
 def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) -> Oracle:
-    """The oracle named by the configuration. Raises `ConfigError`."""
+    """Return the configured oracle. Raises `ConfigError`."""
     plant = model.plant
     if config.controller.oracle == "linear":
         return LinearOracle(plant.d, plant.m)
@@ -108,7 +108,7 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
         truth = true_plant_of(config, get_plant, get_truth) if given is None else given.truth
         if not isinstance(truth, Plant):
             raise ConfigError(
-                "controller.oracle = 'perfect': it needs the equations of the true plant, and there are none"
+                "controller.oracle = 'perfect': it needs the equations of the true plant, but there are none"
             )
         try:
             return PerfectOracle(model, truth)
@@ -127,7 +127,7 @@ def build_oracle(config: Config, model: Model, given: GivenPlant | None = None) 
 
 
 def build_network_oracle(config: Config, model: Model) -> DnnOracle:
-    """The network oracle of the configuration, whichever oracle it names. Raises `ConfigError`."""
+    """Return the network oracle of the configuration, whatever oracle is configured. Raises `ConfigError`."""
     try:
         description = describe_network(config, model)
     except ValueError as error:
@@ -139,7 +139,7 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
     if filtered and description.features > FILTERED:
         raise ConfigError(
             f"the filter of the last layer keeps a covariance of {description.features} x {description.features} "
-            f"numbers; the last of network.hidden can have {FILTERED - 1} neurons at most with it, or take "
+            f"numbers: use at most {FILTERED - 1} neurons in the last layer of network.hidden, or set "
             f'adaptation.law = "gradient"'
         )
     return DnnOracle(
@@ -156,7 +156,7 @@ def build_network_oracle(config: Config, model: Model) -> DnnOracle:
 
 
 def describe_filter(config: Config, time_scale: float) -> Kalman:
-    """The filter of the last layer, and of the constant beside it, at the configured rate.
+    """Return the filter of the last layer, and of the constant beside it, at the configured rate.
 
     time_scale: the plant's, in seconds.
     """
@@ -169,9 +169,9 @@ def describe_filter(config: Config, time_scale: float) -> Kalman:
 
 
 def describe_trial(config: Config, time_scale: float) -> Trial | None:
-    """The trial of hidden weights at the configured rate, for a plant with this time scale in seconds.
+    """Return the trial of hidden weights at the configured rate, for a plant with this time scale in seconds.
 
-    None where it is switched off.
+    The result is None if trials are disabled.
     """
     settings = config.adaptation.trial
     if not settings.enabled:
@@ -190,7 +190,7 @@ def describe_trial(config: Config, time_scale: float) -> Trial | None:
 
 
 def build_model(config: Config, given: GivenPlant | None = None) -> Model:
-    """The nominal model of the configuration's plant at its rate. Raises `ConfigError`, for its horizon too."""
+    """Return the nominal model of the configured plant. Raises `ConfigError`, also for a horizon that is too long."""
     settings = config.controller
     Q = None if settings.Q is None else np.array(settings.Q, dtype=float)
     R = None if settings.R is None else np.array(settings.R, dtype=float)
@@ -207,13 +207,13 @@ def build_model(config: Config, given: GivenPlant | None = None) -> Model:
 
 
 def given_disturbance(config: Config) -> np.ndarray | None:
-    """Half-widths of W, (d,), as h of one period, where the configuration gives them."""
+    """Return the configured half-widths of W, (d,), as bounds of h over one period; None if there are none."""
     W = config.controller.W
     return None if W is None else np.array(W, dtype=float) * config.period
 
 
 class TimedSolver(Solver):
-    """Knows how long its last solve took: for the log, never for a decision."""
+    """A solver that measures its last solve. The time is only logged and never influences a decision."""
 
     seconds = 0.0
 
@@ -237,7 +237,7 @@ def build_controller(
     certificate: Certificate | None = None,
     given: GivenPlant | None = None,
 ) -> tuple[Controller, TimedSolver]:
-    """A controller and the solver that it uses.
+    """Return a controller and its solver.
 
     Args:
         config: the resolved configuration.
@@ -247,7 +247,7 @@ def build_controller(
         given: as for `build_model`.
 
     Raises:
-        ConfigError: the configuration admits no controller, or the sets are of another model.
+        ConfigError: the configuration allows no controller, or the sets belong to another model.
     """
     settings, realise = config.controller, realise or _as_it_is
     try:
@@ -283,10 +283,10 @@ def build_controller(
 
 
 def build_estimator(config: Config, model: Model) -> Estimator | None:
-    """The estimator of the configuration; None: a sample is the state.
+    """Return the configured estimator; None if a sample is the state.
 
     Raises:
-        ConfigError: no sample ever tells of a state.
+        ConfigError: the measurements do not determine a state.
     """
     settings, plant = config.estimator, model.plant
     if settings.kind == "none":
@@ -295,8 +295,8 @@ def build_estimator(config: Config, model: Model) -> Estimator | None:
     measured = np.array(sorted({plant.states.index(name) for name in names}))
     if unseen := unobservable(model, measured):
         raise ConfigError(
-            f"estimator.measured = {', '.join(names)}: what is measured never tells of "
-            f"{', '.join(plant.states[i] for i in unseen)}, which would have to be measured too"
+            f"estimator.measured = {', '.join(names)}: these measurements do not determine "
+            f"{', '.join(plant.states[i] for i in unseen)}; measure them too"
         )
     given = given_disturbance(config)
     process = plant.W * config.period if given is None else given
@@ -310,7 +310,7 @@ def build_estimator(config: Config, model: Model) -> Estimator | None:
 
 
 def configured_reference(config: Config, plant: Description) -> Reference | None:
-    """The reference of the configuration; None where it has none: plans aim at (x_e, u_e)."""
+    """Return the configured reference; None without one, when plans lead to (x_e, u_e)."""
     outputs = config.reference.outputs
     if outputs is None:
         return None
@@ -321,19 +321,19 @@ def configured_reference(config: Config, plant: Description) -> Reference | None
 
 
 def build_backup(config: Config, problem: Problem, realise: Realise | None = None) -> BackupPlanner:
-    """What plans for the plant's outages; arguments as for `build_controller`."""
+    """Return the planner of backup policies; arguments as for `build_controller`."""
     return BackupPlanner(problem, config.controller.backup.margin, realise or _as_it_is)
 
 
 def _warm_up(controller: Controller, solver: TimedSolver, seed: int) -> None:
-    """Whatever is slow the first time is slow here and not in the first tick; leaves no trace in any result."""
+    """Run everything once that is slow at the first call. It changes no result."""
     state = controller.initial_state(seed)
     d, m = controller.model.d, controller.model.m
     controller.oracle.learn(state.oracle, np.zeros(d), np.zeros(m), np.zeros(d))
     controller.oracle.estimate(state.oracle, np.zeros(d), np.zeros(m))
     x = np.zeros_like(state.predicted)
     theta = controller.oracle.theta(state.oracle)
-    # Far enough out that the QP is needed too.
+    # This state is far enough out to need the QP too.
     edge = x.copy()
     edge[:d] = 0.5 * (controller.model.plant.x0 - controller.model.plant.x_e)
     for start in (x, edge):

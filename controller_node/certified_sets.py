@@ -1,7 +1,7 @@
-"""Certified sets on disk: the file that `tandem sets compute` writes, the cache, and which of them is in force.
+"""Certified sets on disk: the file written by `tandem sets compute`, the cache, and the choice of the sets in use.
 
-A file is one JSON object, gzipped where its name ends in .gz. Its sha256 is that of everything else in it, and only
-one spelling of it is accepted, so that any edited byte is seen. It tells damage, not forgery: `tandem sets check`
+A file is one JSON object, compressed with gzip if its name ends in .gz. Its sha256 covers all other content, and only
+one encoding is accepted, so every edited byte is detected. The hash detects damage, not forgery. `tandem sets check`
 proves the claim again.
 """
 
@@ -37,27 +37,27 @@ from node_runtime.whole_file import read_regular, write_whole
 log = logging.getLogger(__name__)
 
 CONSTRUCTION = 2
-"""Counts up when the construction finds other sets for the same arguments."""
+"""Increased when the construction gives other sets for the same arguments."""
 SLACK = 3e-4
 SHIPPED = shipped("sets")
 Kind = Literal["given", "box", "hull", "regions"]
 PREFERRED: tuple[Kind, ...] = ("regions", "hull", "box")
-"""What is looked for where no file is named: the largest first."""
+"""Order of the search if no file is configured, largest sets first."""
 LARGEST = 256 * 1024 * 1024
-"""Bytes of sets, unpacked: a small file may say that it is any size."""
+"""Largest size of sets in bytes after decompression, because a small file may expand to any size."""
 GZIPPED = b"\x1f\x8b"
 
 
 class Found(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the construction and the checker found out about the sets, for people."""
+    """Results of the construction and the check, for people."""
 
     volume_fraction: float
-    """Of X."""
+    """Share of X."""
     invariance_margin: float
-    """The smallest room left beyond W, as a share of X's half-widths."""
+    """The smallest slack beyond W, as a share of X's half-widths."""
     contains_x0: bool
     seconds: float
-    """That the construction took."""
+    """Duration of the construction."""
 
 
 class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,7 +68,7 @@ class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class CertifiedSets:
-    """A certificate with what was found out about it; `sha256` is of both."""
+    """A certificate with its results; `sha256` covers both."""
 
     sha256: str
     found: Found
@@ -80,16 +80,16 @@ class CertifiedSets:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> CertifiedSets:
-        """Raises `CertificateError`: not such a file, edited, or inconsistent."""
+        """Read the bytes of a file. Raises `CertificateError` if they are not such a file, edited, or inconsistent."""
         if data.startswith(GZIPPED):
             try:
                 with gzip.open(io.BytesIO(data)) as file:
                     data = file.read(LARGEST + 1)
             except (OSError, EOFError, zlib.error) as error:
-                raise CertificateError(f"a damaged gzip file: {error}") from error
+                raise CertificateError(f"damaged gzip file: {error}") from error
             if len(data) > LARGEST:
                 raise CertificateError(
-                    f"more than {LARGEST / 1e6:.0f} MB when unpacked; no such sets are known"
+                    f"more than {LARGEST / 1e6:.0f} MB after decompression; certified sets are smaller"
                 )
         try:
             content = msgspec.json.decode(data, type=_Content)
@@ -98,11 +98,11 @@ class CertifiedSets:
         actual = _hash(content.found, bytes(content.certificate))
         if actual != content.sha256:
             raise CertificateError(
-                f"its content has sha256 {actual[:12]}, and it says {content.sha256[:12]}: it was edited or damaged"
+                f"its content has sha256 {actual[:12]}, but it states {content.sha256[:12]}: it was edited or damaged"
             )
         sets = cls(content.sha256, content.found, decode(bytes(content.certificate)))
         if sets.to_bytes().strip() != data.strip():
-            raise CertificateError("its bytes are not those that were written: it was edited")
+            raise CertificateError("its bytes differ from the original encoding: it was edited")
         return sets
 
     def to_bytes(self) -> bytes:
@@ -111,7 +111,7 @@ class CertifiedSets:
 
     @property
     def facets(self) -> list[int]:
-        """Of each set."""
+        """Number of facets of each set."""
         return [len(piece.g) for piece in self.certificate.pieces]
 
 
@@ -120,11 +120,11 @@ def _hash(found: Found, certificate: bytes) -> str:
 
 
 def read_sets(path: Path) -> CertifiedSets:
-    """Raises `CertificateError`, naming the file."""
+    """Read a file. Raises `CertificateError` with the file's name."""
     try:
         data = read_regular(path, LARGEST + 1)
         if len(data) > LARGEST:
-            raise CertificateError(f"more than {LARGEST / 1e6:.0f} MB; no such sets are known")
+            raise CertificateError(f"more than {LARGEST / 1e6:.0f} MB; certified sets are smaller")
         return CertifiedSets.from_bytes(data)
     except OSError as error:
         raise CertificateError(f"{path}: cannot be read: {error.strerror}") from error
@@ -133,9 +133,9 @@ def read_sets(path: Path) -> CertifiedSets:
 
 
 def write_sets(sets: CertifiedSets, path: Path, mode: int = 0o644) -> None:
-    """Whole or not at all. Raises `OSError`."""
+    """Write the whole file or nothing. Raises `OSError`."""
     data = sets.to_bytes()
-    # Without a time of writing in it, so that the same sets are the same file.
+    # The archive contains no time, so equal sets give equal files.
     write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data, mode)
 
 
@@ -143,25 +143,25 @@ def write_sets(sets: CertifiedSets, path: Path, mode: int = 0o644) -> None:
 
 
 def default_cache() -> Path:
-    """The user's; XDG_CACHE_HOME moves it."""
+    """Return the user's cache folder, which XDG_CACHE_HOME can move."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "sets"
 
 
 @dataclass(frozen=True)
 class Work:
-    """One construction: what it depends on, and where its results lie."""
+    """One construction: the key of its arguments, and the files of its results."""
 
     key: str
     sets: Path
-    """The finished ones."""
+    """File of the finished sets."""
     folder: Path
-    """Work in progress. Shared by `hull` and `regions`, which begin with the same sets."""
+    """Folder of intermediate results. `hull` and `regions` share it, because they begin with the same sets."""
 
     @classmethod
     def of(
         cls, model: Model, kind: Kind, start: np.ndarray, W: np.ndarray | None, slack: float, cache: Path
     ) -> Work:
-        """`start` (d,) in deviation coordinates, W (d,) as of `construct`."""
+        """Describe a construction from `start` (d,) in deviations, and W (d,) as for `construct`."""
         given = None
         if kind == "given":
             given = over_any_delay(model, model.plant.W * model.period if W is None else W).tolist()
@@ -177,13 +177,13 @@ class Work:
         return cls(whole, cache / f"{whole}.json", cache / _key(base))
 
     def save(self, sets: CertifiedSets) -> None:
-        """Into the cache, for this user alone. Raises `OSError`."""
+        """Write the sets into the cache, readable and writable for this user only. Raises `OSError`."""
         make_private(self.sets.parent)
         write_sets(sets, self.sets, 0o600)
 
 
 def _equations(model: Model, kind: Kind) -> str | None:
-    """Hash of those that h is bounded by: two plants may have one linear model."""
+    """Return the hash of the equations that bound h, because two plants may have the same linear model."""
     if kind == "given" or model.equations is None:
         return None
     return _sha256_of(model.equations)
@@ -194,17 +194,17 @@ def _sha256_of(equations: Plant) -> str:
 
 
 def _comes_with_tandem(model: Model) -> bool:
-    """Somebody's own plant may have the name and the linear part of a shipped one, and another h."""
+    """Check the equations, because a user's plant may share name and linear part with a shipped one, but not h."""
     shipped, equations = PLANTS.get(model.plant.name), model.equations
     if not isinstance(shipped, Plant) or equations is None:
         return False
     return equations.rhs is shipped.rhs or _sha256_of(equations) == _sha256_of(shipped)
 
 
-def why_not_believed(work: Work) -> str | None:
-    """Why somebody else may have written what the cache has of a construction, and what to do; None: nobody can have.
+def why_not_trusted(work: Work) -> str | None:
+    """Return why another user may have written a construction's files in the cache, and what to do; None if none can.
 
-    What is not there is nobody's.
+    Missing files are accepted.
     """
     cache = work.sets.parent
     for path, reason_of in (
@@ -220,8 +220,8 @@ def why_not_believed(work: Work) -> str | None:
             reason = f"{path}: {error.strerror}"
         if reason is not None:
             return (
-                f"the cache of certified sets is not believed: {reason}. If you trust all that is in it, "
-                f"chmod -R go-w {cache}; else remove it"
+                f"the cache of certified sets is not trusted: {reason}. If you trust its content, run "
+                f"chmod -R go-w {cache}; otherwise remove it"
             )
     return None
 
@@ -235,7 +235,7 @@ def _key(parts: object) -> str:
 
 
 class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
-    """Named sets of arrays in a folder, one .npz each. What cannot be read, or is not ours, counts as not there."""
+    """Named sets of arrays in a folder, one .npz file each. Unreadable and foreign files count as missing."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -271,14 +271,14 @@ class SavedArrays(MutableMapping[str, dict[str, np.ndarray]]):
         return self.folder / f"{name}.npz"
 
 
-# -- which sets are in force ------------------------------------------------------------------
+# -- the sets in use ---------------------------------------------------------------------------
 
 
 def find_sets(config: Config, model: Model, cache: Path | None = None) -> CertifiedSets:
-    """The file that `controller.sets` names, or what the cache or this installation has for this very model.
+    """Return the sets of `controller.sets`, or those of the cache or of this installation for exactly this model.
 
     Raises:
-        ConfigError: there is none, it was edited, it is about another model, or there can be none for this plant.
+        ConfigError: there are none, they were edited, they are for another model, or the plant allows none.
     """
     try:
         require_certifiable(model)
@@ -297,7 +297,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     doubts: list[str] = []
     for kind in PREFERRED:
         work = Work.of(model, kind, start, None, SLACK, cache)
-        doubt = why_not_believed(work) if work.sets.exists() else None
+        doubt = why_not_trusted(work) if work.sets.exists() else None
         candidates = [work.sets] if doubt is None else []
         doubts += [doubt] if doubt is not None else []
         if _comes_with_tandem(model):
@@ -309,19 +309,19 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
                     log.warning("%s", text)
                 return usable
     raise ConfigError(
-        "controller.tightening = 'invariant' needs certified sets, and none are there for this plant, rate and bounds: "
-        "`tandem sets compute` with this configuration makes them, or controller.sets = 'FILE' names them"
+        "controller.tightening = 'invariant' needs certified sets, and there are none for this plant, rate and bounds: "
+        "compute them with `tandem sets compute` and this configuration, or set controller.sets = 'FILE'"
         + "".join(f"; {text}" for text in dict.fromkeys(doubts))
     )
 
 
 def start_of(config: Config, model: Model) -> np.ndarray:
-    """x0 of the configuration in deviation coordinates, (d,)."""
+    """Return the configured x0 in deviation coordinates, (d,)."""
     return np.asarray(initial_state(config, model.plant) - model.plant.x_e)
 
 
 def _sets_for(model: Model, path: Path) -> CertifiedSets:
-    """Raises `CertificateError`, naming the file: it cannot be read, or is about another model."""
+    """Read sets for a model. Raises `CertificateError` with the file's name if unreadable or for another model."""
     sets = read_sets(path)
     try:
         require_model(sets.certificate, model)
@@ -336,13 +336,13 @@ def _usable(path: Path, model: Model) -> CertifiedSets | None:
     try:
         sets = _sets_for(model, path)
     except CertificateError:
-        return None  # of another model, or a damaged cache: as if it were not there
+        return None  # for another model, or damaged: treat it as missing
     return sets if sets.certificate.certified else None
 
 
 def _require_claim(sets: CertifiedSets, name: str) -> None:
     if not sets.certificate.certified:
         raise ConfigError(
-            f"controller.sets: {name}: is a {sets.certificate.kind} and claims nothing; the tightening `invariant` "
+            f"controller.sets: {name}: a {sets.certificate.kind} is not certified; the tightening `invariant` "
             "needs certified sets"
         )

@@ -1,8 +1,8 @@
-"""The controller's memory in a local file, so that a controller that is started again knows what it had learned.
+"""The controller's memory in a local file, so that a restarted controller continues with everything it has learned.
 
-Written in a thread of its own, soon at first, then about once a second, and at an orderly end: a temporary file, fsync,
-rename, so that the file is whole at every moment. A file that is damaged, or that belongs to another controller, is
-named, kept aside and not used.
+A thread writes it: soon after the start, then about once a second, and at an orderly end. It writes a temporary file,
+calls fsync and renames it, so the file is complete at every moment. A damaged file, or one of another controller, is
+reported, renamed and not used.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ log = logging.getLogger(__name__)
 EVERY = 1.0
 """Seconds between two files."""
 FIRST = 0.1
-"""Seconds to the first one, and by how much each further one takes longer: most is learned at the beginning."""
+"""Seconds until the first file, and increase of each further interval, because most is learned at the beginning."""
 MAGIC = b"tandem checkpoint 1\n"
 LARGEST = 256 * 1024 * 1024
-"""Bytes of a file that is read at all."""
+"""Largest size in bytes of a file that is read."""
 DAMAGED, OTHER = ".damaged", ".other"
-"""What is added to the name of a file that is kept aside."""
+"""Suffixes of files that are renamed because they cannot be used."""
 
 
 class CheckpointError(Exception):
-    """A checkpoint that cannot be used; the text says which and why."""
+    """The checkpoint cannot be used. The text says which one and why."""
 
     aside = DAMAGED
 
 
 class OtherController(CheckpointError):
-    """A whole checkpoint, of a controller of another plant, network or model."""
+    """A valid checkpoint of a controller of another plant, network or model."""
 
     aside = OTHER
 
 
 class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What outlives a controller process."""
+    """The part of a controller's state that survives its process."""
 
     belongs: dict[str, str]
-    """To which controller, in words that must be equal."""
+    """Identity of the controller, as texts that must be equal."""
     run_id: str
     seq: int
-    """Its last tick in here."""
+    """The last tick in the checkpoint."""
     arrays: dict[str, m.Array]
     counters: dict[str, int]
     samples: list[bytes]
@@ -68,7 +68,7 @@ class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Resumes(Protocol):
-    """What can go on with a checkpoint: `controller_node.memory.Memory`."""
+    """An object that can continue from a checkpoint, such as `controller_node.memory.Memory`."""
 
     def belongs(self) -> dict[str, str]: ...
 
@@ -77,7 +77,7 @@ class Resumes(Protocol):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What the loop hands over: references to what it never changes again."""
+    """The memory that the loop hands over: references to objects that it never changes again."""
 
     seq: int
     arrays: dict[str, m.Array]
@@ -88,26 +88,28 @@ class Snapshot:
 
 
 def resume(memory: Resumes, path: Path) -> Checkpoint | None:
-    """Let a controller go on with the memory in a file, before its first tick.
+    """Let a controller continue with the memory in a file, before its first tick.
 
     Returns:
-        What there was, or None where there is no file, or none that may be used, after saying why. What cannot be used
-        is kept beside, under another name, because the next checkpoint takes this one.
+        The checkpoint; None after a log line if there is no usable file. An unusable file is renamed, because the next
+        checkpoint takes its name.
     """
     try:
         found = read(path, memory.belongs())
         try:
             memory.go_on(found.arrays, found.run_id)
         except ValueError as error:
-            raise OtherController(f"the checkpoint of a controller with other settings: {error}") from error
-        log.info("%s: goes on from %s, tick %d", path, found.run_id, found.seq)
+            raise OtherController(
+                f"the checkpoint belongs to a controller with other settings: {error}"
+            ) from error
+        log.info("%s: continuing from %s, tick %d", path, found.run_id, found.seq)
         return found
     except FileNotFoundError:
-        log.info("%s: no checkpoint yet; starting afresh", path)
+        log.info("%s: no checkpoint yet; starting without memory", path)
     except OSError as error:
-        log.warning("%s: the checkpoint cannot be read (%s); starting afresh", path, error.strerror)
+        log.warning("%s: the checkpoint cannot be read (%s); starting without memory", path, error.strerror)
     except CheckpointError as error:
-        log.warning("%s: %s; starting afresh%s", path, error, keep_aside(path, error))
+        log.warning("%s: %s; starting without memory%s", path, error, keep_aside(path, error))
     return None
 
 
@@ -131,14 +133,14 @@ def read(path: Path, belongs: Mapping[str, str]) -> Checkpoint:
         for payload in found.samples:
             codec.decode(topics.SAMPLES, payload)
     except (msgspec.DecodeError, codec.BadMessage, UnicodeDecodeError, ValueError) as error:
-        raise CheckpointError(f"whole, but not readable: {error}") from error
+        raise CheckpointError(f"complete, but not readable: {error}") from error
     differs = [
         f"{name} is {found.belongs.get(name, 'not named')} there and {belongs.get(name, 'not named')} here"
         for name in sorted(found.belongs.keys() | belongs.keys())
         if found.belongs.get(name) != belongs.get(name)
     ]
     if differs:
-        raise OtherController(f"the checkpoint of another controller: {'; '.join(differs)}")
+        raise OtherController(f"the checkpoint belongs to another controller: {'; '.join(differs)}")
     for name, array in found.arrays.items():
         if array.dtype != "<i8" and not np.isfinite(array.numpy()).all():
             raise CheckpointError(f"array {name} is not finite")
@@ -146,14 +148,14 @@ def read(path: Path, belongs: Mapping[str, str]) -> Checkpoint:
 
 
 def keep_aside(path: Path, error: CheckpointError) -> str:
-    """Rename a file that cannot be used; says so, for the end of a sentence."""
+    """Rename an unusable file; return the result as the end of a sentence."""
     aside = path.with_name(path.name + error.aside)
     try:
         require_regular(path)
         require_regular(aside)
         path.replace(aside)
     except OSError as failed:
-        return f"; it could not be kept aside ({failed.strerror})"
+        return f"; it could not be renamed ({failed.strerror})"
     return f"; it is kept as {aside}"
 
 
@@ -161,17 +163,17 @@ def keep_aside(path: Path, error: CheckpointError) -> str:
 
 
 class CheckpointWriter:
-    """A context manager with a thread of its own.
+    """Writes checkpoints in a thread of its own. A context manager.
 
-    The loop looks at `wanted` after each tick, and hands its memory over when it is true: nothing else happens in the
-    loop's thread.
+    The loop checks `wanted` after each tick and hands over its memory if it is true. The loop's thread does nothing
+    else.
 
     Args:
         path: the file.
-        belongs: to which controller.
-        outbox: whose newest samples are saved too.
-        samples: how many of them.
-        counts: figures of this writer's, kept up to date here.
+        belongs: identity of the controller.
+        outbox: its newest samples are saved too.
+        samples: number of these samples.
+        counts: counters, which are updated here.
         every: seconds between two files in the long run.
     """
 
@@ -187,7 +189,7 @@ class CheckpointWriter:
         self.wanted = False
         self._path, self._belongs, self._every = path, dict(belongs), every
         self._outbox, self._samples, self._counts = outbox, samples, counts
-        # Encoded once: the interpreter belongs to the loop.
+        # Batches are encoded once, to keep the interpreter free for the loop.
         self._encoded: deque[tuple[int, bytes]] = deque(
             (len(batch.samples), codec.encode(batch)) for batch in outbox.earlier
         )
@@ -198,7 +200,7 @@ class CheckpointWriter:
         self._thread = threading.Thread(target=self._run, name="checkpoint", daemon=True)
 
     def offer(self, memory: Snapshot) -> None:
-        """The newest memory, from the loop; returns at once."""
+        """Hand over the newest memory from the loop; returns at once."""
         self._memory, self.wanted = memory, False
         self._offered.set()
 
@@ -209,7 +211,7 @@ class CheckpointWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The last memory that was offered is written before this returns."""
+        """Write the last memory that was handed over before returning."""
         self._end.set()
         self._offered.set()
         self._thread.join()
@@ -220,7 +222,7 @@ class CheckpointWriter:
         while not self._end.wait(pause := min(self._every, pause + FIRST)):
             self.wanted = True
             self._offered.wait()
-            # Cleared after the wait, never before it: the end, which is said once, must not be missed.
+            # Clear after the wait, never before it, so that the single signal of the end is not missed.
             self._offered.clear()
             self._write()
 
@@ -239,12 +241,12 @@ class CheckpointWriter:
         )
         content = msgspec.msgpack.encode(checkpoint)
         try:
-            # For its owner alone, like everything that a process will believe when it starts.
+            # Only the owner may read or write it, because a process trusts it at its start.
             content = MAGIC + hashlib.sha256(content).digest() + content
             write_whole(self._path, content, mode=0o600, durable=True)
         except OSError as error:
             self._counts["checkpoints failed"] += 1
-            self._warn(f"the checkpoint cannot be written ({error.strerror}); the loop goes on without")
+            self._warn(f"the checkpoint cannot be written ({error.strerror}); the loop continues without it")
             return
         self._counts["checkpoints written"] += 1
         self._warn("")
@@ -259,7 +261,7 @@ class CheckpointWriter:
             kept -= self._encoded.popleft()[0]
 
     def _warn(self, text: str) -> None:
-        """Once for each trouble, and once when it is over."""
+        """Log each failure once, and its end once."""
         if text and text != self._said:
             log.warning("%s: %s; further ones are only counted", self._path, text)
         elif self._said and not text:

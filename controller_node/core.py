@@ -1,7 +1,7 @@
-"""The controller between messages: a Tick in, its Command and everything else that it implies out.
+"""The controller between messages: it maps a Tick to its Command and all other outputs.
 
-Deterministic: the outputs are a function of the configuration, the keyframe and the ticks, and of nothing else. The
-live node, the lock-step simulation and the replay all call `step` and differ only in where the ticks come from.
+It is deterministic: the outputs depend on the configuration, the keyframe and the ticks only. The live node, the
+lock-step simulation and the replay all call `step` and differ only in the source of the ticks.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from protocol import messages as m
 
 
 def sha256_of_known(plant: Known) -> str:
-    """Of all its numbers and words: whether two processes knew the same."""
+    """Return the SHA-256 of all numbers and texts of a plant, to compare the knowledge of two processes."""
     return hashlib.sha256(msgspec.json.encode(plant.to_builtins(), order="sorted")).hexdigest()
 
 
@@ -35,12 +35,12 @@ class ControllerCore:
 
     Args:
         config: the resolved configuration.
-        run_id: stamped on every message; a replay gives the recorded one.
-        sets: the certified sets of the tightening `invariant`; None: found by the configuration.
-        given: the plant; None: the one that the configuration names.
+        run_id: written into every message; a replay uses the recorded one.
+        sets: the certified sets of the tightening `invariant`; None to find them by the configuration.
+        given: the plant; None for the configured one.
 
     Raises:
-        ConfigError: the configuration admits no controller, and why.
+        ConfigError: the configuration allows no controller. The text says why.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class ControllerCore:
         self.translation = Translation(run_id, self.plant, config.period)
 
     def step(self, tick: m.Tick) -> Outputs:
-        """One control step. Never raises for what a tick may hold."""
+        """Run one control step. It never raises because of a tick's content."""
         self._solver.seconds = 0.0
         state, result = self.controller.step(self.memory.state, self.translation.observation(tick))
         self.memory.advance(state, result.new_network)
@@ -74,25 +74,25 @@ class ControllerCore:
         return self.translation.outputs(tick, result, network, self.memory.hidden_sha256)
 
     def prepare(self) -> None:
-        """Use the time until the next tick; see `Controller.prepare`."""
+        """Use the time until the next tick, see `Controller.prepare`."""
         self.controller.prepare(self.memory.state)
 
     def backup(self, command: m.Command) -> m.Backup | None:
-        """What the plant may follow if no command comes after this one, the last step's; None where there is nothing.
+        """Return the policy to follow if no command arrives after `command`, that of the last step; None without one.
 
-        Nothing else depends on it: who needs it asks.
+        Nothing else depends on this call, so it can be omitted.
         """
         policy = self.controller.backup(self._planner(), self.memory.state)
         return None if policy is None else self.translation.backup(policy, command)
 
     def ready_backup(self) -> None:
-        """Build now what `backup` would build when it is first called."""
+        """Build everything that the first call of `backup` would build."""
         state = self.memory.state
         theta = self.controller.oracle.theta(state.oracle)
         self._planner().policy(state.predicted, theta, state.plan.u)
 
     def ready_targets(self) -> None:
-        """Build now what the first reference would build: a loop has no time for it."""
+        """Build everything that the first reference would build, because the loop has no time for it."""
         model, aims = self.controller.model, self.controller.aims
         if aims.targets is not None:
             theta = self.controller.oracle.theta(self.memory.state.oracle)
@@ -105,11 +105,11 @@ class ControllerCore:
 
     @property
     def solve_seconds(self) -> float:
-        """What the last step's solve took on this machine; 0 where there was none."""
+        """Duration of the last step's solve on this machine; 0 without one."""
         return self._solver.seconds
 
     def certified_sets(self) -> m.CertifiedSets | None:
-        """The sets in force, for the log; None without any."""
+        """Return the sets in use for the log; None without any."""
         if self.sets is None:
             return None
         return m.CertifiedSets(
@@ -121,11 +121,11 @@ class ControllerCore:
         )
 
     def arithmetic(self) -> dict[str, str]:
-        """What may make another machine's numbers differ from these in the last digits, by name."""
+        """Return the properties that may change the last digits of numbers on another machine, by name."""
         return {"machine": platform.machine(), "kernels": self.kernels, **provenance.arithmetic()}
 
     def run_info(self, unix_time: float) -> m.RunInfo:
-        """What a log needs to be replayed on its own."""
+        """Return the facts that a self-contained log needs for a replay."""
         facts = self.arithmetic() | {"known plant": sha256_of_known(self.plant)}
         if self.sets is not None:
             facts |= {"certified sets": self.sets.sha256}

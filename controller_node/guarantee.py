@@ -1,4 +1,4 @@
-"""What a controller guarantees, and from which states, in words for its start."""
+"""Describes what a controller guarantees, and from which states, at its start."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from node_runtime.config.sections import Config
 
 
 def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -> str:
-    """One sentence or two for the tightening of the configuration.
+    """Return one or two sentences for the configured tightening.
 
     Args:
         config: the resolved configuration.
         model: the nominal model of that configuration.
-        sets: those in force; None: found by the configuration, for `invariant`.
+        sets: the sets in use; None to find them by the configuration, for `invariant`.
 
     Raises:
-        ConfigError: `invariant`, and there are no sets for it.
+        ConfigError: there are no sets for `invariant`.
     """
-    said = _of_states_that_are_known(config, model, sets)
+    said = _of_known_states(config, model, sets)
     if config.estimator.kind == "none" or config.controller.tightening == "none" or model.plant.dead_time:
         return said
     return (
-        f"{said}. That is for states that are known exactly; here they are estimated, and the error of an estimate is "
-        "not in W: for the true state nothing is guaranteed"
+        f"{said}. This applies to exactly known states. Here states are estimated, and the estimation error is "
+        "not in W: nothing is guaranteed for the true state"
     )
 
 
-def _of_states_that_are_known(config: Config, model: Model, sets: CertifiedSets | None) -> str:
+def _of_known_states(config: Config, model: Model, sets: CertifiedSets | None) -> str:
     if model.plant.dead_time and config.controller.tightening in ("first_step", "tube"):
         return (
-            f"guaranteed: nothing; {config.controller.tightening} tightens by what W does in a period, and not in the "
-            f"dead time of {model.plant.dead_time:g} s as well, over which the state is predicted"
+            f"guaranteed: nothing; {config.controller.tightening} tightens by the effect of W in one period, and not "
+            f"over the dead time of {model.plant.dead_time:g} s, over which the state is predicted"
         )
     match config.controller.tightening:
         case "none":
@@ -42,12 +42,12 @@ def _of_states_that_are_known(config: Config, model: Model, sets: CertifiedSets 
         case "first_step":
             return (
                 "guaranteed: the next state, at its sample, is in X for every disturbance in W, from states where the "
-                "plan keeps its first constraint; nothing for the steps after it"
+                "plan satisfies its first constraint; nothing for later steps"
             )
         case "tube":
             return (
-                "guaranteed: X and U at every sample, for ever, for every disturbance in W, from every state where the "
-                "problem has a solution once; W is taken as given"
+                "guaranteed: X and U at every sample, for all time and every disturbance in W, from every state from "
+                "which the problem is feasible once; W is assumed, not proved"
             )
     return _of_sets(find_sets(config, model) if sets is None else sets, start_of(config, model))
 
@@ -57,16 +57,16 @@ def _of_sets(sets: CertifiedSets, start: np.ndarray) -> str:
     count, margin = len(certificate.pieces), Guard(certificate).first_inputs(start).margin
     inside = f"x0 is inside, {margin:.2g} from the boundary"
     if margin < 0:
-        inside = "x0 is OUTSIDE of them, from where nothing is guaranteed"
+        inside = "x0 is OUTSIDE the sets, so nothing is guaranteed from it"
     trust = "W is proved"
     if certificate.source_of_W == "given":
         trust = (
-            "W is given, not proved, and the states are those that the linear model predicts over the delay"
+            "W is assumed, not proved, and the states are those that the linear model predicts over the delay"
         )
     sets_are = f"{count} certified {'set' if count == 1 else 'sets'} ({certificate.kind}, "
     sets_are += f"{100 * found.volume_fraction:.1f} % of X, margin {found.invariance_margin:.2g}, "
     return (
-        "guaranteed: X and U at every sample, not between two, whatever the network says, if inputs act for whole "
+        "guaranteed: X and U at every sample, not between two samples, for any network, if inputs act for whole "
         f"periods, from every state of {sets_are}sha256 {sets.sha256[:12]}); {trust}; {inside} (shares of X's "
         "half-widths)"
     )

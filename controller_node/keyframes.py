@@ -1,4 +1,4 @@
-"""When a controller says its whole memory: at its beginning and end, every so often, and to who begins to listen."""
+"""Publishes keyframes: at the start and end of a run, at regular intervals, and when a recorder starts listening."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from node_runtime.bus.zenoh_bus import Bus
 from protocol import topics
 
 AGAIN_AT = (0.0, 1.0)
-"""Seconds after a recorder began to listen, or does again, at which it gets a keyframe: all that it hears from then on
-can be replayed. The second one is for who needs a moment longer to be back than another reader."""
+"""Seconds after a recorder starts listening at which it gets a keyframe, so that everything it receives from then on
+can be replayed. The second one serves a recorder that reconnects later than another reader."""
 STATES_KEPT, MESSAGES_A_TICK = 16, 3
-"""Of ticks that were not sent yet when it began; each has at least so many messages of the bulk lane."""
+"""Number of stored states for ticks that were not sent yet, and minimum number of bulk messages per tick."""
 
 
 class Keyframes:
-    """One controller's keyframes on the bus.
+    """Publishes one controller's keyframes on the bus.
 
     Args:
-        bus: the plant's, open.
-        memory: what they are of.
-        every: ticks from one to the next.
+        bus: the plant's bus, open.
+        memory: the controller's memory.
+        every: ticks between two keyframes.
     """
 
     def __init__(self, bus: Bus, memory: Memory, every: int):
@@ -31,36 +31,36 @@ class Keyframes:
         self._states: deque[tuple[int, ControllerState]] = deque(maxlen=STATES_KEPT)
         self._heard: int | None = None
         self._due: list[float] = []
-        bus.when_heard(topics.KEYFRAME, self._hear_reader)
+        bus.when_heard(topics.KEYFRAME, self._add_listener)
 
     def remember(self, seq: int) -> None:
-        """Tick `seq` is over and the next one begins."""
+        """Store the state after tick `seq`, before the next tick begins."""
         self._states.append((seq, self._memory.state))
 
     def begin(self) -> None:
-        """Before the first tick. Who is heard by now needs no greeting."""
+        """Send the keyframe before the first tick, which serves all present listeners."""
         self._heard = None
         self.send(-1)
 
     def send(self, seq: int) -> None:
-        """The memory as it is, after tick `seq`."""
+        """Send the present memory as the keyframe after tick `seq`."""
         self._last = seq
         self._bus.publish(topics.KEYFRAME, self._memory.keyframe(seq))
 
     def send_due(self, seq: int) -> None:
-        """`send`, where it is this tick's turn."""
+        """Send a keyframe if it is due at this tick."""
         if (seq + 1) % self._every == 0:
             self.send(seq)
 
     def send_last(self, seq: int) -> None:
-        """`send`, where that has not been done."""
+        """Send the last keyframe unless it was sent."""
         if self._last < seq:
             self.send(seq)
 
     def greet(self, seq: int, now: float) -> None:
-        """Where somebody began to listen: of after tick `seq`, and of before each tick that he may still hear.
+        """Send keyframes to a new listener: after tick `seq`, and before each tick that it may still receive.
 
-        Between two ticks; `now` in seconds on the monotonic clock.
+        Call it between two ticks; `now` is in seconds on the monotonic clock.
         """
         if self._heard is not None:
             ticks, self._heard = self._heard // MESSAGES_A_TICK + 2, None
@@ -71,6 +71,6 @@ class Keyframes:
             del self._due[0]
             self.send(seq)
 
-    def _hear_reader(self, unsent: int) -> None:
-        """In a thread of the bus. Of the ticks before this moment a reader hears those that were not sent yet."""
+    def _add_listener(self, unsent: int) -> None:
+        """Record a new listener, in a thread of the bus. It will receive the `unsent` messages of earlier ticks."""
         self._heard = unsent

@@ -1,4 +1,4 @@
-"""A controller's memory as others hold it: in keyframes, in checkpoints, and the hidden layers for a trainer."""
+"""A controller's memory for others: keyframes, checkpoints, and the hidden layers for a trainer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from node_runtime.config.sections import Config
 from protocol import messages as m
 
 GIVEN = ("target", "reference.")
-"""Arrays that are there where somebody gave a reference."""
+"""Prefixes of arrays that exist only after a reference was given."""
 WIRE: dict[str, Literal["<i8", "<f8", "<f4"]] = {"int64": "<i8", "float64": "<f8", "float32": "<f4"}
 
 
@@ -24,9 +24,9 @@ class Memory:
     """The state of one controller.
 
     Args:
-        controller: whose state it is.
+        controller: the controller.
         config: the resolved configuration.
-        run_id: stamped on every message.
+        run_id: written into every message.
     """
 
     def __init__(self, controller: Controller, config: Config, run_id: str):
@@ -36,7 +36,7 @@ class Memory:
         self._hash_hidden()
 
     def advance(self, state: ControllerState, new_network: bool) -> None:
-        """The state after a step; `new_network`: whether its hidden layers are others."""
+        """Take over the state after a step; `new_network` says whether its hidden layers changed."""
         self.state = state
         if new_network:
             self._hash_hidden()
@@ -46,9 +46,9 @@ class Memory:
         self.hidden_sha256 = "" if network is None else hash_layers(network.hidden)
 
     def keyframe(self, seq: int, state: ControllerState | None = None) -> m.Keyframe:
-        """The whole memory after tick `seq`, -1 before the first.
+        """Return the whole memory after tick `seq`, -1 before the first.
 
-        state: what `self.state` was after that tick; None: as it is now.
+        state: the value of `self.state` after that tick; None for the present one.
         """
         of = self.state if state is None else state
         arrays = {name: m.Array.of(array, WIRE[array.dtype.name]) for name, array in of.to_arrays().items()}
@@ -60,7 +60,7 @@ class Memory:
         """Take over a keyframe's memory.
 
         Raises:
-            ValueError: the keyframe does not fit this configuration; the text names the array.
+            ValueError: the keyframe does not fit this configuration. The text names the array.
         """
         arrays = {name: array.numpy() for name, array in keyframe.arrays.items()}
         expected, unfit = (
@@ -78,26 +78,26 @@ class Memory:
         self._resumed = keyframe.resumed
 
     def _expected(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """What a memory with these arrays has: only a reference that was given, and its target, may be missing."""
+        """Return the arrays of a valid memory. Only a given reference and its target are optional."""
         expected = {
             name: array for name, array in self.state.to_arrays().items() if not name.startswith(GIVEN)
         }
         if "target" in arrays or self._controller.aims.nothing_yet.size:
             model = self._controller.model
             expected["target"] = np.zeros(model.d + model.m)
-        # Whether these are a reference is for themselves to say.
+        # The arrays of a reference are checked when they are read.
         return expected | {name: array for name, array in arrays.items() if name.startswith("reference.")}
 
     def lasting(self) -> dict[str, m.Array]:
-        """What of the memory outlives this process: all that was learned, nothing that was planned."""
+        """Return the part of the memory that survives this process: everything learned, without plans."""
         arrays = self.keyframe(0).arrays
         return {name: array for name, array in arrays.items() if _lasts(name)}
 
     def go_on(self, lasting: dict[str, m.Array], run_id: str) -> None:
-        """Begin with what the run `run_id` left, and no plan; before the first tick.
+        """Start with the lasting memory of the run `run_id`, and without a plan. Call it before the first tick.
 
         Raises:
-            ValueError: it does not fit this configuration; the text names the array.
+            ValueError: it does not fit this configuration. The text names the array.
         """
         begin = self.keyframe(-1).arrays
         expected = {name for name in begin if _lasts(name)}
@@ -110,7 +110,7 @@ class Memory:
         self.restore(m.Keyframe(run_id=self._run_id, seq=-1, arrays=arrays, resumed=run_id))
 
     def belongs(self) -> dict[str, str]:
-        """Whose memory this is, in words: what must be equal for another process to go on with it."""
+        """Return the identity of this memory as texts, which must be equal in a process that continues with it."""
         model, what = self._controller.model, self._controller.oracle.description
         plant = model.plant
         numbers = b"".join(array.tobytes() for array in (model.A, model.B, plant.x_e, plant.u_e))
@@ -133,7 +133,7 @@ class Memory:
         return words
 
     def hidden_snapshot(self, seq: int) -> m.HiddenSnapshot | None:
-        """The hidden weights in force, for a trainer that joins late; None without a network."""
+        """Return the hidden weights in use, for a trainer that joins late; None without a network."""
         network = self._controller.oracle.network(self.state.oracle)
         if network is None:
             return None
@@ -148,5 +148,5 @@ class Memory:
 
 
 def _lasts(name: str) -> bool:
-    """Whether a new process can go on with this array. Not with a plan, or with a state whose successor it missed."""
+    """Return whether a new process can use this array. Plans and states before an interruption are excluded."""
     return name == "delay" or name.startswith(("oracle.", "estimator.", "reference."))

@@ -1,4 +1,4 @@
-"""`tandem controller`: the live shell around `ControllerCore`. Latch, step, publish; nothing else."""
+"""`tandem controller`: the live loop around `ControllerCore`, which latches, steps and publishes."""
 
 from __future__ import annotations
 
@@ -41,27 +41,27 @@ from protocol import messages as m
 log = logging.getLogger(__name__)
 
 SAMPLES_BATCH = 5
-# Samples wait for each other this long, in seconds, where that makes larger batches.
+# Longest wait of samples for a batch, in seconds, if that gives larger batches than `SAMPLES_BATCH`.
 SAMPLES_WAIT = 0.1
 # A state older than this share of a period belongs to an earlier slot.
 OLDEST_STATE = 0.8
-# Seconds that all states were older than that: no backlog lasts so long, so the plant's clock, or ours, has leapt, or
-# the way is longer now. How long a command took on it the plant judges by its own clock.
+# Seconds. If all states were too old for this time, the age estimate is reset. No backlog lasts so long, so a clock has
+# jumped or the path has become longer. The plant checks the age of commands by its own clock.
 FORGIVES_S = 5.0
-# How long a slot waits for its state, as a share of a period.
+# Longest wait of a slot for its state, as a share of a period.
 STATE_PATIENCE = 0.25
-# Seconds; in a shorter period there is no time for a backup policy, which takes a few milliseconds.
+# Seconds. A shorter period has no time for a backup policy, which takes a few milliseconds.
 BACKUP_FROM = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Latched:
-    """The plant's state as one slot found it."""
+    """The plant's state as found by one slot."""
 
     verdict: m.StateVerdict
     received: Received[m.PlantState] | None
     age: float
-    """Seconds since the sample, as far as that can be known."""
+    """Estimated seconds since the sample."""
 
     @property
     def state(self) -> m.PlantState | None:
@@ -69,7 +69,7 @@ class Latched:
 
 
 class ControllerNode:
-    """One controller on the bus. `run` is its loop; the query thread only reads what the loop leaves."""
+    """One controller on the bus. `run` is its loop; the query thread only reads data that the loop has finished."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class ControllerNode:
         outbox: Outbox | None = None,
         checkpoint: CheckpointWriter | None = None,
     ):
-        """`counts`: this node's own figures, kept up to date here. `checkpoint`: None: the memory is not saved."""
+        """`counts`: the node's counters, which are updated here. `checkpoint`: None to save no memory."""
         self._core = core
         self._bus = bus
         self._health = health
@@ -88,12 +88,12 @@ class ControllerNode:
         self._settings = core.config.controller
         self._period = core.config.period
         self._phase = phase(core.config)
-        # The plant feeds back every state: what it says of one that it does not measure would drive its inputs.
+        # The backup policy feeds back every state of the plant's samples, so all states must be measured.
         self._backs_up = (
             self._settings.backup.enabled
             and self._period >= BACKUP_FROM
             and core.controller.estimator.sees_all
-            # Fed back behind a dead time, its stiff K may be unstable.
+            # With a dead time, feedback with its stiff K may be unstable.
             and not core.plant.dead_time
         )
         core.ready_targets()
@@ -124,7 +124,7 @@ class ControllerNode:
         bus.serve(topics.HIDDEN_QUERY, self._answer_hidden)
 
     def run(self, stop: threading.Event) -> None:
-        """Until `stop` is set."""
+        """Run until `stop` is set."""
         pacer = Pacer(self._grid, stop)
         garbage = GarbageCollection.at(self._period)
         garbage.begin()
@@ -152,9 +152,9 @@ class ControllerNode:
     # -- before the step ---------------------------------------------------------------------------------
 
     def _find_plant(self, stop: threading.Event) -> bool:
-        """Wait for a state young enough and put the next slot `phase` behind its arrival; False when told to stop.
+        """Wait for a recent state and put the next slot `phase` after its arrival; return False if told to stop.
 
-        After an outage longer than the plan there is nothing left to say, so the loop comes back here.
+        The loop returns here after an outage longer than the plan, because it has nothing left to send.
         """
         if stop.is_set():
             return False
@@ -177,15 +177,13 @@ class ControllerNode:
             self._health.set("ready", "no plant: its states come too late to act on")
             old_since = now if old_since is None else old_since
             if now - old_since > FORGIVES_S:
-                text = (
-                    "the plant's states have been %.3g s late for %g s; what comes now is taken for punctual"
-                )
+                text = "the plant's states have been %.3g s late for %g s; they now count as punctual"
                 log.warning(text, age, FORGIVES_S)
                 self._states.forget_ages()
         return False
 
     def _latch(self, slot: Slot) -> Latched:
-        """The newest state; where none of this slot is here yet, wait a little for it."""
+        """Return the newest state. Wait a little if none of this slot has arrived."""
         received, self._first = self._first or self._states.take(), None
         deadline = slot.time + STATE_PATIENCE * self._period
         oldest = OLDEST_STATE * self._period
@@ -200,7 +198,7 @@ class ControllerNode:
             received = newer
 
     def _follow_phase(self, slot: Slot, latched: Latched) -> None:
-        """Keep the slots `phase` behind the arrival of the plant's states."""
+        """Keep the slots `phase` after the arrival of the plant's states."""
         if latched.verdict != "fresh" or latched.received is None:
             return
         received = latched.received
@@ -208,13 +206,13 @@ class ControllerNode:
         if received.message.run_id == self._followed:
             self._grid.slew(arrived, self._phase)
             return
-        # Another plant process, another phase.
+        # A new plant process has a new phase.
         self._followed = received.message.run_id
         after = arrived + self._phase + self._period
         self._grid.reanchor(after if after - slot.time > 0.5 * self._period else after + self._period)
 
     def _take_weights(self) -> None:
-        """Decode hidden weights after the step, where there is time; the next tick carries them."""
+        """Decode hidden weights after the step, when there is time. The next tick contains them."""
         for received in self._trainers.take_all():
             weights = received.message
             if weights.for_run != self._run_id:
@@ -227,7 +225,7 @@ class ControllerNode:
             self._weights = weights
 
     def _take_reference(self) -> None:
-        """The newest, for the next tick; whoever sends more of them than there are ticks is not followed in each."""
+        """Take the newest reference for the next tick. If there are several per tick, the older ones are dropped."""
         for received in self._commanders.take_all():
             if self._reference is not None:
                 detail = (
@@ -260,14 +258,14 @@ class ControllerNode:
         outputs = self._core.step(tick)
         self._bus.publish(topics.COMMAND, outputs.command)
         sent = clock.now()
-        # The plant obeys no command that answers none of its samples, and no policy that belongs to one. And the policy
-        # would feed back a sensor that is not believed.
+        # The plant refuses commands that answer none of its samples, and their policies. With a distrusted sensor the
+        # policy would feed back a wrong measurement.
         obeyed = latched.verdict == "fresh"
-        believed = not outputs.result.sensor_faults
+        trusted = not outputs.result.sensor_faults
         if (
             self._backs_up
             and obeyed
-            and believed
+            and trusted
             and (backup := self._core.backup(outputs.command)) is not None
         ):
             self._bus.publish(topics.BACKUP, backup)
@@ -279,7 +277,7 @@ class ControllerNode:
             lateness_ms=lateness * 1e3,
             state_age_ms=latched.age * 1e3,
         )
-        # Before the bulk thread has something to do: it would compete for the interpreter.
+        # Prepare before the bulk thread has work, because it competes for the interpreter.
         self._core.prepare()
         self._bus.publish(topics.TICK, tick)
         self._bus.publish(topics.RESULT, outputs.result)
@@ -289,11 +287,11 @@ class ControllerNode:
         self._tally.add(tick, outputs.result, overrun=sent > slot.time + self._period)
 
     def _publish_learning(self, judged: m.HiddenWeights | None, outputs: Outputs) -> None:
-        """Everything else that a tick leaves: samples, output weights, keyframes.
+        """Publish everything else of a tick: samples, output weights, keyframes.
 
-        judged: what the tick adopted or refused.
+        judged: the hidden weights that the tick adopted or refused.
         """
-        # Before the output weights that make a trainer ask.
+        # Store them before the output weights, which make a trainer ask for them.
         if outputs.new_network or judged is not None:
             self._remember_hidden(judged, outputs.new_network)
         if outputs.sample is not None:
@@ -331,7 +329,7 @@ class ControllerNode:
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem controller`. 0 when told to stop, 2 for a configuration that admits no controller."""
+    """Run `tandem controller`. Return 0 when told to stop, 2 for a configuration that allows no controller."""
     with one_blas_thread():
         return run_process(lambda stopping: _live(config, stopping), stop)
 

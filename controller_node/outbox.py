@@ -1,4 +1,4 @@
-"""The controller's last samples, kept for a trainer that joins late; after a restart those of the runs before too."""
+"""The controller's last samples, including earlier runs after a restart, for a trainer that joins late."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ BATCH = 500
 class Outbox:
     """The newest `capacity` samples of one controller run. Any thread may call.
 
-    They are numbers in a ring that has its full size from the first sample on: a controller that has run for hours
-    needs no more memory than after its first minute.
+    They are stored in a ring that has its full size from the first sample on, so a controller needs no more memory
+    after hours than after a minute.
 
-    earlier: batches of the runs that this one goes on from, oldest first.
+    earlier: batches of the runs that this one continues, oldest first.
     """
 
     def __init__(self, run_id: str, capacity: int = CAPACITY, earlier: Sequence[Samples] = ()):
@@ -35,11 +35,11 @@ class Outbox:
         self._lock = threading.Lock()
 
     def add(self, sample: Sample) -> None:
-        """Samples come in ascending order of `seq`, all of one plant; the oldest makes room."""
+        """Add a sample. Samples must have ascending `seq` and the same plant. The oldest is dropped if necessary."""
         row = [*sample.x, *sample.u, *sample.h, *itertools.chain.from_iterable(sample.past)]
         with self._lock:
             if self._rows is None:
-                # Written to, so that the memory is really there.
+                # NaN is written to allocate the memory now.
                 self._rows = np.full((self._capacity, len(row)), np.nan)
                 self._sizes = (len(sample.x), len(sample.u), len(sample.h))
             slot = self._count % self._capacity
@@ -47,7 +47,7 @@ class Outbox:
             self._count += 1
 
     def since(self, seq: int, last: int = CAPACITY) -> list[Sample]:
-        """Samples after `seq`, ascending; of those, the newest `last`."""
+        """Return the samples after `seq`, ascending, limited to the newest `last`."""
         with self._lock:
             if self._rows is None:
                 return []
@@ -64,18 +64,18 @@ class Outbox:
         return Sample(seq, row[:d], row[d : d + m], row[d + m : d + m + h], pairs)
 
     def batches(self, samples: list[Sample]) -> list[Samples]:
-        """The same samples as messages of at most `BATCH` pairs each, those of their past included."""
+        """Return the samples as messages of at most `BATCH` pairs each, including the pairs of their past."""
         size = max(1, BATCH // (1 + len(samples[0].past))) if samples else BATCH
         parts = (samples[i : i + size] for i in range(0, len(samples), size))
         return [Samples(run_id=self.run_id, seq=part[-1].seq, samples=part) for part in parts]
 
     def answer(self, parameters: dict[str, str]) -> list[bytes]:
-        """Answer `?run=RUN;since=SEQ;last=K`: encoded `Samples`; [] for another run, or when there are none.
+        """Answer `?run=RUN;since=SEQ;last=K` with encoded `Samples`; [] for another run, or without samples.
 
-        Who asks for all, from the beginning, gets those of earlier runs too, under the names of those runs.
+        A query for all samples from the start also gets those of earlier runs, under the ids of those runs.
 
         Raises:
-            ValueError: a parameter that is unknown or not a number.
+            ValueError: a parameter is unknown or not a number.
         """
         unknown = parameters.keys() - {"run", "since", "last"}
         if unknown:
@@ -88,7 +88,7 @@ class Outbox:
         return [codec.encode(batch) for batch in (*earlier, *self.batches(own))]
 
     def _earlier(self, room: int) -> list[Samples]:
-        """The newest batches of earlier runs that have room."""
+        """Return the newest batches of earlier runs that fit into `room` samples."""
         found: list[Samples] = []
         for batch in reversed(self.earlier):
             room -= len(batch.samples)

@@ -1,4 +1,4 @@
-"""When a controller's slots lie: how long behind the plant's states, and which delay of a command that makes."""
+"""The phase of a controller's slots after the plant's states, and the resulting delay of a command."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 
 LONGEST_PHASE = 0.5
-"""Of a period."""
+"""Largest phase, as a share of a period."""
 USUAL_PHASE, USUAL_PHASE_SHARE = 1e-3, 0.25
-"""Seconds, and share of a period at most."""
+"""Default phase in seconds, and its limit as a share of a period."""
 USUAL_ANSWER, USUAL_ANSWER_SHARE = 4e-3, 0.1
-"""Likewise, from a slot until its command acts."""
+"""Default time from a slot until its command acts, in seconds, and its limit as a share of a period."""
 
 
 def with_input_delay(config: Config) -> Config:
-    """The configuration with `controller.input_delay_ms` settled, so that the log says what was in force."""
+    """Return the configuration with a value for `controller.input_delay_ms`, so that the log contains it."""
     if config.controller.input_delay_ms is not None:
         return config
     usual = phase(config) + min(USUAL_ANSWER, USUAL_ANSWER_SHARE * config.period)
@@ -26,13 +26,13 @@ def with_input_delay(config: Config) -> Config:
 
 
 def phase(config: Config) -> float:
-    """How far, in seconds, the slots lie behind the arrival of the plant's states."""
+    """Return the time of the slots after the arrival of the plant's states, in seconds."""
     given = config.controller.phase_ms
     return min(USUAL_PHASE, USUAL_PHASE_SHARE * config.period) if given is None else given * 1e-3
 
 
 def check_phase(config: Config) -> None:
-    """Raises `ConfigError`: it is too long."""
+    """Raise `ConfigError` if the phase is too long."""
     longest = LONGEST_PHASE * config.period * 1e3
     if phase(config) * 1e3 > longest:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""What a controller has counted since it began, and what of that a person is told at once."""
+"""A controller's counters since its start, and its immediate messages for a person."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ COUNTS = (
 
 
 class Tally:
-    """Of one controller.
+    """The counters and messages of one controller.
 
     Args:
-        counts: the figures of `COUNTS`, kept up to date here.
-        health: which sensors are not believed is said there.
-        bad: messages that were refused.
+        counts: the counters of `COUNTS`, which are updated here.
+        health: receives the distrusted sensors.
+        bad: counts refused messages.
     """
 
     def __init__(self, counts: dict[str, int], health: HealthPublisher, bad: RejectedMessages):
@@ -41,11 +41,11 @@ class Tally:
 
     @property
     def note(self) -> str:
-        """Which sensors are not believed, for a person; empty where all are."""
+        """The distrusted sensors, for a person; empty if there are none."""
         return "; ".join(self._faults.values())
 
     def add(self, tick: m.Tick, result: m.TickResult, overrun: bool) -> None:
-        """One more tick; `overrun`: its command came after the next slot's time."""
+        """Count one more tick; `overrun` means that its command came after the next slot's time."""
         counts = self.counts
         counts["ticks"] += 1
         counts["late ticks"] += tick.late or overrun
@@ -63,10 +63,10 @@ class Tally:
             counts["weights rolled back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
         if result.sensor_faults or self._faults:
-            self._say_faults(tick, result.sensor_faults)
+            self._report_faults(tick, result.sensor_faults)
 
-    def _say_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
-        """In health and in this process's log, where sensors are believed no longer, or again."""
+    def _report_faults(self, tick: m.Tick, faults: dict[str, str]) -> None:
+        """Report changes of the distrusted sensors in health and in this process's log."""
         before = self._faults
         words = {name: m.words_of_fault(name, fault, tick.t) for name, fault in faults.items()}
         self._faults = {name: before.get(name, text) for name, text in words.items()}
@@ -75,5 +75,5 @@ class Tally:
         for name in faults.keys() - before.keys():
             log.warning("tick %d: %s", tick.seq, self._faults[name])
         for name in before.keys() - faults.keys():
-            log.info("tick %d: sensor %s is believed again", tick.seq, name)
+            log.info("tick %d: sensor %s is trusted again", tick.seq, name)
         self._health.set("running", self.note)

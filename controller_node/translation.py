@@ -1,4 +1,4 @@
-"""Messages in plant units to deviations from the equilibrium, and back: one tick's way in and its way out."""
+"""Translates between messages in plant units and deviations, for the inputs and outputs of a tick."""
 
 from __future__ import annotations
 
@@ -25,39 +25,39 @@ from protocol.codec import encode
 
 @dataclass(frozen=True)
 class Outputs:
-    """Everything one tick produces; `sample` and `output_weights` are None where there is none."""
+    """Everything one tick produces; `sample` and `output_weights` may be None."""
 
     command: m.Command
     result: m.TickResult
     sample: m.Sample | None
     new_network: bool
-    """Whether other hidden layers are in use from now on."""
+    """Whether the hidden layers in use change with this tick."""
     _weights: Callable[[], m.OutputWeights] | None
 
     @cached_property
     def output_weights(self) -> m.OutputWeights | None:
-        """Made when they are asked for: a fast loop sends them at few of its ticks."""
+        """The output weights, created on first use because a fast loop sends them at few ticks."""
         return None if self._weights is None else self._weights()
 
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """For one run of one controller."""
+    """The translation for one run of one controller."""
 
     run_id: str
-    """Stamped on every message."""
+    """Written into every message."""
     plant: Description
     period: float
     """Seconds."""
 
     def observation(self, tick: m.Tick) -> Observation:
-        """What a tick lets the controller see."""
+        """Return the controller's observation of a tick."""
         state = tick.state if tick.state_verdict == "fresh" else None
         hidden = None
         if tick.weights is not None:
             layers = [array.numpy().astype(float) for array in tick.weights.layers]
             weights = tick.weights
-            # Of the sample before this tick's own the label is complete now.
+            # The label of the sample before this tick's own is complete now.
             later = None if weights.newest is UNSET else max(0, tick.seq - 1 - weights.newest)
             hidden = HiddenSet(weights.seq, layers, weights.sha256, weights.network_sha256, later)
         asked = self._asked(tick)
@@ -69,7 +69,7 @@ class Translation:
         pieces = tuple((piece.seconds, np.array(piece.u) - self.plant.u_e) for piece in state.pieces)
         total = sum(seconds for seconds, _u in pieces)
         if pieces and not math.isclose(total, self.period, rel_tol=1e-3):
-            # Not the whole period: what acted in the rest of it is not known, but what acts now is.
+            # Part of the period is not reported, so its mean is unknown. The present input is known.
             applied = None
         x = np.array(state.x) - self.plant.x_e
         if state.missing:
@@ -78,7 +78,7 @@ class Translation:
         return Observation(x, applied, source, state.seq, hidden, pieces, tick.truth, asked, tick.skipped)
 
     def _asked(self, tick: m.Tick) -> Change | None:
-        """What the tick's reference comes to; None without one, and for one that is refused."""
+        """Return the change that the tick's reference requests; None without one, or if it is refused."""
         if tick.reference is UNSET:
             return None
         try:
@@ -89,12 +89,12 @@ class Translation:
     def outputs(
         self, tick: m.Tick, result: StepResult, network: LearnedNetwork | None, hidden_sha256: str
     ) -> Outputs:
-        """What a step says to others.
+        """Return the messages of a step.
 
         Args:
-            tick: what it was given.
-            result: what it decided.
-            network: the oracle's, after the step.
+            tick: the step's input.
+            result: the step's result.
+            network: the oracle's network after the step.
             hidden_sha256: hash of that network's hidden layers; empty without one.
         """
         command = self._command(tick, result)
@@ -107,7 +107,7 @@ class Translation:
         )
 
     def backup(self, policy: Policy, command: m.Command) -> m.Backup:
-        """A policy in plant units, from one period after `command` on."""
+        """Return a policy in plant units that starts one period after `command`."""
         inputs = policy.inputs + self.plant.u_e - policy.gain @ self.plant.x_e
         return m.Backup(
             run_id=self.run_id,
@@ -170,14 +170,14 @@ class Translation:
         )
 
     def _judged(self, tick: m.Tick) -> dict[str, Any]:
-        """The fields of a `TickResult` that answer whoever gave a reference."""
+        """Return the fields of a `TickResult` that answer the sender of a reference."""
         if tick.reference is UNSET:
             return {}
         verdict = verdict_on(tick.reference, self.plant, self.period)
         return {"reference_verdict": verdict, "reference_from": tick.reference.run_id}
 
     def _target(self, target: SteadyState | None) -> dict[str, Any]:
-        """The fields of a `TickResult` that tell of it."""
+        """Return the fields of a `TickResult` about the target."""
         if target is None:
             return {}
         x, u = target.xu[: self.plant.d] + self.plant.x_e, target.xu[self.plant.d :] + self.plant.u_e
@@ -214,5 +214,5 @@ class Translation:
 
 
 def _norm(vector: np.ndarray) -> float:
-    """Euclidean; numpy's own takes ten times as long for so few numbers."""
+    """Return the Euclidean norm. numpy's function takes ten times as long on such short vectors."""
     return math.sqrt(vector.dot(vector))

@@ -1,4 +1,4 @@
-"""What each oracle costs on an example: lock-step runs, a line each, and one picture of them all.
+"""Cost of each oracle on an example: lock-step runs, a line each, and one picture of all.
 
 python examples/compare.py examples/tanks/tanks.toml --steps 120
 """
@@ -25,7 +25,7 @@ ORACLES: dict[str, dict[str, Any]] = {
     "dnn": {"oracle": "dnn"},
     "perfect": {"oracle": "perfect"},
 }
-"""What differs between the runs; the number is the gain of the filter (`constant.gain`)."""
+"""Settings of each run; the number is the gain of the filter (`constant.gain`)."""
 LOOKS = {
     "linear": {"color": "#6F6F6F", "linestyle": "-"},
     "constant": {"color": "#56B4E9", "linestyle": "-"},
@@ -51,7 +51,7 @@ class Row:
 def compare(
     config: Path, steps: int, oracles: tuple[str, ...], episodes: int = 1, seed: int = 0, **settings: Any
 ) -> list[Row]:
-    """One run of each oracle, the same in all else; `settings` as `Loop` takes them."""
+    """Run each oracle with otherwise equal settings; `settings` as `Loop` takes them."""
     rows = []
     for oracle in oracles:
         loop = Loop(config=config, seed=seed, **{**settings, **ORACLES[oracle]})
@@ -67,7 +67,7 @@ def compare(
 
 
 def picture(rows: list[Row], plant: Description) -> Figure:
-    """The performance states and the inputs of the last episode; of several constants the best."""
+    """Plot the performance states and the inputs of the last episode; of several constants, the best."""
     constants = [row for row in rows if row.oracle.startswith("constant")]
     worse = sorted(constants, key=lambda row: row.J[-1])[1:]
     shown = [row for row in rows if row not in worse]

@@ -1,4 +1,6 @@
-"""A gateway without any of Tandem's code: zenoh and msgpack are all it needs. docs/gateway.md is what it follows.
+"""A gateway without any of Tandem's code: it needs zenoh and msgpack only.
+
+It follows docs/reference/gateway.md.
 
     tandem run --no-plant                          # in one terminal
     python examples/gateway_without_tandem.py      # in another; arguments: the router's endpoint, folder of keys
@@ -52,16 +54,16 @@ class Compressor:
 
 
 class Gateway:
-    """What acts on the machine, and what is said about it. Every time is in seconds on this machine's own clock."""
+    """The rules for what acts on the machine and for its messages. Times are in seconds on this machine's own clock."""
 
     def __init__(self, machine, run_id, first):
-        # first: when sample 0 is due. seq: of the newest sample. source: what drives.
+        # first: when sample 0 is due. seq: of the newest sample. source: of the acting input.
         self.machine, self.run_id, self.first, self.seq, self.source = machine, run_id, first, -1, "hold"
-        # What acts and since when, and what acted before it since the newest sample.
+        # The acting input and its start, and the inputs before it since the newest sample.
         self.u, self.since, self.pieces = None, first, []
-        # Of the last command that was obeyed; and when something else has to act if no other comes.
+        # Of the last obeyed command, and the time at which another input acts if no other command comes.
         self.plan, self.command_seq, self.arrived, self.switch = [], -1, 0.0, math.inf
-        # Whom to obey: run_id, seq, and when it last spoke.
+        # The obeyed controller: run_id, seq, and the time of its last message.
         self.leader, self.heard = ("", -1), -math.inf
         self.refused = Counter()
 
@@ -89,7 +91,7 @@ class Gateway:
         }
 
     def receive(self, payload, arrived, now):
-        """Obey a command, or count why not."""
+        """Obey a command, or count the reason why not."""
         try:
             command = msgpack.unpackb(payload)
             reason = "oversized" if len(payload) > LARGEST else self.refusal(command, arrived)
@@ -102,7 +104,7 @@ class Gateway:
         self.act(now)
 
     def refusal(self, c, arrived):
-        """Why a command must not be obeyed, or None. Raises for what has other types than a command."""
+        """Return why a command must not be obeyed, or None. Raises if its types are wrong."""
         who, plan = (c["run_id"], c["seq"]), c["plan"]
         if any(type(c[name]) is not kind for name, kind in FIELDS.items()) or c["seq"] >= 2**63:
             return "malformed"
@@ -125,8 +127,8 @@ class Gateway:
         return "stale" if age > (1 + PATIENCE) * PERIOD else None
 
     def act(self, now):
-        """Write what has to act from now on: the command's input, later its plan's, in the end the safe one."""
-        # A hair more: a switching time that rounding put off counts as reached.
+        """Write the input that acts from now on: the command's, later its plan's, in the end the safe one."""
+        # The small term counts a switching time that rounding delayed as reached.
         periods = (now - self.arrived) / PERIOD + 1e-6
         entry, until = int(periods), int(periods) + 1
         if periods < PATIENCE:
@@ -141,14 +143,14 @@ class Gateway:
         self.machine.write(self.u, now)
 
     def note(self, t):
-        """Keep in mind which input acted until t."""
+        """Store which input acted until t."""
         if t > self.since:
             self.pieces.append({"seconds": t - self.since, "u": self.u})
         self.since = t
 
 
 def settings(endpoint, keys):
-    """Zenoh's; keys: the folder of a certificate, where the endpoint begins with tls/."""
+    """The Zenoh configuration; keys: folder of a certificate, if the endpoint begins with tls/."""
     tree = {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}}
     tree["scouting"] = {"multicast": {"enabled": False}}
     if keys is not None:
@@ -159,7 +161,7 @@ def settings(endpoint, keys):
 
 
 def serve(session, gateway, commands):
-    """Sleep until a command comes or something is due, and do it."""
+    """Sleep until a command comes or an action is due, and do it."""
     while True:
         wait = min(gateway.due(), gateway.switch) - time.monotonic()
         try:
@@ -167,7 +169,7 @@ def serve(session, gateway, commands):
         except queue.Empty:
             received = None
         now = time.monotonic()
-        # Samples that were slept through are missing. They are never made up for.
+        # Samples during a stall are missing. They are not made up later.
         gateway.seq += max(0, math.ceil((now - gateway.due()) / PERIOD - 0.5))
         if now >= gateway.due():
             state = msgpack.packb(gateway.sample())
@@ -189,7 +191,9 @@ def main(endpoint="tcp/127.0.0.1:7447", keys=None):
         if not commands.full():
             commands.put((message.payload.to_bytes(), time.monotonic()))
 
-    with contextlib.suppress(OSError):  # without the right to it, samples are late when others want the core
+    with contextlib.suppress(
+        OSError
+    ):  # without this permission, samples are late when other processes use the core
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
     with zenoh.open(settings(endpoint, keys)) as session:
         both = f"{KEY}/controller/command", f"{KEY}/@direct/controller/command"

@@ -1,6 +1,6 @@
 """Learning-based model predictive control: pure functions and small classes, no clock and no I/O.
 
-One solve, of the jet-engine compressor from its x0:
+One solve for the jet-engine compressor, starting at its x0:
 
     import numpy as np
     from lbmpc import LinearOracle, Solver, build_model, build_problem, get_plant
@@ -13,7 +13,7 @@ One solve, of the jet-engine compressor from its x0:
     solution = solver.solve(plant.x0 - plant.x_e, theta, np.zeros((60, model.m)))
     u = plant.u_e + solution.v[0]
 
-What is public is `__all__`; each name is imported when it is asked for. A closed loop that learns is `tandem.Loop`.
+The public names are those in `__all__`; each is imported on first use. `tandem.Loop` is a closed loop that learns.
 """
 
 from __future__ import annotations

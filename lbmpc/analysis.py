@@ -1,4 +1,4 @@
-"""What a model is like to control: which states its inputs move, how it grows, and what its disturbance is."""
+"""Control properties of a model: reachability, growth, settling time and disturbance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lbmpc.model import Model, growth_rate, longest_horizon
 from lbmpc.plants.description import PlantError
 
 SETTLED = 0.2
-"""Half-widths into which the feedback has brought every state from all of X when it counts as settled."""
+"""Half-widths. A state counts as settled when it is this close to rest."""
 MOST_STEPS = 1000
 
 Step = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
@@ -20,14 +20,14 @@ Step = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
 def poles(matrix: np.ndarray, period: float) -> np.ndarray:
-    """Continuous-time poles, 1/s, of a discrete-time matrix (d, d), fastest growth first; -inf for a 0."""
+    """Return the continuous-time poles, 1/s, of a discrete-time matrix (d, d), fastest first; -inf for eigenvalue 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.log(np.linalg.eigvals(matrix).astype(complex)) / period
     return found[np.lexsort((-found.imag, -found.real))]
 
 
 def reach(model: Model, steps: int) -> np.ndarray:
-    """How far inputs within a half-width of u_e can move each state from x_e in `steps`, half-widths, (d,)."""
+    """Return how far inputs within a half-width of u_e move each state from x_e in `steps`, half-widths, (d,)."""
     x, u = model.plant.x_scale, model.plant.u_scale
     total, response = np.zeros(model.d), model.B * u / x[:, None]
     transition = model.A * x / x[:, None]
@@ -38,14 +38,14 @@ def reach(model: Model, steps: int) -> np.ndarray:
 
 
 def growth(model: Model, steps: int) -> float:
-    """Factor by which the fastest mode grows over so many steps; at least 1."""
+    """Return the factor by which the fastest mode grows over `steps` steps; at least 1."""
     return math.exp(min(700.0, steps * growth_rate(model)))
 
 
 def settling_steps(model: Model) -> int:
-    """Steps in which u = K x brings every state of X to within `SETTLED` half-widths, without bounds on u.
+    """Return the steps in which u = K x brings every state of X within `SETTLED` half-widths, without bounds on u.
 
-    A horizon as long sees all of the way to rest; a shorter one leaves the rest to the terminal cost.
+    A horizon of this length covers the whole way to rest. A shorter one relies on the terminal cost.
     """
     x = model.plant.x_scale
     closed = model.closed_loop * x / x[:, None]
@@ -58,7 +58,7 @@ def settling_steps(model: Model) -> int:
 
 
 def advised_horizon(model: Model) -> int:
-    """Steps: to rest, as far as the model's growth leaves digits; at least 1."""
+    """Return a horizon in steps: the settling time, limited by `longest_horizon`; at least 1."""
     most = longest_horizon(model)
     return max(1, min(settling_steps(model), MOST_STEPS if most is None else most))
 
@@ -68,19 +68,19 @@ class SampledDisturbance:
     """The largest |h| found at random states of X and inputs of U."""
 
     largest: np.ndarray
-    """(d,) per second."""
+    """Largest |h| of each state, (d,), per second."""
     x: np.ndarray
-    """(d, d): row i is where state i's was found; plant units. As for `u`, (d, m)."""
+    """Row i is the state at which `largest[i]` was found, (d, d), plant units; `u` is the input, (d, m)."""
     u: np.ndarray
     samples: int
     lost: int
-    """Samples from which the true motion could not be followed."""
+    """Number of samples at which the true motion could not be computed."""
 
 
 def sample_disturbance(model: Model, step: Step, count: int, rng: np.random.Generator) -> SampledDisturbance:
-    """|h| = |x+ - A x - B u| of the true motion, at `count` points of X x U; half of them on its boundary.
+    """Return the largest |h| = |x+ - A x - B u| of the true motion at `count` points of X x U.
 
-    A side without a bound is taken a half-width from (x_e, u_e).
+    Half of the points lie on the boundary. A side without a bound is placed a half-width from (x_e, u_e).
     """
     plant = model.plant
     rest, scale = np.concatenate([plant.x_e, plant.u_e]), np.concatenate([plant.x_scale, plant.u_scale])
@@ -89,7 +89,7 @@ def sample_disturbance(model: Model, step: Step, count: int, rng: np.random.Gene
     low = np.where(np.isfinite(low), low, rest - scale)
     high = np.where(np.isfinite(high), high, rest + scale)
     share = rng.uniform(0.0, 1.0, (count, len(rest)))
-    # h of a smooth plant is largest at the corners, which random points miss where there are many states.
+    # h of a smooth plant is largest at the corners, and uniform points miss corners in many dimensions.
     edge = rng.uniform(0.0, 1.0, share.shape) < 0.8
     share[: count // 2] = np.where(edge, np.round(share), share)[: count // 2]
     points = low + share * (high - low)
@@ -110,18 +110,18 @@ def sample_disturbance(model: Model, step: Step, count: int, rng: np.random.Gene
 
 @dataclass(frozen=True)
 class Kept:
-    """What the safe input does to the plant."""
+    """The result of following the safe input."""
 
     seconds: float
-    """How long it was followed: to the end, or until it left X."""
+    """Seconds followed: until the end, or until the plant left X."""
     left: str
-    """The state or row that left X first, or why the motion could not be followed; "": it stayed."""
+    """The state or row that left X first, or the reason why the motion ended; "" if the plant stayed in X."""
 
 
 def under_safe_input(model: Model, step: Step, start: np.ndarray, seconds: float) -> Kept:
-    """The true motion from `start`, (d,), plant units, under the safe input and gain, renewed every period.
+    """Follow the true motion from `start`, (d,), plant units, under the safe input and gain, updated every period.
 
-    What is fed back acts a dead time later, in whole periods, and before it the safe input without its gain.
+    Feedback acts one dead time later, in whole periods. Until then the safe input acts without its gain.
     """
     plant, x = model.plant, np.array(start, dtype=float)
     coming = [plant.safe_input] * plant.dead_periods(model.period)

@@ -1,4 +1,4 @@
-"""CasADi functions called on numpy arrays that stay in place."""
+"""CasADi functions that are called on shared numpy arrays."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import numpy as np
 
 
 class Bound:
-    """A CasADi function called on arrays that stay where they are: no conversion, no allocation.
+    """A CasADi function bound to fixed numpy arrays, so that a call converts and allocates nothing.
 
-    `inputs[name]` and `outputs[name]` are Fortran-ordered numpy arrays shared with CasADi; write, call, read.
+    `inputs[name]` and `outputs[name]` are Fortran-ordered arrays shared with CasADi. Write the inputs, call the
+    object, and read the outputs.
     """
 
     def __init__(self, function: ca.Function):

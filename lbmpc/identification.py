@@ -1,17 +1,17 @@
-"""A, B and W from measured motion, by least squares:
+"""Identification of A, B and W from measured motion by least squares:
 
-    x+ = A x + B u + c,        x and u as deviations from a given point, c what is left there.
+    x+ = A x + B u + c,        x and u as deviations from a given point, c the offset at that point.
 
-Each row is fitted on its own, in half-widths per second. The samples are cut into blocks of time. What is said of the
-quality comes from fits without one block each: their residuals in that block are those of samples that the fit has not
-seen, and their scatter is the jackknife's standard error (Efron and Tibshirani, An Introduction to the Bootstrap,
-section 11). What a linear model leaves of a plant is no noise, though. It persists from sample to sample, comes back
-wherever the plant goes the same way, and is taken for an effect of whatever moved along with it: more samples do not
-mend that. So the part of a residual that persists, by its autocovariance at one sample, counts once and whole in every
-direction, beside how far the samples moved there.
+Each row is fitted separately, in half-widths per second. The samples are cut into blocks of time, and each block is
+left out of one fit. The residuals in that block show the quality on unseen samples. The scatter of the fits gives the
+jackknife's standard error (Efron and Tibshirani, An Introduction to the Bootstrap, section 11). The error of a linear
+model is not noise, however. It persists from sample to sample, recurs where the plant repeats its motion, and is
+attributed to variables that moved at the same time. More samples do not reduce it. The persistent part of a residual,
+found by its autocovariance at one sample, is therefore counted once and in full in every direction, relative to the
+motion of the samples in that direction.
 
-u may be fed back from x. Then A and B are separable only as far as u does more than a fixed linear feedback; where it
-does not, the samples are refused.
+u may be a feedback of x. A and B can then be separated only as far as u differs from a fixed linear feedback; otherwise
+the samples are rejected.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from functools import cached_property
 import numpy as np
 
 BLOCKS = 10
-"""Blocks of time: each fit has nine tenths of the samples."""
+"""Blocks of time. Each fit uses nine tenths of the samples."""
 SAMPLES_EACH = 10
-"""Samples at least for each number of a row."""
+"""Minimum number of samples per coefficient of a row."""
 EXCITED = 1e-3
-"""RMS motion at least, of a half-width, in every direction of (x, u)."""
+"""Minimum RMS motion in every direction of (x, u), in half-widths."""
 ABOVE_NOISE = 5.0
-"""What moves less than so many times its measuring noise has its effect underrated by 1 / 25 and more."""
+"""Minimum ratio of motion to measurement noise. Below it the effect is underestimated by 1 / 25 or more."""
 KNOWN = 0.1
-"""Half-widths to which one step from a half-width away must be known, as a standard error."""
+"""Half-widths. Largest standard error of one step that starts a half-width away."""
 MARGIN = 1.25
-"""Of W over the largest held-out residual: of n samples the next one exceeds the largest with a chance of 1 / n."""
+"""Ratio of W to the largest held-out residual. The next of n samples exceeds the largest with probability 1 / n."""
 ROUNDING = 1e-9
-"""Half-widths."""
+"""Half-widths. Smaller motion counts as rounding."""
 SHOWN = 0.05
-"""Share of the largest coefficient below which a sentence leaves a term out."""
+"""A term below this share of the largest coefficient is left out of a message."""
 
 
 class NotIdentifiable(ValueError):
-    """These samples do not say what A and B are; the text names every reason and what to record instead."""
+    """The samples do not determine A and B. The text lists every reason and says what to record instead."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variables:
-    """The names of d states and m inputs, their half-widths, and the point that deviations count from."""
+    """Names of d states and m inputs, their half-widths, and the point of reference for deviations."""
 
     states: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -61,18 +61,18 @@ class Variables:
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """Of (x, u), (d + m,)."""
+        """Half-widths of (x, u), (d + m,)."""
         return np.concatenate([self.x_scale, self.u_scale])
 
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """n pairs of samples that are one period apart, in the order of time, in the plant's units."""
+    """n pairs of samples one period apart, in order of time, in the plant's units."""
 
     x: np.ndarray
     """(n, d)."""
     u: np.ndarray
-    """(n, m): held from this sample to the next."""
+    """(n, m): the input held from this sample to the next."""
     after: np.ndarray
     """(n, d): the next sample."""
 
@@ -80,7 +80,7 @@ class Transitions:
         return len(self.x)
 
     def then(self, later: Transitions) -> Transitions:
-        """These and those of another stretch of time."""
+        """Return these transitions followed by those of another stretch of time."""
         joined = (
             np.vstack(pair) for pair in zip(*(vars(part).values() for part in (self, later)), strict=True)
         )
@@ -96,7 +96,7 @@ class Quality:
 
     @classmethod
     def of(cls, residuals: np.ndarray, x_scale: np.ndarray, period: float) -> Quality:
-        """residuals (n, d): what one step missed by, in the plant's units."""
+        """Compute the quality of residuals (n, d), the errors of one step in the plant's units."""
         rates = residuals / x_scale / period
         return cls(np.sqrt((rates**2).mean(axis=0)), np.abs(rates).max(axis=0))
 
@@ -105,14 +105,14 @@ class Quality:
 class Identified:
     """x+ = A x + B u + offset + h with |h| <= W T, in deviations and the plant's units.
 
-    `*_error`: standard errors, with what the linear model leaves out and may have been taken for an effect.
+    `*_error` are standard errors. They include the error of the linear model that may be mistaken for an effect.
     """
 
     period: float
     A: np.ndarray
     B: np.ndarray
     offset: np.ndarray
-    """(d,): h at the point that deviations count from."""
+    """(d,): h at the point of reference."""
     A_error: np.ndarray
     B_error: np.ndarray
     offset_error: np.ndarray
@@ -120,35 +120,35 @@ class Identified:
     """(d,) per second: `MARGIN` times the largest held-out residual, rounded up to two digits."""
     held_out: Quality
     nothing_changes: Quality
-    """Of the prediction x+ = x, for comparison."""
+    """Quality of the prediction x+ = x, for comparison."""
     excitation: np.ndarray
-    """(d + m,): RMS motion in the principal directions of (x, u), in half-widths, the least last."""
+    """(d + m,): RMS motion in the principal directions of (x, u), in half-widths, in descending order."""
     samples: int
 
 
 def identify(samples: Transitions, period: float, variables: Variables) -> Identified:
-    """The least-squares model of these samples.
+    """Fit the least-squares model.
 
     Args:
-        samples: of all stretches of time, in their order.
+        samples: the transitions of all stretches of time, in order.
         period: T in seconds.
-        variables: names for the messages, scales, and the point about which the model is written.
+        variables: names for the messages, scales, and the point of reference of the model.
 
     Raises:
-        NotIdentifiable: too few samples, or they do not move enough in some state, input or combination.
+        NotIdentifiable: there are too few samples, or a state, input or combination does not move enough.
     """
     d, scale = len(variables.states), variables.scale
     least = SAMPLES_EACH * (len(scale) + 1)
     if len(samples) < least:
         raise NotIdentifiable(
             f"{len(samples)} samples are too few: each row of the model has {len(scale) + 1} numbers "
-            f"({', '.join(variables.names)} and an offset), and {least} samples are the least for them"
+            f"({', '.join(variables.names)} and an offset) and needs at least {least} samples"
         )
     z = np.hstack([samples.x - variables.x_e, samples.u - variables.u_e]) / scale
     y = (samples.after - samples.x) / variables.x_scale / period
     middle = z.mean(axis=0)
     rms, directions = _principal(z - middle)
-    # About the middle of the samples: the offset there is known best, and shares no digits with the slopes.
+    # The offset is best known at the centre of the samples, where it is independent of the slopes.
     regressors = np.column_stack([z - middle, np.ones(len(z))])
     fit = _Blockwise(regressors, y)
     residual = y - regressors @ fit.whole
@@ -157,7 +157,7 @@ def identify(samples: Transitions, period: float, variables: Variables) -> Ident
     persistent = _persistent(residual)
 
     def error(of: Callable[[np.ndarray], np.ndarray], moved: np.ndarray) -> np.ndarray:
-        """Of a function of the coefficients, (n, d); moved (n,): what a share of 1 in the samples is in it."""
+        """Return the standard error of a function of the coefficients, (n, d); moved (n,): its factor on a residual."""
         return period * np.hypot(fit.error(of), np.outer(moved, persistent))
 
     _require_known(variables, rms, directions, error(lambda theta: directions @ theta[:-1], 1.0 / rms))
@@ -190,9 +190,9 @@ def identify(samples: Transitions, period: float, variables: Variables) -> Ident
 
 
 class _Blockwise:
-    """Least squares of y (n, d) on z (n, p), of all samples and without one block each.
+    """Least squares of y (n, d) on z (n, p), with all samples and with each block left out.
 
-    Each block is reduced to the triangular factor of (z, y), with which all these fits are exact and small.
+    Each block is reduced to the triangular factor of (z, y), which makes all fits exact and small.
     """
 
     def __init__(self, z: np.ndarray, y: np.ndarray):
@@ -205,32 +205,32 @@ class _Blockwise:
         self.held_out = np.vstack(missed)
 
     def error(self, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """The jackknife's standard error of what `of` makes of the coefficients (p, d)."""
+        """Return the jackknife's standard error of the function `of` of the coefficients (p, d)."""
         each = np.array([of(theta) for theta in self._without])
         return np.sqrt((BLOCKS - 1) / BLOCKS * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
 
 
 def _triangular(matrix: np.ndarray) -> np.ndarray:
-    """R of its QR factorisation."""
+    """Return R of the QR factorisation."""
     return np.asarray(np.linalg.qr(matrix, mode="r"))
 
 
 def _solved(factors: Sequence[np.ndarray], p: int) -> np.ndarray:
-    """(p, d). Of directions that did not move, nothing."""
+    """Return the coefficients, (p, d); zero in directions without motion."""
     stacked = np.vstack(factors)
     return np.linalg.lstsq(stacked[:, :p], stacked[:, p:], rcond=None)[0]
 
 
 def _persistent(residual: np.ndarray) -> np.ndarray:
-    """RMS of the part of residuals (n, d) that is still there a sample later, (d,); of white noise 0."""
+    """Return the RMS of the part of residuals (n, d) that persists over one sample, (d,); 0 for white noise."""
     n, power = len(residual), (residual**2).mean(axis=0)
     later = (residual[1:] * residual[:-1]).sum(axis=0) / n
-    # Two standard deviations of what it is for white noise.
+    # Subtract two standard deviations of the estimate for white noise.
     return np.sqrt(np.maximum(later - 2.0 / np.sqrt(n) * power, 0.0))
 
 
 def _principal(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """RMS motion in the principal directions, (p,), the least last, and the directions, one a row, (p, p)."""
+    """Return the RMS motion in the principal directions, (p,), descending, and the directions as rows, (p, p)."""
     _left, singular, directions = np.linalg.svd(_triangular(z))
     return singular / np.sqrt(len(z)), directions
 
@@ -238,7 +238,7 @@ def _principal(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _require_motion(
     variables: Variables, z: np.ndarray, rms: np.ndarray, directions: np.ndarray, noise: np.ndarray
 ) -> None:
-    """Raises `NotIdentifiable` where a variable or a combination does not move, or no more than its noise."""
+    """Raise `NotIdentifiable` if a variable or combination moves too little, or little more than its noise."""
     own = np.sqrt(((z - z.mean(axis=0)) ** 2).mean(axis=0))
     still = own < EXCITED
     found = [
@@ -254,22 +254,22 @@ def _require_motion(
         elif moved < ABOVE_NOISE * level:
             found.append(
                 f"{_combination(variables, direction)} moves by {_percent(moved)} of a half-width (RMS), and "
-                f"{_percent(level)} is what no model explains, as measuring noise is: what moves so little beside it "
-                "seems to have less effect than it has"
+                f"{_percent(level)} is not explained by any model, like measurement noise: the effect of such a small "
+                "motion is underestimated"
             )
     _refuse(found)
 
 
 def _require_known(variables: Variables, rms: np.ndarray, directions: np.ndarray, errors: np.ndarray) -> None:
-    """Raises `NotIdentifiable` where blocks of samples disagree; `errors` (d + m, d): of one step, half-widths."""
+    """Raise `NotIdentifiable` if blocks disagree; `errors` (d + m, d) are the errors of one step, half-widths."""
     found = []
     for moved, direction, error in zip(rms, directions, errors, strict=True):
         worst = int(error.argmax())
         if error[worst] > KNOWN:
             found.append(
-                f"what {_combination(variables, direction)} does to {variables.states[worst]} is known to "
-                f"±{error[worst]:.2g} half-widths a step only, from a half-width away ({KNOWN:g} at most): it moves by "
-                f"{_percent(moved)} (RMS), too little beside what a linear model leaves out"
+                f"the effect of {_combination(variables, direction)} on {variables.states[worst]} is known only to "
+                f"±{error[worst]:.2g} half-widths a step, from a half-width away ({KNOWN:g} at most): it moves by "
+                f"{_percent(moved)} (RMS), which is small compared with the error of a linear model"
             )
     _refuse(found)
 
@@ -278,14 +278,14 @@ def _refuse(found: list[str]) -> None:
     if found:
         remedy = (
             "Record motion that differs: from several x0, with other weights (controller.Q and R: another feedback), "
-            "or with a signal added to the input. Logs may be given together"
+            "or with a signal added to the input. Several logs can be given together"
         )
         listed = "".join(f"\n  - {one}" for one in found)
-        raise NotIdentifiable(f"the samples do not say what A and B are:{listed}\n{remedy}")
+        raise NotIdentifiable(f"the samples do not determine A and B:{listed}\n{remedy}")
 
 
 def _relation(variables: Variables, z: np.ndarray, direction: np.ndarray) -> str:
-    """What is always zero along the samples, as an equation for one variable; an input where there is one."""
+    """Return the constant relation of the samples as an equation for one variable, an input if it contains one."""
     d = len(variables.states)
     inputs = np.abs(direction[d:])
     fed_back = inputs.max() > SHOWN
@@ -303,14 +303,14 @@ def _relation(variables: Variables, z: np.ndarray, direction: np.ndarray) -> str
     equation = f"{variables.names[one]} = {right}, to {_percent(within)} of its half-width"
     if fed_back:
         return (
-            f"{equation}: the input is a linear function of what else is seen, as under one fixed feedback, so that "
-            "what the plant does by itself and what the input does cannot be told apart"
+            f"{equation}: the input is a linear function of the other variables, as under one fixed feedback, so the "
+            "effects of the plant's own motion and of the input cannot be separated"
         )
-    return f"{equation}: they move together only, so that their effects cannot be told apart"
+    return f"{equation}: they move only together, so their effects cannot be separated"
 
 
 def _combination(variables: Variables, direction: np.ndarray) -> str:
-    """A direction in half-widths, as "z - 0.4 u"."""
+    """Return a direction in half-widths as text, such as "z - 0.4 u"."""
     largest = int(np.abs(direction).argmax())
     shares = direction / direction[largest]
     terms = [
@@ -322,11 +322,11 @@ def _combination(variables: Variables, direction: np.ndarray) -> str:
 
 
 def _percent(share: float) -> str:
-    """With two digits; rounding is 0."""
+    """Format with two digits; rounding errors become 0."""
     return f"{100.0 * share:.2g} %" if share > ROUNDING else "0 %"
 
 
 def _rounded_up(values: np.ndarray) -> np.ndarray:
-    """To two digits, upwards; zeros stay."""
+    """Round up to two digits; zeros stay."""
     digit = 10.0 ** (np.floor(np.log10(np.maximum(values, 1e-300))) - 1.0)
     return np.where(values > 0.0, np.ceil(values / digit) * digit, 0.0)

@@ -1,6 +1,6 @@
-"""The nominal model: linearisation about the equilibrium, exact discretisation, feedback K and terminal cost P.
+"""The nominal model: linearisation at the equilibrium, exact discretisation, feedback K and terminal cost P.
 
-Everything from here on is in deviation coordinates: x - x_e and u - u_e.
+All quantities are deviations, x - x_e and u - u_e.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from lbmpc.pole_placement import place
 from lbmpc.terminal_cost import TOLERANCE, TerminalCost, shortfall, terminal_cost
 
 SAME_PERIOD = 1e-9
-"""How far apart, as a share, two periods are that are the same: one over a rate is rounded."""
+"""Relative difference below which two periods are equal, because 1 / rate is rounded."""
 LARGEST_GROWTH = 1e8
-"""Of a prediction over the horizon: of 16 digits half are left."""
+"""Largest growth of a prediction over the horizon. It leaves half of the 16 digits."""
 MOST_DEAD_PERIODS = 50
-"""Periods of dead time: over more a prediction says little, and each is remembered and predicted in every tick."""
+"""Largest dead time in periods. Each period is stored and predicted in every tick, and the error grows with it."""
 STABLE = 1e-9
-"""How far above 0 rounding may leave a growth a step."""
+"""A growth per step below this value is rounding."""
 
 
 class ModelError(ValueError):
-    """The plant and the chosen period give no usable model."""
+    """The plant and the period give no usable model."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """x+ = A x + B u + h(x, u) with everything known but h.
+    """The model x+ = A x + B u + h(x, u), in which only h is unknown.
 
     Shapes: A (d, d), B (d, m), K (m, d), P (d, d), Q (d, d), R (m, m), S (m, m).
     """
@@ -44,27 +44,27 @@ class Model:
     plant: Known
     period: float
     within: LinearMotion
-    """How it moves within a period."""
+    """The motion within a period."""
     A: np.ndarray
     B: np.ndarray
     Q: np.ndarray
-    """Weight of the states of one stage: its density times the period."""
+    """Weight of the states in one stage: the density times the period."""
     R: np.ndarray
-    """Weight of the inputs of one stage, likewise."""
+    """Weight of the inputs in one stage: the density times the period."""
     S: np.ndarray
-    """Weight of the change of the inputs from stage to stage: its density on (du/dt)^2 over the period."""
+    """Weight of the change of the inputs between stages: the density on (du/dt)^2 divided by the period."""
     K: np.ndarray
     """Feedback of the tubes and of the fallback."""
     P: np.ndarray
-    """Weight of the last state, as `lbmpc.terminal_cost` says."""
+    """Weight of the last state, see `lbmpc.terminal_cost`."""
     equations: Plant | None = None
-    """What `plant` is the linearisation of; None where nothing but numbers is known."""
+    """The equations that `plant` is the linearisation of; None for a plant given by numbers."""
 
     def require_equations(self, wanted_by: str) -> Plant:
-        """Raises `ModelError`: the plant is numbers alone."""
+        """Return the equations. Raises `ModelError` if the plant is given by numbers alone."""
         if self.equations is None:
             raise ModelError(
-                f"{wanted_by} needs the equations of {self.plant.name}, and of this plant there are numbers alone"
+                f"{wanted_by} needs the equations of {self.plant.name}, but this plant is given by numbers alone"
             )
         return self.equations
 
@@ -88,41 +88,41 @@ class Model:
 
     @cached_property
     def time_scale(self) -> float:
-        """Seconds in which the loop under K forgets: the slowest time constant of A + BK, to the nearest power of two.
+        """Slowest time constant of A + BK in seconds, rounded to a power of two.
 
-        What counts as much h for a plant of milliseconds is little for one of minutes. Rounded, it stays the same under
-        small changes of the weights.
+        It scales h: a value that is large for a plant with time constants of milliseconds is small for one of minutes.
+        Rounding keeps it constant under small changes of the weights.
         """
         slowest = max(float(np.abs(np.linalg.eigvals(self.closed_loop)).max()), 1e-300)
         return float(np.exp2(np.rint(np.log2(-self.period / math.log(slowest)))))
 
     @cached_property
     def cost_scale(self) -> float:
-        """What the cost is counted in: x'|P|x + u'Ru with every state and input at its half-width.
+        """The unit of the cost: x'|P|x + u'Ru with every state and input at its half-width.
 
-        That is a bound on the cost to go from anywhere in X, and one input at the end of its range.
+        It bounds the cost to go from anywhere in X, plus one input at the end of its range.
         """
         x, u = self.plant.x_scale, self.plant.u_scale
         return float(x @ np.abs(self.P) @ x + u @ self.R @ u)
 
     def label(self, x: np.ndarray, u: np.ndarray, x_next: np.ndarray, pieces: Pieces = ()) -> np.ndarray:
-        """h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), with the input that really was applied.
+        """Return h(x_t, u_t) = x_{t+1} - A x_t - B u_t, (d,), for the input that was applied.
 
-        Where several inputs acted within the period, `pieces` has them, and B u_t becomes what the linear model answers
-        to just these. Their mean would do for a slow input; for an actuator faster than the period it would book the
-        timing of the command as a disturbance.
+        If several inputs acted within the period, `pieces` lists them, and the linear model's response to them replaces
+        B u_t. The mean input is accurate enough for a slow plant. With an actuator faster than the period it would
+        count the timing of the command as a disturbance.
         """
         if not pieces:
             return x_next - self.step(x, u)
         return x_next - self.A.dot(x) - self.within.answer(pieces)
 
     def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """A x + B u, (d,)."""
-        # For so few numbers `dot` takes half as long as `@`.
+        """Return A x + B u, (d,)."""
+        # `dot` takes half the time of `@` on such small arrays.
         return self.A.dot(x) + self.B.dot(u)
 
     def ahead(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray:
-        """The linear model's state, (d,), `seconds` after x, (d,), under the input u, (m,), for use in every tick."""
+        """Return the linear model's state, (d,), `seconds` after x, (d,), under u, (m,). Fast enough for every tick."""
         return self.within.after(x, u, seconds)
 
 
@@ -134,22 +134,22 @@ def build_model(
     terminal: TerminalCost = "riccati",
     S: np.ndarray | None = None,
 ) -> Model:
-    """The model at a sampling period T.
+    """Build the model for a sampling period T.
 
-    K places the plant's own closed-loop poles, mapped by exp(p T), or is the LQR gain when it names none.
+    K places the plant's configured closed-loop poles, mapped by exp(p T). Without configured poles it is the LQR gain.
 
     Args:
         plant: numbers, or equations that are linearised.
         period: T in seconds.
-        Q, R: diagonals of the weights as densities, per second, (d,) and (m,); ones by default. A stage weighs T times
-            as much, so that the cost of a motion does not depend on how often it is sampled.
+        Q, R: diagonals of the weights as densities, per second, (d,) and (m,); ones by default. A stage has T times the
+            density, so that the cost of a motion does not depend on the sampling rate.
         terminal: the equation for P.
-        S: diagonal of the weight on (du/dt)^2, likewise, (m,); zeros by default. T ((u_i - u_{i-1}) / T)^2 is what a
-            stage has of it, so that a ramp costs the same however often it is sampled. P does not know of it.
+        S: diagonal of the weight on (du/dt)^2 as a density, (m,); zeros by default. A stage has
+            T ((u_i - u_{i-1}) / T)^2 of it, so that a ramp has the same cost at any sampling rate. P ignores S.
 
     Raises:
-        ModelError: the plant cannot be used as it is described, is not stabilisable, weights of the wrong length, or no
-            P that bounds what comes after the horizon.
+        ModelError: the plant is not usable as described, it is not stabilisable, weights have the wrong length, or no P
+            bounds the cost after the horizon.
     """
     try:
         require_model(plant)
@@ -158,8 +158,8 @@ def build_model(
     known = plant if isinstance(plant, Known) else plant.known()
     if known.dead_time > (MOST_DEAD_PERIODS + SAME_PERIOD) * period:
         raise ModelError(
-            f"{plant.name}: its dead time of {known.dead_time:g} s is {known.dead_time / period:.4g} periods, and "
-            f"{MOST_DEAD_PERIODS} is the most: take a rate of {MOST_DEAD_PERIODS / known.dead_time:.3g} Hz or less"
+            f"{plant.name}: its dead time of {known.dead_time:g} s is {known.dead_time / period:.4g} periods; at most "
+            f"{MOST_DEAD_PERIODS} are allowed: use a rate of {MOST_DEAD_PERIODS / known.dead_time:.3g} Hz or less"
         )
     units = balanced(known)
     A, B = _of_a_period(known, period, units)
@@ -176,13 +176,13 @@ def build_model(
 
 
 def _of_a_period(known: Known, period: float, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A and B over this period. Raises `ModelError`: they are those of another one."""
+    """Return A and B for this period. Raises `ModelError` if they are given for another one."""
     if known.period is None:
         return discretise(known.A, known.B, period, units)
     if not math.isclose(known.period, period, rel_tol=SAME_PERIOD):
         raise ModelError(
-            f"{known.name}: A and B are those of a period of {known.period:g} s, and the rate makes one of {period:g} "
-            f"s: take rate = {1 / known.period:.10g}, or give A and B in continuous time"
+            f"{known.name}: A and B are given for a period of {known.period:g} s, but the rate gives {period:g} "
+            f"s: set rate = {1 / known.period:.10g}, or give A and B in continuous time"
         )
     return known.A, known.B
 
@@ -197,7 +197,7 @@ def _gain_and_terminal_weight(
     r: np.ndarray,
     x: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """K and P of the model in the units x, (d,). Raises `ModelError`."""
+    """Return K and P in the units x, (d,). Raises `ModelError`."""
     try:
         if plant.poles is not None:
             k = place(a, b, [_real(np.exp(p * period)) for p in plant.poles])
@@ -226,10 +226,10 @@ def _terminal_weight(
     k: np.ndarray,
     scale: np.ndarray,
 ) -> np.ndarray:
-    """P of that name, of which it is certain that it bounds what comes after the horizon. Raises `ModelError`."""
+    """Return P of this kind after checking that it bounds the cost after the horizon. Raises `ModelError`."""
     where = f"{plant.name}: the terminal cost {kind!r} at a period of {period:g} s"
     remedy = (
-        f"take {'lyapunov' if kind == 'riccati' else 'riccati'!r} (controller.terminal), or a shorter period"
+        f"use {'lyapunov' if kind == 'riccati' else 'riccati'!r} (controller.terminal) or a shorter period"
     )
     try:
         p, k_f = terminal_cost(kind, a, b, q, r, k, period)
@@ -238,37 +238,37 @@ def _terminal_weight(
         raise ModelError(f"{where} has no solution: {error}; {remedy}") from error
     if not missing <= TOLERANCE:
         raise ModelError(
-            f"{where} does not bound what comes after the horizon: P - A_f'P A_f is smaller than Q + K_f'R K_f by "
+            f"{where} does not bound the cost after the horizon: P - A_f'P A_f is smaller than Q + K_f'R K_f by "
             f"{missing:.2g} of P; {remedy}"
         )
     return p
 
 
 def growth_rate(model: Model) -> float:
-    """Of the fastest mode, a step: the logarithm of the largest |eigenvalue| of A; at least 0."""
+    """Return the growth of the fastest mode per step, the logarithm of the largest |eigenvalue| of A; at least 0."""
     return math.log(max(float(np.abs(np.linalg.eigvals(model.A)).max()), 1.0))
 
 
 def longest_horizon(model: Model) -> int | None:
-    """Steps over which a prediction keeps half of its digits: it grows by `LARGEST_GROWTH` at most; None: any."""
+    """Return the horizon in steps over which a prediction grows by `LARGEST_GROWTH`; None if there is no limit."""
     rate = growth_rate(model)
     return int(math.log(LARGEST_GROWTH) / rate) if rate > STABLE else None
 
 
 def require_horizon(model: Model, horizon: int) -> None:
-    """Raises `ModelError` where the plant runs away so fast that a prediction of so many steps has no digits left."""
+    """Raise `ModelError` if predictions over the horizon grow so much that no digits are left."""
     rate, most = growth_rate(model), longest_horizon(model)
     if most is None or horizon <= most:
         return
     remedy = (
         f"at most {most} steps ({most * model.period:.3g} s)"
         if most
-        else "no horizon at this rate: sample faster"
+        else "no horizon at this rate; use a higher rate"
     )
     raise ModelError(
-        f"{model.plant.name} is unstable: over a horizon of {horizon} steps ({horizon * model.period:.3g} s) what is "
-        f"predicted grows by 10^{horizon * rate / math.log(10.0):.1f}, and above "
-        f"10^{math.log10(LARGEST_GROWTH):g} rounding decides. What makes sense: {remedy}"
+        f"{model.plant.name} is unstable: over a horizon of {horizon} steps ({horizon * model.period:.3g} s) a "
+        f"prediction grows by 10^{horizon * rate / math.log(10.0):.1f}, and above "
+        f"10^{math.log10(LARGEST_GROWTH):g} rounding dominates. Possible: {remedy}"
     )
 
 

@@ -1,10 +1,10 @@
-"""K from closed-loop poles, for one input: the method of Kautsky, Nichols and Van Dooren.
+"""K from closed-loop poles for one input, by the method of Kautsky, Nichols and Van Dooren.
 
     A + BK = X diag(p) X^-1,    X's column i spans the kernel of U1'(A - p_i I),    B = (U0 U1) (z; 0)
 
-With one input there is nothing to choose, and these lines are all of it. `scipy.signal.place_poles` does the same, to
-the last bit, and chooses where there are several inputs. But importing it takes 0.9 s, as long as everything else until
-the first tick of a controller that is started again (median of 15 processes each).
+With one input the solution is unique, and this code is complete. `scipy.signal.place_poles` gives exactly the same
+result and also covers several inputs. Its import takes 0.9 s, which is as long as the whole start of a controller up
+to its first tick (median of 15 processes each).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from scipy.linalg import qr
 
 
 def place(A: np.ndarray, B: np.ndarray, poles: Sequence[complex]) -> np.ndarray:
-    """K, (m, d), such that A + BK has these d eigenvalues; complex ones in conjugate pairs.
+    """Return K, (m, d), such that A + BK has these d eigenvalues; complex ones must be in conjugate pairs.
 
     Raises:
-        ValueError: too few or too many, not in pairs, repeated, or they cannot be placed.
+        ValueError: the number of poles is wrong, they are not in pairs or repeated, or they cannot be placed.
     """
     d, m = B.shape
     if m > 1 or d == 1:
-        # A second, which only such plants pay.
+        # This import takes a second and is needed for such plants only.
         from scipy.signal import place_poles
 
         return np.asarray(-place_poles(A, B, poles).gain_matrix)
     p = _ordered(poles, d)
     u, z = qr(B)
     u0, u1 = u[:, :1], u[:, 1:]
-    # Complex throughout, real poles too: the same roundings as scipy's.
+    # X is complex even for real poles, to have the same rounding as scipy.
     X = np.column_stack([_kernel(u1.T @ (A - pole * np.eye(d))) for pole in p]).astype(complex)
     try:
         closed = np.linalg.solve(X.T, np.diag(p) @ X.T).T
@@ -40,12 +40,12 @@ def place(A: np.ndarray, B: np.ndarray, poles: Sequence[complex]) -> np.ndarray:
 
 
 def _ordered(poles: Sequence[complex], d: int) -> np.ndarray:
-    """Real ones first, then pair by pair, (d,)."""
+    """Return the poles with real ones first, then the pairs, (d,)."""
     given = np.asarray(poles)
     if len(given) != d:
         raise ValueError(f"{len(given)} poles are given, {d} are needed: {_words(given)}")
     if len(set(given.tolist())) < d:
-        raise ValueError(f"with one input no pole may be there twice: {_words(given)}")
+        raise ValueError(f"with one input all poles must be different: {_words(given)}")
     pairs = [q for p in np.sort(given[np.imag(given) < 0]) if np.conj(p) in given for q in (p, np.conj(p))]
     ordered = np.hstack([np.sort(given[np.isreal(given)]), pairs])
     if len(ordered) != d:
@@ -54,7 +54,7 @@ def _ordered(poles: Sequence[complex], d: int) -> np.ndarray:
 
 
 def _kernel(rows: np.ndarray) -> np.ndarray:
-    """A vector of length 1, (d,), that these d - 1 rows map to zero."""
+    """Return a unit vector, (d,), in the kernel of these d - 1 rows."""
     q, _ = qr(rows.T)
     return np.conj(q[:, -1]) / np.linalg.norm(q[:, -1])
 

@@ -6,11 +6,11 @@
                     zbar_{i+1} = A zbar_i + B v_i,                      zbar_0 = x_t         (nominal trajectory)
                     v_i in V_i,   |v_i - v_{i-1}| <= rate T,   zbar_{i+1} in Z_{i+1}         i = 0 .. N-1
 
-in deviation coordinates. With the paper's c_i = v_i - K zbar_i each trajectory is steered by its own state, v_i =
-K zbar_i + c_i and u_i = K z_i + c_i: what h_hat moves z away from zbar by grows with A + BK, not with A, and zbar need
-not follow what h_hat asks of z (docs/decisions/0033). u_0 is v_0. Deciding in v and in c is the same, and v is far
-better conditioned. The constraints do not see the oracle: in v they are linear, with constant matrices. u_{-1} and
-v_{-1} are what acts now. By default S is 0 and the rate infinite: inputs may step.
+in deviation coordinates. With the paper's c_i = v_i - K zbar_i each trajectory has feedback of its own state, v_i =
+K zbar_i + c_i and u_i = K z_i + c_i. The deviation of z from zbar due to h_hat thus grows with A + BK, not with A, and
+zbar need not follow corrections that h_hat requires of z (docs/decisions/0033). u_0 equals v_0. Optimising over v and
+over c is equivalent, but v is better conditioned. The constraints do not depend on the oracle: in v they are linear
+with constant matrices. u_{-1} and v_{-1} are the present input. By default S is 0 and the rate is unlimited.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ Tightening = Literal["none", "first_step", "tube", "invariant"]
 class Problem:
     """(e:LBMPC) for one model, oracle and horizon.
 
-    `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty
-    `penalty` times the model's `cost_scale` per half-width of violation, unless a set guarantees that they can be kept.
-    Those of less importance give way first, `priorities`.
+    `states[i]` bounds zbar_{i+1} and `inputs[i]` bounds v_i. State rows are soft, with the exact penalty `penalty`
+    times the model's `cost_scale` per half-width of violation, unless a set guarantees feasibility. Rows of lower
+    importance are relaxed first, see `priorities`.
     """
 
     model: Model
@@ -52,21 +52,21 @@ class Problem:
     soft: bool
     penalty: float
     guard: Guard | None = None
-    """Bounds v_0 by a certified family of sets; None: nothing is certified."""
+    """Bounds v_0 by a certified family of sets; None without a certificate."""
 
     @cached_property
     def input_steps(self) -> np.ndarray:
-        """By how much an input may change from stage to stage, (m,); infinite where it may step."""
+        """Largest change of an input between stages, (m,); infinite without a rate limit."""
         return self.model.plant.input_rates * self.model.period
 
     @cached_property
     def priorities(self) -> tuple[int, ...]:
-        """Of the rows that all `states` share, in whose order they give way: 0 last."""
+        """Priorities of the rows that all `states` share; rows with 0 are relaxed last."""
         return (0,) * self.model.d + self.model.plant.state_rows.priorities
 
     @cached_property
     def looks_back(self) -> bool:
-        """Whether v_0 depends on the input before."""
+        """Whether v_0 depends on the previous input."""
         return bool(self.model.changes_cost or np.isfinite(self.input_steps).any())
 
 
@@ -79,20 +79,20 @@ def build_problem(
     penalty: float = 100.0,
     certificate: Certificate | None = None,
 ) -> Problem:
-    """Lay out the constraints of the named tightening; W (d,) as h of one period.
+    """Set up the constraints of a tightening. W (d,) is a bound of h over one period.
 
     * `none`: plain X and U.
-    * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows soft.
-    * `tube`: zbar_i in X - R_i, v_i in U - K R_i, zbar_N in Omega - R_N with Omega disturbance invariant; state rows
-      hard, since from every state where they can be met once they can be met for ever.
-    * `invariant`: v_0 bounded so that the next state stays in the sets of `certificate`, hard; later rows, and all rows
-      outside of the sets, as for `first_step`.
+    * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows are soft.
+    * `tube`: zbar_i in X - R_i, v_i in U - K R_i, zbar_N in Omega - R_N with Omega disturbance invariant. State rows
+      are hard, because a problem that is feasible once stays feasible.
+    * `invariant`: v_0 is bounded so that the next state stays in the sets of `certificate`, hard. Later rows, and all
+      rows outside the sets, are those of `first_step`.
 
     Raises:
-        ModelError: the plant runs away within the horizon.
-        EmptySetError: the tightening leaves nothing; names the step, the constraint and the margin.
+        ModelError: predictions grow too much over the horizon.
+        EmptySetError: a tightened set is empty. The text names the step, the constraint and the margin.
         CertificateError: `invariant` without a certificate, with that of another model, with a dead time or with rows
-            beside the boxes; `tube` with rows of inputs; either where an input has a rate limit.
+            besides the boxes; `tube` with rows of inputs; either of them with rate limits of inputs.
     """
     require_horizon(model, horizon)
     if tightening in ("tube", "invariant"):
@@ -102,12 +102,12 @@ def build_problem(
         require_certifiable(model)
         if certificate is None:
             raise CertificateError(
-                "the tightening `invariant` needs certified sets: tandem sets compute makes them"
+                "the tightening `invariant` needs certified sets; compute them with `tandem sets compute`"
             )
         require_match(certificate, model)
         if not certificate.certified:
             raise CertificateError(
-                f"these sets are an approximation ({certificate.kind}) that claims nothing"
+                f"these sets are an approximation ({certificate.kind}) and are not certified"
             )
         if certificate.source_of_W == "given":
             require_prediction(model)
@@ -130,25 +130,25 @@ def build_problem(
 
 
 def _require_steps(model: Model, tightening: Tightening) -> None:
-    """What these two claim, X for ever, they claim of inputs that may step. The actuator's rate is physics: it wins."""
+    """Raise `CertificateError` for rate limits or rows of inputs, which the guarantee of these tightenings excludes."""
     plant = model.plant
     if plant.input_rows.names and tightening == "tube":
         raise CertificateError(
-            "the tightening `tube` takes inputs in boxes, and there are rows of several "
-            f"({', '.join(plant.input_rows.names)}): leave these out, or take the tightening `first_step`"
+            "the tightening `tube` supports boxes of inputs only, but there are rows of inputs "
+            f"({', '.join(plant.input_rows.names)}): remove them, or use the tightening `first_step`"
         )
     if limited := [
         name for name, rate in zip(plant.inputs, plant.input_rates, strict=True) if np.isfinite(rate)
     ]:
         raise CertificateError(
-            f"the tightening `{tightening}` claims that X can be kept for ever, and its sets do not know of a limit on "
-            f"how fast {', '.join(limited)} may change: leave out plant.input_rate_max (u_rate_max of the plant), or "
-            "take the tightening `first_step`, which claims nothing"
+            f"the tightening `{tightening}` guarantees X for unlimited input rates, but there are rate limits for "
+            f"{', '.join(limited)}: remove plant.input_rate_max (u_rate_max of the plant), or "
+            "use the tightening `first_step`, which has no guarantee"
         )
 
 
 def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytope, n: int) -> Polytope:
-    """Omega - R_N together with X - R_N, as the rows of the last step."""
+    """Return the intersection of Omega - R_N and X - R_N as the rows of the last step."""
     omega = terminal_set(model, X, U, W)
     low, high = tube_margins(omega.F, model.closed_loop, W, n)
     omega = omega.minus(low[n], high[n])
@@ -160,7 +160,7 @@ def _terminal(model: Model, X: Polytope, U: Polytope, W: Polytope, last: Polytop
     )
     if both.interior_point(model.plant.x_scale) is None:
         raise EmptySetError(
-            f"the tightened set is empty at step {n}: the terminal set Omega - R_{n} holds nothing. "
-            f"A smaller W, another K or a shorter horizon would help."
+            f"the tightened set is empty at step {n}: the terminal set Omega - R_{n} is empty. "
+            f"A smaller W, another K or a shorter horizon may help."
         )
     return both

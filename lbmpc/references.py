@@ -1,6 +1,6 @@
-"""Where the outputs should be: piecewise linear in time, given while the loop runs, forgotten when its lease is over.
+"""References of the outputs: piecewise linear in time, changed while the loop runs, and limited by a lease.
 
-Pure, like everything in a step: time is counted in periods, so that a replay finds every value again.
+The module is pure. Time is counted in periods, so that a replay reproduces every value.
 """
 
 from __future__ import annotations
@@ -11,40 +11,40 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 FOR_EVER = -1
-"""Of a lease: none."""
+"""Value of a lease without end."""
 LONGEST = 2**53
-"""Periods that are counted at most: a number of 64 bits with a sign, and a float, hold them."""
+"""Largest count of periods, exact both as a signed 64-bit integer and as a float."""
 PREVIEWED = 5
-"""Knots of a horizon at most: each may take a search for its target."""
+"""Largest number of knots within a horizon. Each can need a search for its target."""
 AT_ONCE = np.zeros(1)
 ChangeKind = Literal["set", "hold", "configured"]
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Outputs and where they should be, deviations; p outputs, k knots."""
+    """Outputs and their desired values, in deviations; p outputs, k knots."""
 
     outputs: tuple[int, ...]
     """Indices of the states that are outputs."""
     times: np.ndarray
-    """(k,) seconds since it was given, in rising order; two that are equal are a step."""
+    """(k,) seconds since the reference was given, ascending. Two equal times are a step."""
     values: np.ndarray
-    """(k, p), linear in between; before the first knot and after the last one they stay."""
+    """(k, p), linear between the knots, and constant before the first and after the last."""
     passed: int = 0
     """Periods since it was given."""
     left: int = FOR_EVER
-    """Periods until it is forgotten."""
+    """Periods until the lease ends."""
     held: bool = False
-    """Whether the plant is held where it was."""
+    """Whether the plant is held at a state."""
     source: int = 0
-    """Of who gave it: to say it again renews the lease, and nothing else."""
+    """Sender of the reference. Repeating the same reference only renews the lease."""
 
     def at(self, seconds: float) -> np.ndarray:
-        """(p,) so many seconds after it was given."""
+        """Return the value, (p,), `seconds` after the reference was given."""
         return _at(self.times, self.values, seconds, int(self.times.searchsorted(seconds, "right")))
 
     def advanced(self, periods: int) -> Reference | None:
-        """So many periods later; None: its lease is over."""
+        """Return the reference `periods` later; None if its lease has ended."""
         if self.left != FOR_EVER and self.left <= periods:
             return None
         left = self.left if self.left == FOR_EVER else self.left - periods
@@ -60,10 +60,10 @@ class Reference:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], d: int) -> Reference:
-        """Of a plant with d states.
+        """Restore a reference of a plant with d states.
 
         Raises:
-            ValueError: an array is missing or there are more, or they fit no reference; the text names the array.
+            ValueError: an array is missing, unknown or not valid. The text is the name of the array.
         """
         expected = {"outputs": 1, "times": 1, "values": 2, "count": 1}
         for name in sorted(expected.keys() | arrays.keys()):
@@ -91,7 +91,7 @@ class Reference:
         return cls((*outputs.tolist(),), times, values, min(passed, LONGEST), left, bool(held), source)
 
     def repeats(self, change: Change) -> bool:
-        """Whether that is what was asked for, said again."""
+        """Return whether a change repeats this reference."""
         if change.source != self.source or self.held != (change.kind == "hold"):
             return False
         if self.held:
@@ -108,33 +108,33 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What somebody asks for. `configured` needs nothing else."""
+    """A requested change. `configured` needs no other field."""
 
     kind: ChangeKind
-    """hold: to where the plant is now."""
+    """`hold` holds the plant at its present state."""
     outputs: tuple[int, ...] = ()
     times: np.ndarray | None = None
-    """(k,) as of a `Reference`, from now on, none negative."""
+    """(k,) as in `Reference`, from now on, none negative."""
     values: np.ndarray | None = None
     """(k, p)"""
     lease: int = FOR_EVER
     """Periods."""
     source: int = 0
-    """Of who asks."""
+    """Sender of the request."""
 
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times and values, of `set`."""
+        """Times and values of `set`."""
         assert self.times is not None
         assert self.values is not None
         return self.times, self.values
 
 
 class Preview(NamedTuple):
-    """What a horizon of n steps sees of a reference."""
+    """The part of a reference within a horizon of n steps."""
 
     positions: np.ndarray
-    """(k,) steps from its beginning, 0 to n in rising order; (1,) where nothing changes."""
+    """(k,) steps from the start of the horizon, 0 to n, ascending; (1,) for a constant reference."""
     values: np.ndarray
     """(k, p)"""
 
@@ -147,15 +147,15 @@ def changed(
     aim: np.ndarray,
     own: tuple[int, ...],
 ) -> Reference | None:
-    """The reference from now on; None: the configured one.
+    """Return the reference from now on; None means the configured one.
 
     Args:
-        present: the one in force, the configured one included.
-        change: what is asked for. Its first knot later than now, it goes there from where the present reference is.
+        present: the reference in force, which may be the configured one.
+        change: the request. If its first knot lies in the future, the reference moves there from its present value.
         period: seconds.
-        x: where the plant is, (d,), deviations.
-        aim: where the present plan leads, (d,): where an output begins that has no reference yet.
-        own: the outputs that are held where the plant is.
+        x: present state, (d,), in deviations.
+        aim: target of the present plan, (d,), as start of outputs without a reference.
+        own: the outputs that `hold` applies to.
     """
     if change.kind == "configured":
         return None
@@ -174,9 +174,9 @@ def changed(
 
 
 def preview(reference: Reference, ahead: float, period: float, n: int) -> Preview:
-    """What the horizon sees that begins `ahead` seconds from now.
+    """Return the part of a reference within a horizon that begins `ahead` seconds from now.
 
-    Of more knots than `PREVIEWED` the first ones and the end are left.
+    If there are more knots than `PREVIEWED`, the first ones and the end are kept.
     """
     begin = reference.passed * period + ahead
     end = begin + n * period
@@ -193,7 +193,7 @@ def preview(reference: Reference, ahead: float, period: float, n: int) -> Previe
 
 
 def _at(times: np.ndarray, values: np.ndarray, t: float, after: int) -> np.ndarray:
-    """(p,) at t, which is between the knots after - 1 and after."""
+    """Return the value, (p,), at t, which lies between the knots after - 1 and after."""
     if not 0 < after < len(times):
         return values[0] if after == 0 else values[-1]
     share = (t - times[after - 1]) / (times[after] - times[after - 1])
@@ -201,7 +201,7 @@ def _at(times: np.ndarray, values: np.ndarray, t: float, after: int) -> np.ndarr
 
 
 def between(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(a, p): the piecewise linear function of knots times (k,), values (k, p), at (a,); at a step what follows it."""
+    """Interpolate knots times (k,), values (k, p) at (a,); the result is (a, p). At a step the later value is used."""
     after = times.searchsorted(at, "right")
     first, last = np.maximum(after - 1, 0), np.minimum(after, len(times) - 1)
     length = times[last] - times[first]

@@ -1,16 +1,16 @@
-"""The rest that a plan aims at: the target selector of offset-free MPC, with what was learned.
+"""Target selection of offset-free MPC with the learned model: the rest that a plan leads to.
 
     min over x, u   |C x - r|^2 + SECOND (|x|_Q^2 + |u|_R^2)
     subject to      (A - I) x + B u + h_hat(x, u) = v,   x in Z,   u in V
 
-in deviation coordinates, everything in half-widths. Q and R are those of the cost, Z and V the tightened X and U of the
-problem. So the outputs C x come first: they meet r where the learned model has such a rest, and are as near as they can
-be where it has none. Of all rests that do as well the target costs least about the equilibrium, and without outputs it
-costs least of all rests (Muske and Rawlings 1993; Pannocchia and Rawlings 2003). v is 0, but on the way of a reference
-that moves: there it is how far the rest moves in a period, so that a plant at the target moves on with it.
+in deviation coordinates, in half-widths. Q and R are those of the cost, Z and V the tightened X and U of the problem.
+The outputs C x have precedence: they equal r if the learned model has such a rest, and are as near as possible
+otherwise. Among all equally good rests the target has the least cost about the equilibrium; without outputs it has the
+least cost of all rests (Muske and Rawlings 1993; Pannocchia and Rawlings 2003). v is 0 except for a moving reference.
+There it is the motion of the rest per period, so that a plant at the target moves with it.
 
-A few Newton steps from the last target solve it, always as many at most, and never by the clock. Each is an equality
-constrained least-squares problem; where its solution is outside the rows, a QP with as many variables as inputs.
+A few Newton steps from the last target solve the problem, limited by number and never by time. Each step is an equality
+constrained least-squares problem. If its solution violates the rows, a QP with as many variables as inputs follows.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from lbmpc.sets.geometry.polytope import row_ranges
 from lbmpc.solver.least_distance import Penalty, least_distance, violation
 
 STEPS = 5
-"""Newton steps in one search at most. The next search goes on from where this one ends."""
+"""Largest number of Newton steps per search. The next search continues from the result."""
 ARRIVED = 1e-5
-"""Half-widths: a step that is shorter leaves an error of its square."""
+"""Half-widths. The error after a shorter step is the square of its length."""
 INSIDE = 1e-6
-"""Of a row's range: how far outside Z or V a rest may be, as far as a QP's tolerance lets it."""
+"""Share of a row's range by which a rest may be outside Z or V, because of a QP's tolerance."""
 REACHED = 1e-4
-"""Half-widths: outputs that are so near to r count as there."""
+"""Half-widths. Outputs this close to r count as reached."""
 SECOND = 1e-8
-"""Weight of the cost beside that of the outputs: small enough to move them by less than anybody sees."""
+"""Weight of the cost relative to that of the outputs. It moves the outputs by a negligible amount."""
 LEAST = 1e-6
-"""Of the largest weight: what a state or input counts at least, so that there is one nearest rest."""
+"""Smallest weight of a state or input relative to the largest, so that the nearest rest is unique."""
 SOLVED = 1e-6
-"""What linear equations in half-widths may be off by; more, and they have no solution."""
+"""Largest error of a solution of linear equations in half-widths."""
 PENALTY = 1e6
-"""Of the rows, so that there is a solution of the QP where no rest is inside."""
+"""Penalty on the rows, so that the QP is feasible even if no rest is inside."""
 
 TargetStatus = Literal["reached", "nearest", "no rest"]
-"""nearest: a rest, but not where the outputs are at r; no rest: none was found inside Z and V."""
+"""`nearest`: a rest whose outputs differ from r. `no rest`: none was found inside Z and V."""
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyState:
-    """A target, in deviation coordinates, inside the plant's X and U whatever its status."""
+    """A target in deviation coordinates. It is inside the plant's X and U for any status."""
 
     xu: np.ndarray
     """x_s, then u_s, (d + m,)."""
@@ -66,11 +66,11 @@ class SteadyState:
 
 
 class TargetSelector:
-    """Finds targets of one problem, for one parameter theta of its oracle and one reference after another.
+    """Finds targets of one problem for varying parameters theta of its oracle and varying references.
 
     Args:
-        problem: its model, oracle, cost, X and U.
-        realise: what turns a CasADi function into the one that is called.
+        problem: provides model, oracle, cost, X and U.
+        realise: turns a CasADi function into the function that is called.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class TargetSelector:
         low, high = np.concatenate([plant.x_min, plant.u_min]), np.concatenate([plant.x_max, plant.u_max])
         equilibrium = np.concatenate([plant.x_e, plant.u_e])
         self._low, self._high = (low - equilibrium) / self._scale, (high - equilibrium) / self._scale
-        # Built at the first search: a controller without a reference does not need it.
+        # Built at the first search, because a controller without a reference does not need it.
         self._function: Bound | None = None
         self._chosen: tuple[int, ...] | None = None
         self._per_weight = np.zeros(0)
@@ -123,16 +123,17 @@ class TargetSelector:
         r: np.ndarray,
         v: np.ndarray | float = 0.0,
     ) -> SteadyState:
-        """The target under the oracle's parameters theta.
+        """Return the target for the oracle's parameters theta.
 
-        Never raises for numbers; where they cannot be used it is the equilibrium, with the status `no rest`.
+        The method never raises because of its numbers. If they cannot be used, the result is the equilibrium with the
+        status `no rest`.
 
         Args:
-            theta: the oracle's.
+            theta: the oracle's parameters.
             start: x and u of the last target, (d + m,).
-            outputs: indices of the states that are outputs, p; more than there are inputs meet their r in part.
-            r: where they should be, (p,), deviations.
-            v: how far x moves there in a period, (d,).
+            outputs: indices of the p output states. If there are more outputs than inputs, they match r in part.
+            r: desired outputs, (p,), in deviations.
+            v: motion of x at the target per period, (d,).
         """
         w, rests = start / self._scale, False
         chosen = list(outputs)
@@ -155,7 +156,7 @@ class TargetSelector:
         return SteadyState(w * self._scale, status, distance, outputs, r)
 
     def _weigh(self, outputs: tuple[int, ...]) -> None:
-        """Weights of x and u for these outputs."""
+        """Set the weights of x and u for these outputs."""
         if outputs == self._chosen:
             return
         weights = self._weights.copy()
@@ -166,11 +167,11 @@ class TargetSelector:
         self._per_weight, self._chosen = 1.0 / np.sqrt(weights), outputs
 
     def _step(self, w: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """One Newton step from w, (d + m,), in half-widths.
+        """Take one Newton step from w, (d + m,), in half-widths.
 
         Returns:
-            Where it leads, inside the plant's X and U; how far that is, infinite where the numbers are unusable; how
-            far from Z and V that is.
+            The result, clipped to the plant's X and U; the length of the step, infinite if the numbers are not usable;
+            the distance from Z and V.
         """
         newton = self._newton
         newton.inputs["w"][:, 0] = w
@@ -180,7 +181,7 @@ class TargetSelector:
             return np.zeros_like(w), np.inf, np.inf
         if outside <= INSIDE:
             return newton.outputs["inside"][:, 0].copy(), moved, outside
-        # free + moves q costs |q|^2 / 2 more, along the rests as they are linearised.
+        # free + moves q increases the cost by |q|^2 / 2 along the linearised rests.
         with np.errstate(all="ignore"):
             free, d = newton.outputs["free"][:, 0], len(newton.outputs["rests"])
             basis = np.linalg.qr((newton.outputs["rests"] * self._per_weight).T, mode="complete")[0][:, d:]
@@ -203,11 +204,11 @@ def newton_step(
     theta: ca.MX,
     v: ca.MX,
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """One Newton step from w, (d + m,), in units of `scale`, (d + m,).
+    """Build one Newton step from w, (d + m,), in units of `scale`, (d + m,).
 
     Returns:
         w+, which minimises w'diag(weights) w / 2 - wanted'w on the rests of the model linearised at w; the Jacobian of
-        these rests, (d, d + m); how far w+ is from a solution, NaN where it is none.
+        these rests, (d, d + m); the residual of w+, NaN if it is no solution.
     """
     model, d = problem.model, problem.model.d
     linear = ca.DM(np.hstack([model.A - np.eye(d), model.B]))
@@ -217,13 +218,13 @@ def newton_step(
     matrix = ca.vertcat(ca.horzcat(ca.diag(weights), rests.T), ca.horzcat(rests, ca.DM.zeros(d, d)))
     matrix, right = ca.densify(matrix), ca.densify(ca.vertcat(wanted, rests @ w - motion))
     solution = ca.solve(matrix, right, "qr")
-    # A sum of squares, since a largest one of CasADi overlooks what is no number.
+    # Use a sum of squares, because CasADi's maximum ignores NaN.
     wrong = ca.norm_2(matrix @ solution - right) / (1.0 + ca.norm_2(right))
     return solution[: len(scale)], rests, wrong
 
 
 def _h_at_rest(oracle: Oracle, xu: ca.MX, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
-    """h_hat (d,) and its slopes (d, d + m) at (x, u) where that was the pair before as well, and all before it."""
+    """Return h_hat (d,) and its slopes (d, d + m) at (x, u), with all earlier pairs equal to (x, u)."""
     d, before = oracle.d, oracle.pairs - 1
     point, parts = ca.vertcat(xu[:d], *[xu] * before, xu[d:]), oracle.split(theta)
     (jacobian,) = oracle.jacobians(point, parts)
@@ -234,9 +235,9 @@ def _h_at_rest(oracle: Oracle, xu: ca.MX, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
 
 
 def _rows(problem: Problem, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of (x, u) in units of `scale`, (rows, d + m), and their bounds: the first step's, and the last one's.
+    """Return the rows of the first and last step for (x, u) in units of `scale`, (rows, d + m), and their bounds.
 
-    Of the steps between, a tightening to a tube is no thicker than at the end, and any other is plain X and U.
+    The steps between need no rows: a tube is thickest at the end, and any other tightening is plain X and U there.
     """
     first, last, inputs = problem.states[0], problem.states[-1], problem.inputs[-1]
     parts = [first] if last is first else [first, last]

@@ -1,17 +1,17 @@
-"""The terminal cost |z_N|_P^2 of (e:LBMPC): which P, and whether it bounds what comes after the horizon.
+"""The terminal cost |z_N|_P^2 of (e:LBMPC): the choice of P, and the check that it bounds the cost after the horizon.
 
-With the stage weights Q and R of one period T, P is named:
+With the stage weights Q and R of one period T, the choices of P are:
 
     riccati      P = A'PA - A'PB (R + B'PB)^-1 B'PA + Q         the least cost of the nominal model without bounds
     lyapunov     P = (A + BK)'P(A + BK) + Q + K'RK              the nominal cost of v = K x
     published    riccati of (A + BK, B) with Q / T and R / T    the reimplementation of Aswani et al. (2013), where the
                                                                 terminal cost is not multiplied by T
 
-The theory asks of each that some gain K_f pays for every further stage out of P:
+The theory requires a gain K_f such that P decreases by at least the cost of each further stage:
 
     P - A_f'P A_f >= Q + K_f'R K_f,    A_f = A + B K_f.
 
-For `lyapunov` that gain is K. For the others it is the LQR gain of P, K_f = -(R + B'PB)^-1 B'PA, which loses least.
+For `lyapunov` that gain is K. For the others it is the LQR gain of P, K_f = -(R + B'PB)^-1 B'PA, the best choice.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 TerminalCost = Literal["riccati", "lyapunov", "published"]
 TOLERANCE = 1e-6
-"""What the condition may miss by for rounding, as a share of P, in units of the half-widths."""
+"""Rounding error of the condition that is accepted, as a share of P, in units of the half-widths."""
 
 
 def terminal_cost(
@@ -35,17 +35,17 @@ def terminal_cost(
     K: np.ndarray,
     period: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """P (d, d), symmetric, and the gain K_f (m, d) that belongs to it.
+    """Return P (d, d), symmetric, and its gain K_f (m, d).
 
     Args:
         kind: the equation for P, as above.
-        A, B: of the discrete-time model, (d, d) and (d, m).
+        A, B: matrices of the discrete-time model, (d, d) and (d, m).
         Q, R: stage weights, (d, d) and (m, m).
         K: feedback with A + BK Schur stable, (m, d).
         period: T in seconds.
 
     Raises:
-        numpy.linalg.LinAlgError: the equation has no solution in these numbers.
+        numpy.linalg.LinAlgError: the equation has no solution for these numbers.
     """
     if kind == "lyapunov":
         P = solve_discrete_lyapunov((A + B @ K).T, Q + K.T @ R @ K)
@@ -66,9 +66,9 @@ def shortfall(
     R: np.ndarray,
     scale: np.ndarray,
 ) -> float:
-    """By how much P misses the condition, or being positive, as a share of itself; `scale` (d,): units of x.
+    """Return the relative violation of the condition and of P >= 0 by P; `scale` (d,) are the units of x.
 
-    At most `TOLERANCE` where only rounding is missing.
+    Up to `TOLERANCE` the violation counts as rounding.
     """
     A_f, units = A + B @ K_f, np.outer(scale, scale)
     decrease = P - A_f.T @ P @ A_f - Q - K_f.T @ R @ K_f

@@ -1,1 +1,1 @@
-"""What a network is: its operations, architectures, description and hash. Imports nothing else of Tandem."""
+"""Networks: operations, architectures, descriptions and hashes. This package imports nothing else of Tandem."""

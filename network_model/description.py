@@ -1,11 +1,11 @@
-"""The network's description: all that the trainer's torch network and the controller's CasADi network share.
+"""The network's description, which the trainer's torch network and the controller's CasADi network share.
 
     h_hat(x, u) = output_scale * K' phi(x, u),        phi = (1, psi_L[W_{L-1}' (1, psi_{L-1}[ ... ])])
 
-(e:NN_structure) of the paper. The input is (x, u) in deviation coordinates divided by `input_scale`, or a window of
-the last k such pairs. Every weight matrix carries its bias as its first row, and every layer's activations carry a
-leading 1, the output layer's included. How the hidden layers act on the window is their architecture, a file of
-`network_model/architectures`. The last hidden activation is bounded, so phi is: |phi|^2 <= 1 + n_L = sigma^2.
+Equation (e:NN_structure) of the paper. The input is (x, u) in deviation coordinates divided by `input_scale`, or a
+window of the last k such pairs. The first row of every weight matrix is its bias. The activations of every layer
+carry a leading 1, including those of the last. The architecture (a file of `network_model/architectures`) says how
+the hidden layers act on the window. The last hidden activation is bounded, so |phi|^2 <= 1 + n_L = sigma^2.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ Length = Annotated[int, msgspec.Meta(ge=1, le=128)]
 Window = Annotated[int, msgspec.Meta(ge=1, le=64)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 LAYERS = 32
-"""Hidden layers at most: a description comes from elsewhere, and memory is taken by it."""
+"""Maximum number of hidden layers. A description may come from another machine, and its layers take memory."""
 
 
 class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sizes, activations and scaling of one network. Two processes agree when their `sha256` agree."""
+    """Sizes, activations and scaling of one network. Two processes agree when the `sha256` of theirs are equal."""
 
     states: Length
     inputs: Length
@@ -47,17 +47,17 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     activations: list[Activation]
     """One for each hidden layer; the last must be bounded."""
     input_scale: list[Positive]
-    """Units of (x, u) that count as 1: half-widths of X and U."""
+    """Units of (x, u) that count as 1: the half-widths of X and U."""
     output_scale: list[Positive]
-    """Units of h that count as 1, one for each state."""
+    """Units of h that count as 1, one per state."""
     max_layer_norm: Positive = 100.0
     """Largest Frobenius norm of a hidden layer that a controller accepts."""
     architecture: str = "mlp"
-    """A file of `network_model/architectures`, or the name of a stranger's, with the hash of its file's text."""
+    """Name of a file of `network_model/architectures`, or of a user's file together with the hash of its text."""
     window: Window = 1
-    """k, the pairs (x, u) that the network sees: the present one and k - 1 before it."""
+    """k, the number of pairs (x, u) that the network sees: the present one and the k - 1 before it."""
     options: dict[str, int] = {}
-    """The architecture's own settings, all of them."""
+    """All options of the architecture, by name."""
 
     def __post_init__(self) -> None:
         if not self.hidden:
@@ -66,7 +66,7 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
             raise ValueError(f"{len(self.hidden)} hidden layers but {len(self.activations)} activations")
         if self.activations[-1] not in BOUNDED:
             raise ValueError(
-                f"the last activation, {self.activations[-1]}, is unbounded; use one of {', '.join(BOUNDED)}"
+                f"the last activation, {self.activations[-1]}, is not bounded; use one of {', '.join(BOUNDED)}"
             )
         if len(self.input_scale) != self.states + self.inputs:
             raise ValueError(
@@ -88,12 +88,12 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     @property
     def sizes(self) -> Sizes:
-        """What an architecture needs to know."""
+        """The sizes that the architecture works with."""
         return Sizes(self.pair, self.window, tuple(self.hidden), tuple(self.activations), self.options)
 
     @property
     def layer_shapes(self) -> list[tuple[int, int]]:
-        """Shapes of the hidden weights, the bias of each as its first row; for an mlp (1 + n_{i-1}, n_i)."""
+        """Shapes of the hidden weights, each with its bias as first row; (1 + n_{i-1}, n_i) for an mlp."""
         return get_architecture(self.architecture).shapes(self.sizes)
 
     @property
@@ -102,12 +102,12 @@ class NetworkDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         return 1 + get_architecture(self.architecture).outputs(self.sizes)
 
     def sha256(self) -> str:
-        """Of all fields."""
+        """Return the SHA-256 of all fields, in hexadecimal."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()
 
 
 def initial_hidden(description: NetworkDescription, rng: np.random.Generator) -> list[np.ndarray]:
-    """Random hidden layers, float32 values as they travel: Glorot-uniform weights, zero biases."""
+    """Return random hidden layers in float32 precision: Glorot-uniform weights, zero biases."""
     layers = []
     for rows, columns in description.layer_shapes:
         limit = np.sqrt(6.0 / (rows - 1 + columns))
@@ -118,7 +118,7 @@ def initial_hidden(description: NetworkDescription, rng: np.random.Generator) ->
 
 
 def hash_layers(layers: list[np.ndarray]) -> str:
-    """sha256 over the layers as little-endian float32, row-major, shapes included."""
+    """Return the SHA-256 of the layers as little-endian float32, row-major, with their shapes."""
     digest = hashlib.sha256()
     for layer in layers:
         digest.update(repr(tuple(layer.shape)).encode())
@@ -127,7 +127,7 @@ def hash_layers(layers: list[np.ndarray]) -> str:
 
 
 def why_unacceptable(description: NetworkDescription, layers: list[np.ndarray]) -> str | None:
-    """The first reason why these hidden layers must not be used, or None when they may."""
+    """Return the first reason to reject these hidden layers, or None if they are acceptable."""
     shapes = [tuple(layer.shape) for layer in layers]
     if shapes != description.layer_shapes:
         return f"shapes {shapes}, expected {description.layer_shapes}"

@@ -1,1 +1,1 @@
-"""What every process shares: configuration, bus, inbox, pacing, real-time priority, health."""
+"""Code that all processes share: configuration, bus, inbox, pacing, real-time priority, health."""

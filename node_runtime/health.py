@@ -1,4 +1,4 @@
-"""Tell the others how this process is: `Health` twice a second and at every change, `RunInfo` every 5 s."""
+"""Publishes the state of a process: `Health` twice a second and at every change, `RunInfo` every 5 s."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from protocol.messages import Health, ProcessStatus, RunInfo
 HEALTH_PERIOD = 0.5
 RUN_INFO_EVERY = 10
 MAX_RATE = 600.0
-"""Publishers a second, at most, of one `HealthThread`: a thousand then speak within the two seconds after which a view
-calls one silent."""
+"""Largest rate of publications of one `HealthThread`, per second. A thousand publishers then publish within two
+seconds, after which a view shows a process as silent."""
 
 
 class HealthThread:
-    """One thread that lets publishers speak, one after the other; a context manager.
+    """One thread that lets several publishers publish in turn; a context manager.
 
-    Each comes twice a second, or, where there are more than three hundred, as often as `MAX_RATE` allows.
+    Each publishes twice a second, or as often as `MAX_RATE` allows if there are more than three hundred.
     """
 
     def __init__(self) -> None:
@@ -33,12 +33,12 @@ class HealthThread:
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
     def add(self, publisher: HealthPublisher) -> None:
-        """From now on `publisher` speaks."""
+        """Start publishing for `publisher`."""
         with self._lock:
             self._publishers.append(publisher)
 
     def remove(self, publisher: HealthPublisher) -> None:
-        """From now on it does not."""
+        """Stop publishing for `publisher`."""
         with self._lock:
             self._publishers.remove(publisher)
 
@@ -56,7 +56,7 @@ class HealthThread:
             with self._lock:
                 among = len(self._publishers)
                 if among:
-                    # With the lock held, so that none speaks after it was removed.
+                    # The lock is held, so that no publisher publishes after its removal.
                     self._publishers[turn % among].publish_turn()
                 turn += 1
             if self._end.wait(max(HEALTH_PERIOD / max(1, among), 1.0 / MAX_RATE)):
@@ -64,7 +64,7 @@ class HealthThread:
 
 
 class HealthPublisher:
-    """Publishes how one process is, from a thread of its own or one that others use too. A context manager.
+    """Publishes the state of one process, from a thread of its own or a shared one. A context manager.
 
     Any thread may call `set`.
     """
@@ -77,9 +77,14 @@ class HealthPublisher:
         note: str = "",
         thread: HealthThread | None = None,
     ):
-        """`counters`: the process's own figures, added to the bus's. `note`: stands before all others.
+        """Create a publisher.
 
-        thread: that lets it speak; None: one of its own.
+        Args:
+            bus: the bus.
+            info: the constant facts about the process.
+            counters: returns the process's own counters, which are added to the bus's.
+            note: a text that precedes all notes.
+            thread: a shared thread; None for one of its own.
         """
         self._thread = thread or HealthThread()
         self._shared = thread is not None
@@ -94,7 +99,7 @@ class HealthPublisher:
         self._lock = threading.Lock()
 
     def set(self, status: ProcessStatus, note: str = "") -> None:
-        """Change the status or the note, and publish it if it is a change."""
+        """Set status and note, and publish them if they changed."""
         with self._lock:
             changed = (status, note) != (self._status, self._note)
             self._status, self._note = status, note
@@ -115,11 +120,11 @@ class HealthPublisher:
                 note=readable("; ".join(filter(None, (self._standing_note, self._note)))),
             )
             self._seq += 1
-            # Inside the lock, so that the order on the wire is the order of seq.
+            # Publish inside the lock, so that messages are sent in the order of seq.
             self._bus.publish(topics.HEALTH[self._bus.process], health)
 
     def publish_turn(self) -> None:
-        """Say how this process is, and now and then what it is."""
+        """Publish `Health`, and `RunInfo` every `RUN_INFO_EVERY` turns."""
         if self._turns % RUN_INFO_EVERY == 0:
             info = msgspec.structs.replace(self._info, seq=self._turns // RUN_INFO_EVERY)
             self._bus.publish(topics.RUN_INFO[self._bus.process], info)

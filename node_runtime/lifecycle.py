@@ -1,4 +1,4 @@
-"""Begin and end of a process: run ids, signals, exit codes."""
+"""Start and end of a process: run ids, signals, exit codes."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ log = logging.getLogger(__name__)
 EXIT_MISCONFIGURED = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# Ctrl-C reaches a whole process group, and a supervisor may repeat it at once: still one wish to stop.
+# Ctrl-C reaches a whole process group, and a supervisor may repeat it at once. Both count as one signal.
 REPEATED_SIGNAL_S = 1.0
 
 
 def new_run_id(process: str) -> str:
-    """A fresh name for this incarnation of `process`."""
+    """Return a new id for this incarnation of `process`."""
     return f"{process}-{uuid.uuid4().hex[:12]}"
 
 
 def run_process(body: Callable[[threading.Event], int], stop: threading.Event | None = None) -> int:
-    """Run `body` until it ends, with an event that signals set; its exit code.
+    """Run `body` with an event that is set by signals, and return its exit code.
 
-    `stop`: as for `stopped_by_signals`. 2 for a `ConfigError`, 0 when told to stop before there was a router.
+    `stop` is that of `stopped_by_signals`. The result is 2 after a `ConfigError`, and 0 if the process was told to stop
+    before there was a router.
     """
     with stopped_by_signals(stop) as stopping:
         try:
@@ -47,9 +48,9 @@ def run_process(body: Callable[[threading.Event], int], stop: threading.Event | 
 
 @contextmanager
 def stopped_by_signals(stop: threading.Event | None = None) -> Iterator[threading.Event]:
-    """Let SIGINT and SIGTERM set the event that is yielded. A signal a second later ends the process at once.
+    """Let SIGINT and SIGTERM set the yielded event. Another signal more than a second later ends the process at once.
 
-    Outside the main thread signals are left alone: there the owner of `stop` sets it.
+    Outside the main thread signals are not handled, and the owner of `stop` sets the event.
     """
     event = stop or threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -60,7 +61,7 @@ def stopped_by_signals(stop: threading.Event | None = None) -> Iterator[threadin
     def handle(number: int, _frame: FrameType | None) -> None:
         if not first:
             first.append(clock.now())
-            # Event.set from a handler could wait for a lock that the interrupted code holds.
+            # Event.set in a handler could wait for a lock that the interrupted code holds.
             threading.Thread(target=event.set, name="stop", daemon=True).start()
         elif clock.now() - first[0] > REPEATED_SIGNAL_S:
             signal.signal(number, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Folders whose content is believed, because nobody but this user can have written it."""
+"""Checks of folders whose contents are trusted because only this user can write them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from node_runtime.whole_file import KINDS
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, for this user alone, whatever the umask.
+    """Create a folder, and its missing parents, for this user alone, whatever the umask is.
 
     Raises:
-        OSError: one of them cannot be made.
+        OSError: a folder cannot be created.
     """
     for path in (*reversed(folder.parents), folder):
         if not path.is_dir():
@@ -22,11 +22,11 @@ def make_private(folder: Path) -> None:
 
 
 def why_not_private(folder: Path) -> str | None:
-    """Why others may have written what is in a folder, and what to do; None where only this user can have.
+    """Return why others may have written to a folder, and what to do; None if only this user can.
 
-    The folder itself must be this user's, no link, and writable by nobody else. Of the folders above it, none may
-    belong to a third user or be open to all: he could put another folder in its place. In a folder like /tmp, whose
-    sticky bit forbids that, it may lie. Raises `OSError`: the folder is not there.
+    The folder must belong to this user, must not be a link, and must not be writable by others. No folder above it may
+    belong to a third user or be writable by all, because that user could replace the folder. A folder with a sticky
+    bit, such as /tmp, is allowed above it. Raises `OSError` if the folder does not exist.
     """
     reason = why_not_ours(folder, folder.lstat())
     if reason is not None:
@@ -36,12 +36,12 @@ def why_not_private(folder: Path) -> str | None:
         if status.st_uid not in (0, os.geteuid()):
             return f"{folder} lies below {above}, which belongs to {_user(status.st_uid)}"
         if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
-            return f"{folder} lies below {above}, which everybody can write"
+            return f"{folder} lies below {above}, which all users can write to"
     return None
 
 
 def why_not_ours(path: Path, status: os.stat_result) -> str | None:
-    """Why others may have written a file or folder, by what `lstat` says of it; None where they cannot."""
+    """Return why others may have written a file or folder, given its `lstat`; None if they cannot have."""
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         return f"{path} is {KINDS.get(stat.S_IFMT(status.st_mode), 'something else')}"
     if status.st_uid != os.geteuid():

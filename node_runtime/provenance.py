@@ -1,4 +1,4 @@
-"""What a process runs on and with: of a log's messages, and of figures that were measured."""
+"""Versions and hardware of a process, for a log's messages and for measured results."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from node_runtime.config.sections import Config
 from protocol.messages import RunInfo
 
 SCIENCE = ("tandem-control", "numpy", "scipy", "casadi", "daqp")
-"""What a controller's numbers depend on."""
+"""Packages that influence a controller's numbers."""
 CONTROLLER = (*SCIENCE, "msgspec", "eclipse-zenoh")
-"""What a controller process consists of."""
+"""Packages of a controller process."""
 PACKAGES = (*CONTROLLER, "torch", "mcap")
 
 
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
-    """Of Python, and of those of `packages` that are installed here."""
+    """Return the versions of Python and of the installed packages among `packages`."""
     return {"python": platform.python_version(), **{p: _version(p) for p in packages if _version(p)}}
 
 
 @cache
 def _version(package: str) -> str:
-    # Takes milliseconds to read, and a trainer of many plants has one `RunInfo` for each.
+    # Reading takes milliseconds, and a trainer of many plants creates one `RunInfo` for each.
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -48,10 +48,16 @@ def run_info(
     facts: Mapping[str, str] | None = None,
     unix_time: float | None = None,
 ) -> RunInfo:
-    """What a log needs to know about a process.
+    """Return the facts about a process that a log needs.
 
-    units: of its signals, by name. packages: whose versions it says. facts: what it runs with besides, said before
-    the versions. unix_time: when it began; None: now.
+    Args:
+        config: the configuration.
+        process: the role.
+        run_id: the incarnation.
+        units: units of its signals, by name.
+        packages: packages whose versions are included.
+        facts: further facts, which precede the versions.
+        unix_time: start of the process; None for now.
     """
     found = versions(packages)
     return RunInfo(
@@ -67,7 +73,7 @@ def run_info(
 
 
 def describe() -> dict[str, str]:
-    """The processor, how many of its cores this process may use, and the system; no names of hosts."""
+    """Return the processor, the number of cores available to this process, and the system, without host names."""
     cores = len(os.sched_getaffinity(0))
     return {
         "processor": _processor(),
@@ -77,9 +83,9 @@ def describe() -> dict[str, str]:
 
 
 def arithmetic() -> dict[str, str]:
-    """What rounds on this machine, beside compiled functions: its processor, and the kernels that its BLAS chose."""
+    """Return what determines rounding besides compiled functions: the processor and the kernels of its BLAS."""
     found = [library for library in threadpoolctl.threadpool_info() if library["user_api"] == "blas"]
-    # Torch may bring its own, which no controller uses.
+    # Torch may bring a BLAS of its own, which no controller uses.
     ours = [library for library in found if re.search(r"[/\\](numpy|scipy)\b", library["filepath"])] or found
     kernels = {
         f"{library['internal_api']} {library['version']} {library.get('architecture', '')}"
@@ -89,7 +95,7 @@ def arithmetic() -> dict[str, str]:
 
 
 def load() -> float:
-    """Processes that wanted a core in the last minute, on average: above the number of cores, times are too long."""
+    """Return the load average of the last minute. Above the number of cores, measured times are too long."""
     return os.getloadavg()[0]
 
 

@@ -1,4 +1,4 @@
-"""What arrived and must not be obeyed: counted by topic and reason, named once in the log."""
+"""Rejected messages: counted by topic and reason, and logged once per kind."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from node_runtime.printable import printable
 
 log = logging.getLogger(__name__)
 
-# A hostile sender must not fill the memory with reasons; the counters travel in every Health message.
+# A hostile sender must not fill the memory with reasons, and the counters are part of every Health message.
 MAX_KINDS = 200
 
 
 class RejectedMessages:
-    """Counts per (topic, reason); the first of each is logged with its detail, the rest are only counted."""
+    """Counts per (topic, reason). The first message of each kind is logged with its detail."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
         self._lock = threading.Lock()
 
     def count(self, topic: str, reason: str, detail: str = "") -> bool:
-        """Count one message; whether it is the first of its kind.
+        """Count one message; return whether it is the first of its kind.
 
-        `reason` is one of a few fixed texts; `detail` is only logged, for a person.
+        `reason` is one of a few fixed texts. `detail` is only logged.
         """
         key = f"bad {topic}: {reason}"
         with self._lock:
@@ -37,12 +37,12 @@ class RejectedMessages:
         return seen == 0
 
     def counters(self) -> dict[str, int]:
-        """Keys like "bad plant/state: not finite"."""
+        """Return the counters by keys such as "bad plant/state: not finite"."""
         with self._lock:
             return dict(self._counts)
 
     @property
     def total(self) -> int:
-        """Bad messages of every kind so far."""
+        """Number of rejected messages of every kind."""
         with self._lock:
             return sum(self._counts.values())

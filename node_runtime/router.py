@@ -1,7 +1,7 @@
-"""`tandem router`: the Zenoh router that all nodes are clients of.
+"""`tandem router`: the Zenoh router that all processes connect to.
 
-It listens on `bus.endpoint`, and on `bus.remote` for other machines, where every client needs a certificate and may do
-what its role may (`protocol.rights`).
+It listens on `bus.endpoint`, and on `bus.remote` for other machines. There every client needs a certificate and has the
+rights of its role (`protocol.rights`).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from protocol import topics
 log = logging.getLogger(__name__)
 
 RECEIVING_THREADS = 32
-"""Of Zenoh, for all links together. It closes the link of a client that has vanished with SO_LINGER, and the thread
-that does waits in it for up to 10 s (eclipse-zenoh/zenoh #1101, #2718). A client has two links and Zenoh two threads:
-a trainer whose link was cut stopped every state and command for that long, as soon as its lease was over."""
+"""Number of Zenoh's receiving threads for all links. Zenoh closes the link of a vanished client with SO_LINGER, and the
+closing thread then waits up to 10 s (eclipse-zenoh/zenoh #1101, #2718). A client has two links and Zenoh two threads by
+default, so the cut links of one trainer would stop all states and commands for that time after its lease."""
 
 
 _CAUSES = {
     "in use": (
-        "{place} is taken: another router may be running, or another program has the port (`ss -ltnp` names it). "
+        "{place} is in use: another router may be running, or another program uses the port (`ss -ltnp` shows it). "
         "Stop it, or set bus.endpoint or bus.remote to another port."
     ),
     "Permission denied": (
@@ -46,31 +46,31 @@ _CAUSES = {
     ),
     "Cannot assign requested address": (
         "the router cannot listen on {place}: this machine does not have that address. "
-        "Write one that it has; 0.0.0.0 stands for all of them."
+        "Use an address of this machine, or 0.0.0.0 for all of them."
     ),
     "lookup address information": (
-        "the router cannot listen on {place}: the name is not known here. Write an address of this machine."
+        "the router cannot listen on {place}: the name is not known here. Use an address of this machine."
     ),
     "invalid port value": "{place}: a port is a number from 1 to 65535.",
 }
-"""By what Zenoh says: what it means for a person."""
+"""Messages for a person, by the words in Zenoh's text."""
 
 
 class RouterError(RuntimeError):
-    """The router cannot listen; the text says where and what to do."""
+    """The router cannot listen. The text says where and what to do."""
 
 
 def open_router(config: Config) -> zenoh.Session:
-    """A Zenoh session in router mode, listening on `config.bus.endpoint` and `bus.remote`; a context manager.
+    """Open a Zenoh session in router mode at `config.bus.endpoint` and `bus.remote`; it is a context manager.
 
     Raises:
         RouterError: it cannot listen there.
-        ConfigError: an endpoint is none, or the router's certificate cannot be used.
+        ConfigError: an endpoint is not valid, or the router's certificate cannot be used.
     """
     bus = config.bus
     if bus.remote and not secure(bus.remote):
         raise ConfigError(
-            f"bus.remote = {bus.remote!r}: other machines come in with certificates only; write tls/HOST:PORT"
+            f"bus.remote = {bus.remote!r}: other machines need certificates; write tls/HOST:PORT"
         )
     settings = None
     if remote(config):
@@ -86,23 +86,23 @@ def open_router(config: Config) -> zenoh.Session:
 
 
 def _why_not_listening(said: str, endpoint: str, other: str | None) -> str:
-    """The plain cause and what to do, from what Zenoh said of the first endpoint that failed."""
+    """Return the cause and the remedy, given Zenoh's text about the first endpoint that failed."""
     failed = [place for place in (endpoint, other) if place and place.partition("/")[2] in said]
     place = failed[0] if len(failed) == 1 else " or ".join(filter(None, (endpoint, other)))
     for words, text in _CAUSES.items():
         if words in said:
             return text.format(place=place)
-    # Where in Zenoh's sources it was said helps nobody.
+    # The position in Zenoh's sources is removed, because it does not help the reader.
     return f"the router cannot listen on {place}: {re.sub(r' at /[^ ]*[.]rs:[0-9]+[.]?', '', said)}"
 
 
 def remote(config: Config) -> bool:
-    """Whether the router of this configuration listens where certificates are needed."""
+    """Return whether the router of this configuration listens at an endpoint with certificates."""
     return bool(config.bus.remote) or secure(config.bus.endpoint)
 
 
 def open_to_all(endpoint: str) -> bool:
-    """Whether this is a plain endpoint that may be reached from elsewhere: none of loopback."""
+    """Return whether this is a plain endpoint that other machines may reach, that is, not a loopback address."""
     protocol, _, place = endpoint.partition("/")
     host = place.rpartition(":")[0].strip("[]")
     if protocol != "tcp" or host == "localhost":
@@ -114,14 +114,14 @@ def open_to_all(endpoint: str) -> bool:
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem router`: route until told to stop. 0; 1 when the endpoint is taken; 2 when it cannot be used."""
-    # Read when the first session opens, and nowhere else to be said.
+    """Run the router until it is told to stop. Return 0; 1 if the endpoint is in use; 2 if it is not usable."""
+    # Zenoh reads this variable when the first session opens; there is no other way to set it.
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
     if open_to_all(config.bus.endpoint) and not config.bus.insecure:
         log.warning(
-            "%s is neither encrypted nor authenticated: whoever reaches it may command the plant. Let it listen on "
-            "127.0.0.1, and on bus.remote for other machines, with certificates that `tandem keys create` makes; "
-            "bus.insecure=true says that it is meant",
+            "%s is neither encrypted nor authenticated: anyone who can reach it may command the plant. Listen on "
+            "127.0.0.1, and on bus.remote for other machines, with certificates from `tandem keys create`; "
+            "set bus.insecure=true if this is intended",
             config.bus.endpoint,
         )
     return run_process(lambda stopping: _route(config, stopping), stop)
@@ -129,13 +129,13 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
 
 def _route(config: Config, stopping: threading.Event) -> int:
     bad = RejectedMessages()
-    # Every state and every command passes through here, so the router must be as punctual as the loops.
+    # Every state and command passes through the router, so it must be as punctual as the loops.
     with (
         punctual(config.realtime.priority, keep_awake=config.awake) as note,
         contextlib.ExitStack() as while_listening,
     ):
         if remote(config):
-            # At a thousand ticks a second a line of log for each message would cost more than the messages.
+            # At a thousand ticks a second, a log line per message would cost more than the messages.
             fast = config.rate > topics.BATCH_ABOVE_HZ
             filters = zenoh_log.REFUSED if fast else zenoh_log.DENIED
             while_listening.enter_context(zenoh_log.counting_refusals(bad, filters))
@@ -146,8 +146,8 @@ def _route(config: Config, stopping: threading.Event) -> int:
             return 1
         log.info("router listening on %s", config.bus.endpoint)
         if config.bus.remote:
-            log.info("and for other machines, with certificates, on %s", config.bus.remote)
-        # Its health travels like everybody else's, through a client of itself.
+            log.info("router listening for other machines, with certificates, on %s", config.bus.remote)
+        # The router's health is published through a client of the router itself.
         run_id = new_run_id("router")
         info = run_info(config, "router", run_id)
         with (

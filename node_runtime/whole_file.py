@@ -1,7 +1,7 @@
-"""Files that are whole at every moment: written under another name beside, then renamed.
+"""Files that are complete at every moment: written under another name in the same folder, then renamed.
 
-Only regular files are read, replaced or moved. A name may be given to anything: a device that is replaced is lost to
-the whole machine, and a pipe that is opened waits for somebody at its other end.
+Only regular files are read, replaced or moved. A device that is replaced is lost to the whole machine, and opening a
+pipe waits for its other end.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ KINDS = {
 
 
 def require_regular(path: Path) -> None:
-    """Before a file is replaced or moved: raises `OSError` where a folder, link, device or pipe has that name.
+    """Raise `OSError` if the name belongs to a folder, link, device or pipe. Call it before replacing or moving a file.
 
-    The text for a person is in `strerror`. Where there is nothing, nothing is raised.
+    `strerror` is a text for a person. A missing file is accepted.
     """
     try:
         _require(path, os.lstat(path).st_mode)
@@ -37,10 +37,10 @@ def require_regular(path: Path) -> None:
 
 @contextmanager
 def open_regular(path: Path) -> Iterator[IO[bytes]]:
-    """A file to be read; a link to a file is followed.
+    """Open a regular file for reading. A link to a file is followed.
 
     Raises:
-        OSError: it cannot be opened, or is no regular file. It never waits for one who writes into a pipe.
+        OSError: it cannot be opened or is not a regular file. The call never waits for the writer of a pipe.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -53,7 +53,7 @@ def open_regular(path: Path) -> Iterator[IO[bytes]]:
 
 
 def read_regular(path: Path, limit: int = -1) -> bytes:
-    """The content of a file, at most `limit` bytes of it; raises as `open_regular`."""
+    """Return the content of a file, at most `limit` bytes; raises as `open_regular` does."""
     with open_regular(path) as file:
         return file.read(limit)
 
@@ -62,29 +62,29 @@ def _require(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         what = KINDS.get(stat.S_IFMT(mode), "something else")
         raise OSError(
-            errno.EINVAL, f"it is {what}, and only a regular file is read, replaced or moved", str(path)
+            errno.EINVAL, f"it is {what}, but only regular files are read, replaced or moved", str(path)
         )
 
 
 def write_whole(path: Path, content: bytes, mode: int = 0o644, durable: bool = False) -> None:
-    """Write a file so that who reads it at any moment finds the old one or the new one, whole.
+    """Write a file so that a reader at any moment finds either the old or the new content, complete.
 
-    Two processes may write the same file. One that is killed meanwhile leaves `.NAME.PID.new` behind, which nobody
-    reads.
+    Two processes may write the same file. A process that is killed meanwhile leaves `.NAME.PID.new` behind, which is
+    never read.
 
     Args:
-        path: the file; folders above it that are missing are made.
-        content: all of it.
-        mode: its permissions from the first byte on, less what the umask takes.
-        durable: a crash of the machine leaves the old one or the new one too. Waits for the disk.
+        path: the file; missing folders above it are created.
+        content: the whole content.
+        mode: permissions from the first byte on, reduced by the umask.
+        durable: True waits for the disk, so that a crash of the machine leaves the old or the new file too.
 
     Raises:
-        OSError: it cannot be written, or something else than a regular file has that name. The old file stays.
+        OSError: it cannot be written, or the name belongs to something other than a regular file. The old file stays.
     """
     require_regular(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(f".{path.name}.{os.getpid()}.new")
-    # Never into a file that is there already, with whatever permissions.
+    # Never write into an existing file, whose permissions may differ.
     new.unlink(missing_ok=True)
     try:
         with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

@@ -1,4 +1,4 @@
-"""The process at the plant: a gateway around two functions of a machine's, and the simulated plant that is one such."""
+"""The process at the plant: a gateway around a machine's two functions, and the simulated plant as such a machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Gateway"]
 
 
 def __getattr__(name: str) -> Any:
-    """What is exported, imported where it is used: lock-step needs no bus."""
+    """Import an exported name on first use, because lock-step needs no bus."""
     if name != "Gateway":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from plant_sim.gateway import Gateway

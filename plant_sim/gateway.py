@@ -1,6 +1,6 @@
-"""A machine on the bus: two functions of its own, and around them all that a controller expects of a plant.
+"""The gateway: connects a machine to the bus by two functions, and provides all that a controller expects of a plant.
 
-The whole of it, for a compressor:
+The complete program for a compressor:
 
     import numpy as np
     from plant_sim import Gateway
@@ -49,9 +49,9 @@ log = logging.getLogger(__name__)
 LATE = 0.2
 """Share of a period after which a sample counts as late."""
 STRETCH = 0.01
-"""Share of a period."""
+"""Share of a period before the next sample in which the loop sleeps instead of waiting for messages."""
 LONGEST_WAIT_S = 0.1
-"""How soon the loop notices that it is told to stop."""
+"""Longest wait of the loop, after which it notices a request to stop."""
 NOTES: dict[InputSource, str] = {
     "hold": "held at x0 until the first command",
     "command": "",
@@ -63,21 +63,21 @@ BEFORE_COMMANDS = "safe input until the first command"
 
 
 class Gateway:
-    """A plant as controllers know one, made of two functions.
+    """A plant on the bus, made of two functions.
 
-    At every sampling time the state is read and published. A command acts from its arrival; one that is foreign, stale
-    or of another period is refused and counted. While none comes the backup policy acts, then the plan, then the safe
-    input (`plant_sim.shield`). Before the first command, and in the end, it is the safe input. Before all of them goes
-    what a person commands by hand, while the plant stays in X (`plant_sim.hand`).
+    At every sampling time the state is read and published. A command acts from its arrival. A command from a foreign
+    sender, a stale one, or one for another period is refused and counted. Without commands the backup policy acts,
+    then the plan, then the safe input (`plant_sim.shield`). The safe input also acts before the first command and at
+    the end. An input that a person commands by hand has precedence while the plant stays in X (`plant_sim.hand`).
 
     Args:
-        known: what is known of the plant: its dimensions, bounds and safe input. None: what `config` names.
-        config: the resolved configuration, or the file that has it.
-        simulated: the two functions are a simulation's. It stands still until the first `write`, and each call counts
-            as made when it was `due`, not when a busy computer got to it.
+        known: the description of the plant: dimensions, bounds and safe input. None for the plant named by `config`.
+        config: the resolved configuration, or its file.
+        simulated: True if the functions are a simulation's. It stands still until the first `write`, and each call
+            counts as made at its `due` time, even if a busy computer made it later.
 
     Raises:
-        ConfigError: a configuration that is wrong or does not fit the plant.
+        ConfigError: the configuration is wrong or does not fit the plant.
     """
 
     def __init__(self, known: Known | Plant | None, config: Config | Path | str, *, simulated: bool = False):
@@ -89,37 +89,37 @@ class Gateway:
 
     @property
     def due(self) -> float:
-        """For which moment the call under way is made, seconds on the monotonic clock."""
+        """The time for which the present call is made, in seconds on the monotonic clock."""
         return 0.0 if self._serving is None else self._serving[1].due
 
     def new_epoch(self) -> None:
-        """The next sample does not follow from the last: the origin is another, or the state was set by hand.
+        """Declare that the next sample does not follow from the last: a new origin, or a state that was set by hand.
 
-        It says that nothing is known of what acted before it, so that nobody learns from it. Of older samples no
-        command is obeyed any more, and of the plan and the backup policy nothing is followed. `read` calls this, before
-        it returns the first such state. Any thread may, but a sample from before the leap may then come between.
+        The next sample then reports its past input as unknown, so that nothing is learned from it. Commands that answer
+        older samples are refused, and the plan and the backup policy are dropped. Call this in `read`, before it
+        returns the first new state. Another thread may call it too, but an old sample may then follow the call.
         """
         if self._serving is not None:
             self._serving[0].jump()
 
     def serve(self, read: Read, write: Write, stop: threading.Event | None = None) -> None:
-        """Be the plant until `stop` is set or a signal ends the process; waits for the router first.
+        """Serve as the plant until `stop` is set or a signal ends the process. Waits for the router first.
 
-        Both functions are called from this thread, never at the same time. What they raise is counted, logged and told
-        in health, and the loop goes on: a state that could not be measured is not published, an input that could not be
-        written counts as unknown. Between samples `read` is called for the backup policy and the safe input where these
-        depend on the state.
+        Both functions are called from this thread, one at a time. Their exceptions are counted, logged and reported in
+        health, and the loop goes on: a state that could not be measured is not published, and an input that could not
+        be written counts as unknown. `read` is also called between samples if the backup policy or the safe input
+        depends on the state.
 
         Args:
-            read: the state, (d,), plant units, as it is now. With an estimator NaN may stand for states of which no
-                number comes, as of a sensor that is dead.
-            write: lets an input, (m,), act from now on; always within the bounds. Called for every command, also where
-                the input is the same, and at least every two periods, for a watchdog of the machine's own.
-            stop: outside the main thread, where no signal arrives, the only way to end it.
+            read: returns the present state, (d,), in plant units. With an estimator, NaN is allowed for states whose
+                sensor gives no number.
+            write: applies an input, (m,), from now on; it is always within the bounds. It is called for every command,
+                even if the input is the same, and at least every two periods, so that it can serve a watchdog.
+            stop: the only way to end the loop outside the main thread, where signals do not arrive.
 
         Raises:
-            ConfigError: a core that this process may not use, or certificates that are none.
-            PlantError: raised by one of the two: the machine cannot go on.
+            ConfigError: this process may not use the configured core, or its certificate is not valid.
+            PlantError: raised by one of the functions if the machine cannot go on.
         """
         config, run_id = self.config, new_run_id("plant")
         place = core_for(config, "plant", os.sched_getaffinity(0))
@@ -128,12 +128,12 @@ class Gateway:
         gaps = config.estimator.kind != "none"
         machine = Guarded(read, write, self.known.d, config.period, self._simulated, gaps)
         self._serving = shield, machine
-        # Until there is a router, too.
+        # Write the safe input also while there is no router.
         _leave_safe(shield, machine)
         with (
             stopped_by_signals(stop) as stopping,
             punctual(config.realtime.priority, keep_awake=config.awake) as note,
-            _left_at_once(),
+            _interruptible(),
             Bus(config, "plant", run_id, stopping) as bus,
         ):
             loop = _Loop(shield, machine, bus, self._simulated)
@@ -147,15 +147,15 @@ class Gateway:
 
 
 def _leave_safe(shield: Shield, machine: Guarded) -> None:
-    # Of a machine that is lost nothing is to be made safe.
+    # The input does not matter if the machine is lost.
     with suppress(PlantError):
         if (u := shield.rest()) is not None:
             machine.write(u, clock.now())
 
 
 @contextmanager
-def _left_at_once() -> Iterator[None]:
-    """Told to stop before there was a router."""
+def _interruptible() -> Iterator[None]:
+    """Accept a request to stop before there was a router."""
     try:
         yield
     except OpenInterrupted as interrupted:
@@ -163,7 +163,7 @@ def _left_at_once() -> Iterator[None]:
 
 
 class _Loop:
-    """Samples on an absolute grid; between them, commands as they arrive and what else is due."""
+    """Takes samples on an absolute grid; between them, applies commands as they arrive and inputs as they are due."""
 
     def __init__(self, shield: Shield, machine: Guarded, bus: Bus, simulated: bool):
         self._shield, self._machine, self._bus, self._simulated = shield, machine, bus, simulated
@@ -179,23 +179,23 @@ class _Loop:
         self._health: HealthPublisher | None = None
 
     def run(self, health: HealthPublisher, stop: threading.Event) -> None:
-        """Until `stop` is set. Raises `PlantError`."""
+        """Run until `stop` is set. Raises `PlantError`."""
         self._health = health
         garbage = GarbageCollection.at(self._period)
         garbage.begin()
-        pacer = Pacer(Grid(self._period, clock.now() + self._period), stop, partial(self._obey_until, stop))
+        pacer = Pacer(Grid(self._period, clock.now() + self._period), stop, partial(self._act_until, stop))
         while (turn := pacer.next()) is not None:
             self._sample(*turn)
-            self._say()
+            self._report()
             garbage.idle()
 
     def figures(self) -> dict[str, int]:
-        """For health, whose thread goes on where the loop waits for a call that does not return."""
+        """Return the counters for health, whose thread also runs while the loop waits for a call that hangs."""
         if self._machine.hangs:
-            self._say()
+            self._report()
         return self._counts | self._machine.counts
 
-    def _say(self) -> None:
+    def _report(self) -> None:
         if self._health is None:
             return
         moving, trouble = self._shield.moving, self._machine.trouble()
@@ -208,9 +208,9 @@ class _Loop:
         status: ProcessStatus = "failed" if trouble else "running" if moving else "ready"
         self._health.set(status, "; ".join(filter(None, (trouble, note))))
 
-    def _obey_until(self, stop: threading.Event, time: float) -> bool:
-        """Let act what arrives and what is due, until `time`; False when told to stop."""
-        # The last stretch is slept through: that is more punctual, and what comes in it acts right after the sample.
+    def _act_until(self, stop: threading.Event, time: float) -> bool:
+        """Apply messages and due inputs until `time`; return False if told to stop."""
+        # The loop sleeps before the sample, which is more punctual. Messages of that time act right after the sample.
         rest = time - STRETCH * self._period
         while not stop.is_set():
             self._take_orders()
@@ -222,7 +222,7 @@ class _Loop:
                 return True
             wait = min(rest - now, max(0.0, self._shield.due - now), LONGEST_WAIT_S)
             with self._arrived:
-                # For policies too: read at the slot, they would make its sample late.
+                # Read policies now too. Reading them at the slot would delay its sample.
                 self._arrived.wait_for(lambda: self._commands or self._backups, wait)
         return False
 
@@ -230,7 +230,7 @@ class _Loop:
         if self._simulated:
             self._shield.advance(t, self._machine)
         elif self._shield.due <= t:
-            # After a standstill only what acts now: a real machine needs no burst of what should have been.
+            # After a delay apply only the present input. A real machine must not get a burst of past inputs.
             self._shield.act(t, self._machine)
 
     def _sample(self, slot: Slot, lateness: float) -> None:

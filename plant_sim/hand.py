@@ -1,9 +1,10 @@
-"""A hand on the switch: an input that a person commands, while they say so and the plant stays in X. No clock, no I/O.
+"""Manual override: an input that a person commands, valid while it is renewed and the plant stays in X. No clock, no
+I/O.
 
-The messages of one sender are one intention. Its message number 0 begins it and takes over from whoever's was there,
-those behind it renew it or give another input. It ends when it says so itself, when another begins, when the lease of
-its last message is over, when the state is another one (a new origin), and where the plant would leave X. What ended
-does not come back: a renewal that arrives too late is refused, also by a gateway that was started again meanwhile.
+The messages of one sender are one intention. Message number 0 starts it and replaces any earlier intention; later
+messages renew it or change the input. It ends when its sender ends it, when another one starts, when the lease of its
+last message expires, when the state is set anew, and when the plant would leave X. An ended intention does not resume:
+late renewals are refused, also by a gateway that was restarted meanwhile.
 """
 
 from __future__ import annotations
@@ -21,37 +22,37 @@ HandVerdict = Literal["ok", "out of order", "ended", "no model"]
 
 LEASE_OVER = "the lease is over"
 NO_LONGER = "no longer driven by hand: "
-"""So a gateway's health begins to say why, in `Hand.ended`."""
+"""Start of the text in a gateway's health that gives the reason in `Hand.ended`."""
 
 
 class Hand:
-    """Whose input acts, and until when. Times in seconds."""
+    """The present manual input and its end. Times are in seconds."""
 
     def __init__(self, plant: Description, way_back: WayBack | None):
-        """way_back: what is asked at every sample; None: nobody may take over by hand."""
+        """way_back: the check at every sample; None if manual inputs are not allowed."""
         self._plant, self._way_back = plant, way_back
         self._said: Override | None = None
         self._wanted = np.zeros(plant.m)
         self._u: np.ndarray | None = None
         self._ahead: Ahead | None = None
         self.until = np.inf
-        """When it is over if nothing else is said; infinite where nobody has the hand on it."""
+        """When the override ends without further messages; infinite without an override."""
         self._given_back: str | None = None
         self.ended = ""
-        """Why their input acts no more, for a person; empty while it does, and where they gave it back."""
+        """Why the override ended, for a person; empty while it is active and after its sender ended it."""
 
     @property
     def run_id(self) -> str:
-        """Of the last who said anything; empty before that."""
+        """run_id of the last sender; empty before the first message."""
         return "" if self._said is None else self._said.run_id
 
     @property
     def acts(self) -> bool:
-        """Whether somebody has taken over, from the next sample on at the latest."""
+        """Whether an override is active, at the latest from the next sample on."""
         return self.until < np.inf and self._given_back is None
 
     def take(self, override: Override, t: float) -> HandVerdict:
-        """What arrived at time t, with the plant's dimensions (`check_dimensions`)."""
+        """Handle a message that arrived at time t and has the plant's dimensions (`check_dimensions`)."""
         last = self._said
         own = last is not None and override.run_id == last.run_id
         if self._way_back is None:
@@ -72,22 +73,23 @@ class Hand:
         return "ok"
 
     def end(self, why: str) -> None:
-        """From now on it is for others to say what acts."""
+        """End the override."""
         if self.until < np.inf:
             self._u, self._ahead, self._given_back, self.until, self.ended = None, None, None, np.inf, why
 
     def input(self, t: float) -> np.ndarray | None:
-        """The input, (m,), that acts by hand at time t; None: none does."""
+        """Return the manual input, (m,), at time t; None without one."""
         if t >= self.until:
             self.end(LEASE_OVER if self._given_back is None else self._given_back)
         return self._u
 
     def look(self, x: np.ndarray | None, acting: np.ndarray, written: Sequence[np.ndarray] = ()) -> None:
-        """At a sample: what was said since the last acts from now on, unless there is no way back inside X behind it.
+        """Apply the last requested input from this sample on, if the plant can be brought back inside X afterwards.
 
-        x: the state, (d,), plant units; None: it was not measured, and what was predicted stands for it. acting: the
-        input until now, (m,). written: those that are on their way through the plant's dead time, one a period, the
-        oldest first.
+        Args:
+            x: the state, (d,), in plant units; None if it was not measured, which uses the predicted state.
+            acting: the present input, (m,).
+            written: inputs within the plant's dead time, one per period, oldest first.
         """
         way_back = self._way_back
         if not self.acts or way_back is None:

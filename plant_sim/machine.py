@@ -1,4 +1,4 @@
-"""A stranger's two functions as a `Machine`: whatever they do, the loop that calls them goes on and says so."""
+"""A user's two functions as a `Machine`. Whatever they do, the loop that calls them goes on and reports it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,29 @@ R = TypeVar("R")
 SLOW = 0.5
 """Share of a period above which a call counts as slow."""
 HANGS_S = 1.0
-"""Seconds for which a call must not have returned to be a trouble."""
+"""Seconds after which a call that has not returned is reported."""
 REMEMBERED_S = 1.0
-"""Seconds for which one that failed is a trouble."""
+"""Seconds for which a failed call is reported."""
 
 
 class NotMeasured(Exception):
-    """What `read` may raise where there is no sample this time, and nothing is wrong."""
+    """Raised by `read` when there is no sample this time and nothing is wrong."""
 
 
 class Guarded:
-    """Calls them, never both at a time, and counts what goes wrong. `trouble` may be asked by any thread."""
+    """Calls the functions, one at a time, and counts failures. Any thread may call `trouble`."""
 
     def __init__(
         self, read: Read, write: Write, states: int, period: float, simulated: bool, gaps: bool = False
     ):
-        """states: d. simulated: each call counts as made when it was due, and what it raises is an error of its own.
+        """Wrap two functions.
 
-        gaps: NaN may stand for some of the states.
+        Args:
+            read, write: the functions.
+            states: d.
+            period: seconds.
+            simulated: each call counts as made at its due time, and exceptions are not caught.
+            gaps: whether NaN is allowed for some of the states.
         """
         self._read, self._write, self._gaps = read, write, gaps
         self._states, self._slow, self._simulated = states, SLOW * period, simulated
@@ -47,9 +52,9 @@ class Guarded:
         self._failures: dict[Call, tuple[str, float]] = {}
         self.counts = dict.fromkeys(("reads failed", "reads slow", "writes failed", "writes slow"), 0)
         self.due = 0.0
-        """For which moment the last call was made, seconds on the monotonic clock."""
+        """The time for which the last call was made, in seconds on the monotonic clock."""
         self.measured = 0.0
-        """When the last `read` began."""
+        """When the last `read` started."""
 
     def read(self, due: float) -> np.ndarray | None:
         return self._call("read", due, self._measure)
@@ -58,14 +63,14 @@ class Guarded:
         return self._call("write", due, partial(self._apply, u))
 
     def trouble(self) -> str:
-        """What is wrong now, for a person; empty when nothing is."""
+        """Return what is wrong now, for a person; empty if nothing is."""
         now = clock.now()
         failed = [text for text, at in self._failures.copy().values() if now - at < REMEMBERED_S]
         return "; ".join(filter(None, (*failed, self.hangs)))
 
     @property
     def hangs(self) -> str:
-        """Which call has not returned for long, for a person; empty when none."""
+        """The call that has not returned for a long time, for a person; empty if there is none."""
         under_way = self._under_way
         if under_way is None or clock.now() - under_way[1] < HANGS_S:
             return ""
@@ -75,14 +80,14 @@ class Guarded:
         self.measured = self._now()
         x = np.array(self._read(), dtype=float)
         if x.shape != (self._states,):
-            raise ValueError(f"x has the shape {x.shape}, the plant has {self._states} states")
+            raise ValueError(f"x has the shape {x.shape}, but the plant has {self._states} states")
         gaps = np.isnan(x)
         if not np.isfinite(x).all() and (not self._gaps or gaps.all() or np.isinf(x).any()):
             raise ValueError("x is not finite")
         return x
 
     def _apply(self, u: np.ndarray) -> float:
-        # A copy: what others do with it is not what acted.
+        # Pass a copy, because the function may change it.
         self._write(u.copy())
         return self._now()
 
@@ -98,7 +103,7 @@ class Guarded:
             raise
         except NotMeasured:
             return None
-        except Exception as error:  # not our code: whatever it raises, the machine still needs an input
+        except Exception as error:  # user code: after any exception the machine still needs an input
             if self._simulated:
                 raise
             self._failed(name, f"{name} failed: {type(error).__name__}: {error}"[:300])
@@ -115,6 +120,6 @@ class Guarded:
         first, last = self._failures.get(name, ("", -REMEMBERED_S))
         if now - last > REMEMBERED_S:
             first = text
-            log.warning("%s; the loop goes on, and further failures are only counted", text)
-        # The first of many, so that what is said does not change with each.
+            log.warning("%s; the loop continues, and further failures are only counted", text)
+        # Report the first of several failures, so that the text does not change with each.
         self._failures[name] = first, now

@@ -20,14 +20,14 @@ log = logging.getLogger(__name__)
 
 
 def motion_of(config: Config) -> Motion:
-    """How the plant that the configuration names really moves. Raises `ConfigError`."""
+    """Return the true motion of the configured plant. Raises `ConfigError`."""
     plant, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
     x0, dead_time = initial_state(config, plant), true_dead_time(config, plant, truth)
     return Motion(true_motion(truth), x0, config.period, dead_time, plant.safe_input)
 
 
 def main(config: Config, stop: threading.Event | None = None) -> int:
-    """`tandem plant`. 0 when told to stop, 2 for a wrong configuration, 3 when the plant's motion ended."""
+    """Run `tandem plant`. Return 0 when told to stop, 2 for a wrong configuration, 3 if the plant's motion ended."""
     return run_process(lambda stopping: _live(config, stopping), stop)
 
 
@@ -43,7 +43,7 @@ def _live(config: Config, stopping: threading.Event) -> int:
 
     def write(u: np.ndarray) -> None:
         motion.write(u, gateway.due)
-        # There is time for it now.
+        # There is time for it after a write.
         motion.look_ahead()
 
     try:

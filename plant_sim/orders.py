@@ -1,4 +1,4 @@
-"""What drives the plant's input: a fresh command, else the backup policy or the plan, else the plant's safe input."""
+"""The plant's input in order of precedence: a fresh command, the backup policy, the plan, the plant's safe input."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from lbmpc.plants import Description
 from protocol.messages import Backup, Command, InputSource
 
 Measure = Callable[[], np.ndarray | None]
-"""x, (d,), of this moment, NaN for a state of which no number came; None where none of it can be measured. Called only
-by what depends on it."""
+"""Returns the present x, (d,), with NaN for states without a number; None if it cannot be measured. It is called only
+if an input depends on the state."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What acts from some moment on."""
+    """An input and its time of validity."""
 
     u: np.ndarray
     """(m,), in U."""
     source: InputSource
     until: float
-    """When something else takes over if no command comes; infinite where nothing does."""
+    """When another input takes over without a new command; infinite if none does."""
 
 
 class Standby:
-    """A backup policy and when its command began to act; immutable. Times in seconds."""
+    """A backup policy with the start of its command; immutable. Times are in seconds."""
 
     def __init__(self, backup: Backup, arrived: float):
         """`backup` must have the plant's dimensions."""
@@ -39,10 +39,10 @@ class Standby:
         self._gain = np.array(backup.gain)
 
     def drive(self, t: float, measure: Measure) -> tuple[np.ndarray, float] | None:
-        """What it wants at time t, and until when.
+        """Return the policy's input at time t, and when it ends.
 
-        None before its first entry, behind its last, where the state is not known, and where its numbers, each of them
-        finite, add up to none.
+        The result is None before the first entry, after the last one, for an unknown state, and if the result is not
+        finite.
         """
         entry = _elapsed(self._arrived, t, self._period)
         if not 1 <= entry <= len(self._inputs) or (x := measure()) is None:
@@ -53,14 +53,14 @@ class Standby:
 
 
 class Orders:
-    """The last command and what follows from it as time goes by; immutable. Times in seconds.
+    """The last command and the inputs that follow it over time; immutable. Times are in seconds.
 
-    The command's input acts for `patience` periods from its arrival. Then, in each period, the backup policy
-    acts while it has an entry, the plan's entry while it has one, and the plant's safe input for ever after.
+    The command's input acts for `patience` periods from its arrival. After that, in each period, the backup policy acts
+    while it has an entry, then the plan while it has an entry, then the plant's safe input.
     """
 
     def __init__(self, plant: Description, command: Command, arrived: float, patience: float):
-        """`command` must have the plant's dimensions; what acts of it is brought into U."""
+        """`command` must have the plant's dimensions. Its inputs are clipped to U."""
         self.run_id, self.seq = command.run_id, command.seq
         self.arrived = arrived
         self._period = command.period
@@ -70,13 +70,13 @@ class Orders:
         self._first = plant.within(command.u)
 
     def without_plan(self) -> Orders:
-        """The same command, after which the safe input follows."""
+        """Return the same command, followed by the safe input."""
         alone = copy(self)
         alone._plan = self._plan[:1]
         return alone
 
     def drive(self, t: float, measure: Measure, standby: Standby | None = None) -> Drive:
-        """What acts at time t, `arrived` or later."""
+        """Return the input at time t, which is `arrived` or later."""
         if self._patience_ends > _reached(t, self._period):
             return Drive(self._first, "command", self._patience_ends)
         if standby is not None and (backup := standby.drive(t, measure)) is not None:
@@ -84,13 +84,13 @@ class Orders:
         entry = _elapsed(self.arrived, t, self._period)
         ends = self.arrived + (entry + 1) * self._period
         if entry < len(self._plan):
-            # Entry by entry, as they are needed: most plans are never followed beyond their first.
+            # Entries are clipped when they are needed, because most plans are followed for one entry only.
             return Drive(self._plant.within(self._plan[entry]), "plan", ends)
         return safe_drive(self._plant, measure, ends)
 
 
 def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
-    """The safe input; of one that depends on the state: until `ends`, and without its feedback where none is known."""
+    """Return the safe input. If it depends on the state, it is valid until `ends`; unknown states give no feedback."""
     if plant.safe_gain is None:
         return Drive(plant.within(plant.safe_input), "safe", math.inf)
     x = measure()
@@ -99,12 +99,12 @@ def safe_drive(plant: Description, measure: Measure, ends: float) -> Drive:
 
 
 def _reached(t: float, period: float) -> float:
-    """t, and a little more: a switching time that rounding put a hair too late still counts as reached."""
+    """Return t plus a small tolerance, so that a switching time that is late by rounding counts as reached."""
     return t + 1e-9 * period + 4 * math.ulp(t)
 
 
 def _elapsed(since: float, t: float, period: float) -> int:
-    """Whole periods from `since` to t, so that the next one ends later than t."""
+    """Return the whole periods from `since` to t, so that the next one ends later than t."""
     entry = max(0, math.floor((t - since) / period))
     while since + (entry + 1) * period <= _reached(t, period):
         entry += 1

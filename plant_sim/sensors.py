@@ -1,4 +1,4 @@
-"""Sensors of a simulated plant that err: noise, white or coloured, quantisation, bias, lost samples, stuck, dead."""
+"""Imperfect sensors of a simulated plant: noise (white or coloured), quantisation, bias, lost samples, stuck, dead."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from node_runtime.config.plant import in_half_widths
 from node_runtime.config.sections import Config
 
 SENSORS = 0x4015E
-"""Besides the seed, so that nothing else of a run draws the same numbers."""
+"""Combined with the seed, so that no other part of a run draws the same numbers."""
 
 
 class Sensors:
-    """What is measured of a true state. The same calls give the same numbers.
+    """Measures a true state. Equal calls give equal numbers.
 
     Args:
-        config: has `plant.sensors` and the seed.
-        plant: its states and half-widths.
+        config: provides `plant.sensors` and the seed.
+        plant: provides states and half-widths.
     """
 
     def __init__(self, config: Config, plant: Description):
@@ -38,9 +38,9 @@ class Sensors:
         self._perfect = not (shares or settings.stuck or settings.dead or settings.dropouts)
 
     def measure(self, x: np.ndarray, t: float) -> np.ndarray | None:
-        """What is measured of x, (d,), at t, seconds, plant units; None where the sample is lost. t must not fall.
+        """Return the measurement of x, (d,), at time t in seconds, in plant units; None if the sample is lost.
 
-        NaN is in the place of a state whose sensor is dead.
+        States with a dead sensor are NaN. t must not decrease.
         """
         if self._perfect:
             return x
@@ -58,7 +58,7 @@ class Sensors:
         return None if lost else seen
 
     def _drawn(self, t: float) -> np.ndarray:
-        """Noise of variance 1, (d,)."""
+        """Return noise of variance 1, (d,)."""
         drawn, correlation = self._draws.standard_normal(len(self._scale)), self._settings.correlation
         if correlation > 0.0 and self._last is not None:
             at, before = self._last

@@ -1,4 +1,4 @@
-"""The rules between a controller and a plant: what is obeyed, what acts, what a sample says. No clock and no I/O."""
+"""The rules between controller and plant: accepted commands, acting inputs, samples. No clock and no I/O."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from protocol.messages import Backup, Command, InputSource, Override, Piece, Pla
 
 Verdict = Literal["ok", "wrong period", "foreign", "stale", "answers no sample"]
 JITTER = 0.1
-"""Share of a period by which the time between two measurements may differ from it: the error of a label is that share
-of what the plant moves in a period."""
+"""Largest deviation of the time between two measurements from a period, as a share of it. The error of a label is that
+share of the plant's motion in a period."""
 MOST_ACTED = 1000
-"""Inputs that are remembered from sample to sample: where none can be taken for long, no more is needed."""
+"""Largest number of inputs remembered between samples. It is reached only if no sample can be taken for long."""
 
 
 class Machine(Protocol):
-    """The plant itself. `due`: seconds, for which moment a call is made."""
+    """The plant itself. `due` is the time in seconds for which a call is made."""
 
     def read(self, due: float) -> np.ndarray | None:
-        """x, (d,), plant units; None where it cannot be measured."""
+        """Return x, (d,), in plant units; None if it cannot be measured."""
         ...
 
     def write(self, u: np.ndarray, due: float) -> float | None:
-        """Let u, (m,), act from now on. From when it does, seconds; None where that is not known."""
+        """Apply u, (m,), from now on. Return when it takes effect, in seconds; None if that is not known."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Acting:
-    """From `since` on, u acts; None: the plant is held, or nobody knows."""
+    """An input that acts from `since` on. u is None if the plant is held or the input is not known."""
 
     since: float
     u: np.ndarray | None
@@ -49,11 +49,11 @@ class _Acting:
 
 
 class Shield:
-    """What stands between the commands and a plant's input. Every time is an argument, in seconds.
+    """Decides about commands and the plant's input. Every time is an argument, in seconds.
 
-    In a loop `command`, `backup` and `override` take what arrives, `act` or `advance` lets it act, `sample` ends a
-    period, `renew` begins the next. The same calls give the same numbers, for a simulated plant in virtual time as for
-    a real one.
+    In a loop, `command`, `backup` and `override` accept messages, `act` or `advance` applies inputs, `sample` ends a
+    period, and `renew` starts the next one. Equal calls give equal numbers, for a simulated plant in virtual time as
+    for a real one.
     """
 
     def __init__(
@@ -65,19 +65,25 @@ class Shield:
         held: bool,
         way_back: WayBack | None = None,
     ):
-        """patience: periods without a command before the plan goes on.
+        """Create a shield.
 
-        held: the plant stands still until the first command that answers one of its samples; else the safe input acts.
-        way_back: whether an input by hand may act; None: none does.
+        Args:
+            plant: the description of the plant.
+            period: seconds.
+            patience: periods without a command before the backup policy or the plan takes over.
+            run_id: the incarnation of the plant.
+            held: True for a plant that stands still until the first command that answers one of its samples; otherwise
+                the safe input acts.
+            way_back: the check of manual inputs; None if they are not allowed.
         """
         self.plant = plant
         self.hand = Hand(plant, way_back)
-        # What is on its way through the dead time, one a period.
+        # Inputs within the dead time, one per period.
         dead = plant.dead_periods(period)
         self._on_the_way = deque([plant.safe_input] * dead, maxlen=dead)
         self._period, self._patience, self._run_id = period, patience, run_id
         self._held = held
-        # Before anything acts, the actuator is where it is without anybody.
+        # Before the first input the actuator has the safe input.
         self._rate_limit = RateLimit(plant, period)
         self._first: float | None = None
         self._t = self._measured = self._acted = -math.inf
@@ -94,24 +100,24 @@ class Shield:
 
     @property
     def moving(self) -> bool:
-        """Whether there was a command to obey."""
+        """Whether a command was accepted."""
         return self._orders is not None
 
     @property
     def due(self) -> float:
-        """When `advance` has something to do next, if nothing else arrives; infinite where never."""
+        """When `advance` must act next without further messages; infinite if never."""
         until = min(self._until, self.hand.until)
         return min(until, self._pending[0].arrived) if self._pending else until
 
-    # -- what is obeyed ----------------------------------------------------------------------------------
+    # -- accepted messages -------------------------------------------------------------------------------
 
     def command(self, command: Command, t: float) -> Verdict:
         """Let `command` act from time t on, or from the last sample if t lies before it.
 
-        It must have the plant's dimensions (`check_dimensions`). It is refused when its period is not the plant's, when
-        it answers another plant's sample or none, and when it answers a sample so old that the plan had to take over
-        already, or one from before a jump. A controller that hears no states goes on with a plan that keeps only the
-        nominal model in X; the backup policy that the plant has is better, and it has its own sensors.
+        It must have the plant's dimensions (`check_dimensions`). It is refused if its period differs from the plant's,
+        if it answers no sample or another plant's, if it answers a sample from before a jump, or if it answers a sample
+        so old that the plan has taken over. A controller that receives no states continues with a plan that keeps only
+        the nominal model in X; the plant's backup policy is better, because it uses the plant's sensors.
         """
         if not math.isclose(command.period, self._period, rel_tol=1e-6):
             return "wrong period"
@@ -127,10 +133,10 @@ class Shield:
         return "ok"
 
     def backup(self, backup: Backup) -> Verdict:
-        """Keep `backup` ready for when commands stop coming.
+        """Store `backup` for the time when commands stop.
 
-        It must have the plant's dimensions. It is refused unless it belongs to one of the last commands: only these
-        say when its periods begin.
+        It must have the plant's dimensions. It is refused unless it belongs to one of the last commands, because the
+        command determines the start of its periods.
         """
         if not math.isclose(backup.period, self._period, rel_tol=1e-6):
             return "wrong period"
@@ -142,39 +148,39 @@ class Shield:
         return "stale" if any(order.run_id == backup.run_id for order in known) else "foreign"
 
     def override(self, override: Override, t: float) -> HandVerdict:
-        """Let a person's input act from the next sample on, before all others, or no more; it arrived at time t.
+        """Start, renew or end a manual input, given a message that arrived at time t. It acts from the next sample on.
 
-        It must have the plant's dimensions. See `plant_sim.hand` for when it ends.
+        The message must have the plant's dimensions. See `plant_sim.hand` for the end of an override.
         """
         return self.hand.take(override, t)
 
     def jump(self) -> None:
-        """From the next sample on the state is another one than the last inputs led to: a new origin, a fresh start.
+        """Declare that the next state does not follow from the last inputs: a new origin or a restart.
 
-        That sample says that nothing is known of what acted before it. The input stays what it is until a command
-        comes that answers it or a later one, or else, after the patience, the safe input: the plan and the policy that
-        there were belong to the state from before. Any thread may call this.
+        The next sample then reports its past input as unknown. The present input acts until a command arrives that
+        answers this sample or a later one, or until the patience ends, and then the safe input. Plan and backup policy
+        belong to the old state and are dropped. Any thread may call this.
         """
         self._jumped = True
 
-    # -- what acts ---------------------------------------------------------------------------------------
+    # -- acting inputs -----------------------------------------------------------------------------------
 
     def advance(self, t: float, machine: Machine) -> None:
-        """Let all act that has to by time t, each at its own time: for a plant whose time is an argument."""
+        """Apply all inputs that are due by time t, each at its own time, for a plant in virtual time."""
         while (due := max(self.due, self._acted)) <= t:
             self.act(due, machine)
 
     def act(self, t: float, machine: Machine) -> None:
-        """Let act what has to at time t: the newest command, or what is due since the last."""
+        """Apply the input at time t: the newest command, or the input that is due."""
         while self._pending and self._pending[0].arrived <= t:
             self._orders = self._pending.pop(0)
         self._write(self._drive(t, partial(machine.read, t)), t, machine)
 
     def renew(self, t: float, x: np.ndarray | None, machine: Machine) -> None:
-        """At every sample, with its x: what depends on the state follows it.
+        """Update inputs that depend on the state, at every sample with its x.
 
-        And what was not written for a period is written again: a machine's own watchdog may wait for it, and where the
-        last write failed the next one may not.
+        An input that was not written for a period is written again, because a machine's watchdog may expect it, and
+        because a failed write must be repeated.
         """
         self.hand.look(x, self.acting, self._on_the_way)
         written, self._written = self._written, False
@@ -191,12 +197,12 @@ class Shield:
 
     @property
     def acting(self) -> np.ndarray:
-        """The input that acts, (m,); where nobody knows, what the actuator has without anybody."""
+        """The input that acts, (m,); the safe input if it is not known."""
         u = self._tape[-1].u
         return self.plant.within(self.plant.safe_input) if u is None else u
 
     def rest(self) -> np.ndarray | None:
-        """The input, (m,), to leave a machine with, at once; None: one that could stand still needs none."""
+        """Return the input, (m,), to leave a machine with; None for a machine that can stand still."""
         return None if self._held else self.plant.within(self.plant.safe_input)
 
     def _drive(self, t: float, measure: Measure) -> Drive:
@@ -205,11 +211,11 @@ class Shield:
         orders = self._orders
         if orders is None:
             return safe_drive(self.plant, measure, math.inf)
-        # Until the backup of the last command is here, that of the one before serves.
+        # Until the backup policy of the last command arrives, that of the previous one is used.
         return orders.drive(t, measure, self._standby.get(orders.seq) or self._standby.get(orders.seq - 1))
 
     def _write(self, drive: Drive, due: float, machine: Machine) -> None:
-        """Whatever acts passes here: as far as its rate allows, and the rest of the way as soon as that does."""
+        """Write an input within its rate limit. The rest of a limited change follows as soon as the limit allows."""
         reached = self._rate_limit.nearest(drive.u, due)
         since = machine.write(reached, due)
         self._acted = due
@@ -225,18 +231,17 @@ class Shield:
         )
         del self._tape[:-MOST_ACTED]
 
-    # -- what a sample says ------------------------------------------------------------------------------
+    # -- samples -----------------------------------------------------------------------------------------
 
     def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
-        """x(t), (d,), NaN where no number came, and what acted since the sample before.
+        """Return the sample of x(t), (d,), with NaN for missing numbers, and of the inputs since the previous sample.
 
-        t must rise by about whole periods, after `advance`.
+        t must increase by about whole periods. Call `advance` first.
 
-        `applied` is the time average of the input over the last period, that input itself when only one
-        acted, and None when a part of it is not known or the last sample is not one period ago.
-        `source` is what acted just before t.
+        `applied` is the mean input over the last period, exactly the input if only one acted. It is None if part of it
+        is not known or the last sample is not one period ago. `source` is the source of the input just before t.
 
-        measured: when x was really measured, where that was not at t.
+        measured: when x was measured, if that was not at t.
         """
         measured = t if measured is None else measured
         if self._first is None:
@@ -247,11 +252,11 @@ class Shield:
         acted = self._acted_until(t)
         whole = abs(measured - self._measured - self._period) <= JITTER * self._period
         applied = self._average(acted) if whole else None
-        # Also where it has acted for no time at all yet.
+        # Include the present input even if it has not acted for any time yet.
         pieces = _pieces(acted or [(0.0, self._tape[0])])
         orders = self._orders
         if orders is not None:
-            # Of older commands nothing is followed any more, but for the one before the last: see `_drive`.
+            # Policies of older commands are dropped, except the previous one's; see `_drive`.
             self._standby = {seq: one for seq, one in self._standby.items() if seq >= orders.seq - 1}
         self._t, self._measured = t, measured
         if self._on_the_way.maxlen:
@@ -268,7 +273,7 @@ class Shield:
         )
 
     def _begin_epoch(self, t: float) -> None:
-        """Of what was before t only the input that acts is still true."""
+        """Reset everything from before t except the acting input."""
         self._jumped, self._epoch, self._measured = False, self._seq, -math.inf
         self._pending, self._standby = [], {}
         self.hand.end("the state is another one")
@@ -277,12 +282,12 @@ class Shield:
         self._tape = [replace(self._tape[-1], since=t)]
 
     def _acted_until(self, t: float) -> list[tuple[float, _Acting]]:
-        """For how many seconds what acted since the last sample, in order; the tape then begins at t."""
+        """Return the inputs since the last sample with their seconds, in order. The tape then begins at t."""
         acted, tape = [], []
         for one, end in zip(self._tape, [*(after.since for after in self._tape[1:]), math.inf], strict=True):
             seconds = min(end, t) - max(one.since, self._t)
             if seconds > 0.0:
-                # Differences of large times are not exact; the period is.
+                # Differences of large times are not exact, so the exact period is used.
                 whole = math.isclose(seconds, self._period, rel_tol=1e-6)
                 acted.append((self._period if whole else seconds, one))
             if end > t:
@@ -292,7 +297,7 @@ class Shield:
 
     def _average(self, acted: list[tuple[float, _Acting]]) -> list[float] | None:
         total = sum(seconds for seconds, _one in acted)
-        # Lists of Python's numbers: in a fast loop numpy would take longer than all else here.
+        # Use lists of Python numbers. In a fast loop numpy would take longer than everything else here.
         inputs = [one.u.tolist() for _seconds, one in acted if one.u is not None]
         if len(inputs) < len(acted) or not math.isclose(total, self._period, rel_tol=1e-6):
             return None
@@ -303,7 +308,7 @@ class Shield:
 
 
 def measurement(plant: Description, x: np.ndarray) -> dict[str, Any]:
-    """The fields of a `PlantState` that tell of x, (d,): NaN, where no number came, does not travel."""
+    """Return the fields of a `PlantState` for x, (d,). States with NaN are listed as missing."""
     missing = np.isnan(x)
     if not missing.any():
         return {"x": x.tolist()}
@@ -312,7 +317,7 @@ def measurement(plant: Description, x: np.ndarray) -> dict[str, Any]:
 
 
 def _pieces(acted: list[tuple[float, _Acting]]) -> list[Piece]:
-    """The known inputs at the end, one piece for equal ones; the last still acts."""
+    """Return the known inputs up to the end, with equal ones merged. The last one still acts."""
     pieces: list[Piece] = []
     for u, same in groupby(acted, key=lambda part: None if part[1].u is None else part[1].u.tolist()):
         pieces = [] if u is None else [*pieces, Piece(sum(seconds for seconds, _one in same), u)]

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from protocol import topics
 from protocol.topics import COMMANDER, Topic
 
-OPERATOR = "operator"
-"""Whoever looks: `tandem health`, a live view. It publishes nothing."""
-ROLES = (*topics.PROCESSES, OPERATOR, COMMANDER)
-READS_ALL = ("recorder", OPERATOR, COMMANDER)
+VIEWER = "viewer"
+"""The role of `tandem health` and `tandem live`: it reads everything and publishes nothing."""
+ROLES = (*topics.PROCESSES, VIEWER, COMMANDER)
+READS_ALL = ("recorder", VIEWER, COMMANDER)
 QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
 
 _READS: dict[str, tuple[Topic, ...]] = {
@@ -68,8 +68,8 @@ def rights_of(role: str) -> Rights:
 
 
 def role_of(process: str) -> str:
-    """The role in which a process of this name speaks: its own, or the operator's."""
-    return process if process in (*topics.PROCESSES, COMMANDER) else OPERATOR
+    """The role in which a process of this name speaks: its own, or the viewer's."""
+    return process if process in (*topics.PROCESSES, COMMANDER) else VIEWER
 
 
 def common_name(role: str, plant: str) -> str:

@@ -21,8 +21,8 @@ READABLE = (FORMAT,)
 LIBRARY = f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}"
 """What the header, a file's first record, says of who wrote it: the format's number is in it."""
 
-RAW, VIEW = "raw/", "view/"
-"""Channels: a topic's bytes as they travelled, and the same messages for people."""
+RAW = "raw/"
+"""Channels of a topic's bytes as they travelled; those for people are `run_log.views`."""
 IDENTITY = "tandem"
 """Metadata that says what a log is of."""
 CONTINUED = "continued"

@@ -4,7 +4,7 @@
 
     result = Loop("moore_greitzer", oracle="dnn").run(200)
 
-`Loop` is imported when it is asked for: a machine that only trains has no CasADi, one that only controls no torch.
+`Loop` is imported on first use: a trainer's machine has no CasADi, and a controller's machine has no torch.
 """
 
 from __future__ import annotations

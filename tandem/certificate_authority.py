@@ -1,7 +1,7 @@
-"""A plant's private authority and one certificate a role: made, made anew, and found again on disk.
+"""A plant's private authority and one certificate for each role: created, renewed and loaded.
 
-keys/jet1/authority/   certificate.pem, key.pem     the key belongs in a drawer: it is needed to renew, not to run
-keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      all that the trainer's machine gets
+keys/jet1/authority/   certificate.pem, key.pem     keep the key elsewhere: renewing needs it, running does not
+keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      everything that the trainer's machine gets
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from tandem.terminal import Refused
 AUTHORITY_FOLDER = "authority"
 PEM = serialization.Encoding.PEM
 AUTHORITY_DAYS = 3650
-"""Longer than any certificate that it signs: renewing one of those is one folder to copy, a new authority is all."""
+"""Longer than any certificate that it signs. Renewing a certificate means one folder to copy; a new authority, all."""
 LEAF_DAYS = 365
 EARLY = timedelta(days=1)
-"""Clocks differ: a certificate is valid a little before it was made."""
+"""Clocks differ: a certificate is valid from a little before its creation."""
 ALWAYS = ("localhost", "127.0.0.1", "router")
 
 
@@ -58,7 +58,7 @@ class Issued:
 
     @property
     def hosts(self) -> list[str]:
-        """The names and addresses that it is valid for, the router's alone."""
+        """Names and addresses for which the certificate is valid; only the router's has them."""
         try:
             names = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         except x509.ExtensionNotFound:
@@ -69,7 +69,7 @@ class Issued:
 
 
 def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Issued]:
-    """An authority for one plant and a certificate for every role, in `folder`, which must not exist yet."""
+    """Create an authority for one plant and a certificate for every role, in `folder`, which must not exist yet."""
     if folder.exists() or folder.is_symlink():
         raise Refused(
             f"{folder}: exists already, and keys never overwrite anything. `tandem keys renew --role ROLE` makes one "
@@ -93,8 +93,10 @@ def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Is
 
 def renew(
     role: str, folder: Path, hosts: Sequence[str], days: int, drawer: Path | None
-) -> tuple[Issued, Issued]:
-    """A new key and certificate for one role; returns the old one and the new one.
+) -> tuple[Issued | None, Issued]:
+    """Issue a new key and certificate for one role; return the old one and the new one.
+
+    The old one is None for a role that these keys do not have: a later version may have more roles.
 
     folder: the plant's; hosts: more names for the router, beside those that it has; drawer: where the authority is,
     None: in the folder.
@@ -109,27 +111,28 @@ def renew(
         ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
         raise Refused(f"{place / KEY}: is not the key of {CERTIFICATE} beside it")
-    old = _issued(folder / role)
-    if old is None:
-        raise Refused(f"{folder / role / CERTIFICATE}: not there; is {folder} a plant's folder of keys?")
     _, plant = _role_and_plant(authority)
-    if plant != old.plant:
+    old = _issued(folder / role)
+    if old is None and not any(one.plant == plant for one in found(folder)):
+        raise Refused(f"{folder}: has no certificate of {plant}; is it the plant's folder of keys?")
+    if old is not None and plant != old.plant:
         raise Refused(f"{place}: is the authority of {plant}, and {folder / role} is of {old.plant}")
     left = (authority.not_valid_after_utc - datetime.now(UTC)).days
     if not 1 <= days < left:
         raise Refused(f"--days {days}: at least 1, and less than the {left} that the authority has left")
     if hosts and role != "router":
         raise Refused(f"--host: only the router's certificate names hosts, not the {role}'s")
-    names = _host_names([*old.hosts, *hosts]) if role == "router" else []
+    names = _host_names([*(ALWAYS if old is None else old.hosts), *hosts]) if role == "router" else []
     with _refused_where_it_cannot_write(folder):
-        issue(folder / role, common_name(role, old.plant), key, authority, days, names)
+        (folder / role).mkdir(mode=0o700, exist_ok=True)
+        issue(folder / role, common_name(role, plant), key, authority, days, names)
     new = _issued(folder / role)
     assert new is not None
     return old, new
 
 
 def found(folder: Path) -> list[Issued]:
-    """All certificates in a folder, in a plant's, or in one of several plants'."""
+    """Load all certificates of a folder, of a plant's folder, or of several plants'."""
     if not folder.is_dir():
         raise Refused(f"{folder}: no such folder; `tandem keys create --plant NAME` makes one")
     places = sorted(path.parent for depth in ("", "*/", "*/*/") for path in folder.glob(depth + CERTIFICATE))
@@ -180,7 +183,7 @@ def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
 
 
 def _authority(plant: str, key: ec.EllipticCurvePrivateKey) -> x509.Certificate:
-    # Two authorities of one plant are two names, so that who refuses the other's certificates can say so.
+    # Two authorities of one plant have two names, so that a refusal can name the other one.
     number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest.hex()
     own = _name(common_name(AUTHORITY_FOLDER, plant))
     name = x509.Name([*own, x509.NameAttribute(NameOID.SERIAL_NUMBER, number)])
@@ -197,7 +200,7 @@ def issue(
     days: float,
     hosts: list[x509.GeneralName],
 ) -> None:
-    """A new key and its certificate, named `name`, in `folder`. Who has hosts is a server too; all are clients."""
+    """Create a key and its certificate, named `name`, in `folder`. With hosts it is a server too; all are clients."""
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
     builder = _builder(_name(name), authority.subject, key.public_key(), days, signs_others=False)
@@ -214,7 +217,7 @@ def issue(
 def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float, *, signs_others: bool
 ) -> x509.CertificateBuilder:
-    """What both kinds have; an authority signs these certificates and no further authority."""
+    """Properties of both kinds; an authority signs these certificates and no further authority."""
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
@@ -257,5 +260,5 @@ def _write(folder: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Cert
 
 
 def _write_file(path: Path, content: bytes) -> None:
-    """Readable by the owner alone from the first byte."""
+    """Create a file that only its owner can read, from the first byte on."""
     write_whole(path, content, mode=0o600, durable=True)

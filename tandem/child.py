@@ -1,8 +1,8 @@
-"""What runs in a process that `tandem run` starts: a tandem command that ends when its supervisor does.
+"""The main module of a process of `tandem run`: a tandem command that ends when its supervisor does.
 
     python -P -m tandem.child SUPERVISOR_PID COMMAND...
 
-A supervisor that is killed cannot stop its children, so they watch it.
+A killed supervisor cannot stop its children, so they watch it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ GRACE_S = 5.0
 
 
 def end_with(parent: int, grace_s: float = GRACE_S) -> None:
-    """Have this process end, first politely, when the process `parent` does. Ends it now if that is gone."""
+    """End this process, politely at first, when the process `parent` ends; at once if that is gone."""
     try:
         handle = os.pidfd_open(parent)
     except ProcessLookupError:
         raise SystemExit(1) from None
-    if os.getppid() != parent:  # it died, and its number was given to somebody else
+    if os.getppid() != parent:  # it died, and its number belongs to another process
         raise SystemExit(1)
 
     def watch() -> None:
@@ -38,7 +38,7 @@ def end_with(parent: int, grace_s: float = GRACE_S) -> None:
 
 
 def main() -> int:
-    # The supervisor's own priority is not for all: each process takes what it needs.
+    # The supervisor's own priority is not inherited: each process requests what it needs.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     end_with(int(sys.argv[1]))
     from tandem.cli import main as tandem

@@ -1,10 +1,10 @@
 """`tandem`: the command line. Every command has `--help`, and `--json` for one JSON object on stdout.
 
-Exit codes: 0 it went well; 1 it did not (a replay differs, a process died, the output could not be
-written, which a reader who leaves does not mean); 2 what was asked cannot be done (a mistake in the arguments, the
-configuration or the file); 3 there are no such sets, or their certificate does not hold; 130 interrupted.
+Exit codes: 0 success; 1 failure (a replay differs, a process died, the output could not be
+written, except for a reader that closes the pipe); 2 the request cannot be done (a mistake in the arguments, the
+configuration or the file); 3 the sets are empty, or their certificate does not hold; 130 interrupted.
 
-What a command needs is imported when it runs: so `tandem --help` is quick, the trainer needs no CasADi, and
+Modules are imported when a command runs: `tandem --help` is quick, the trainer needs no CasADi, and
 the controller no torch.
 """
 
@@ -21,6 +21,7 @@ from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
+from tandem.commands.export import Export
 from tandem.commands.health import Health
 from tandem.commands.identify import Identify
 from tandem.commands.keys import KeysCommand
@@ -41,6 +42,7 @@ AnyCommand = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Report, subcommand("report")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Recover, subcommand("recover")]
     | Annotated[Router, subcommand("router")]
     | Annotated[Controller, subcommand("controller")]
@@ -63,7 +65,7 @@ AnyCommand = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Parse, do, and say what is wrong in one message; returns the exit code."""
+    """Parse the arguments, run the command, print errors as one message; return the exit code."""
     with never_failing() as output:
         try:
             code = _do(sys.argv[1:] if argv is None else argv)
@@ -74,6 +76,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return output.exit_code(code)
 
 
+def parse(argv: Sequence[str]) -> Command:
+    """Return the command that these arguments ask for, without running it.
+
+    Raises:
+        SystemExit: after `--help`, or a mistake in the arguments.
+    """
+    parsed: Any = tyro.cli(
+        AnyCommand,
+        prog="tandem",
+        description="Learning-based model predictive control that learns while it runs. --version says which this is.",
+        args=argv,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    return getattr(parsed, "action", parsed)
+
+
 def _do(argv: Sequence[str]) -> int:
     from tandem import terminal
 
@@ -82,14 +100,7 @@ def _do(argv: Sequence[str]) -> int:
 
         terminal.write(f"tandem {version('tandem-control')}\n")
         return 0
-    parsed: Any = tyro.cli(
-        AnyCommand,
-        prog="tandem",
-        description="Learning-based model predictive control that learns while it runs. --version says which this is.",
-        args=argv,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
-    command: Command = getattr(parsed, "action", parsed)
+    command = parse(argv)
     from node_runtime.config.strict import ConfigError
     from run_log.errors import LogError
 

@@ -1,4 +1,4 @@
-"""The rich console of all commands: what it is given is text, whoever wrote it."""
+"""The rich console of all commands; it prints text from any source safely."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from node_runtime.printable import printable
 
 
 class PlainConsole(Console):
-    """No markup, no names of pictures, no highlighting; and no control characters but its own."""
+    """No markup, no emoji names, no highlighting; and no control characters but its own."""
 
     def __init__(self, stderr: bool = False):
         super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """As rich does. Every text comes by here before it is laid out, those within tables and panels too."""
+        """As in rich. Every text passes here before its layout, also texts within tables and panels."""
         if isinstance(renderable, str):
             renderable = self.render_str(renderable)
         if isinstance(renderable, Text) and (plain := printable(renderable.plain)) != renderable.plain:

@@ -1,4 +1,4 @@
-"""The closed loop in Python: the controller, its trainer and a plant, or a plant of yours, one step at a time.
+"""The closed loop in Python: the controller, its trainer and a plant, possibly your own, one step at a time.
 
 The same lock-step as `tandem simulate`: equal settings and seeds give equal bits.
 """
@@ -54,7 +54,7 @@ class Step(NamedTuple):
     u: np.ndarray
     """The input from then on, (m,)."""
     result: TickResult
-    """What the controller concluded: status, iterations, h and h_hat, what became of hidden weights, and more."""
+    """The controller's result: status, iterations, h and h_hat, verdict on hidden weights, and more."""
 
 
 class Loop:
@@ -63,16 +63,16 @@ class Loop:
     Args:
         known: what the controller knows: `Known` (matrices), `Plant` (equations, which are linearised), the name of a
             plant of Tandem, or a reference, "tanks.py:TANKS". None: the configuration's.
-        truth: how the plant really moves: a `Plant`, an object with `step(x, u, dt) -> x` (a simulator of yours), a
-            reference to either, or other parameters of the same equations, {"leak": 0.02}. None: the configuration's,
-            or as known.
-        oracle: what h is estimated with: linear (not at all), constant, l2nw, dnn or perfect.
+        truth: how the plant moves: a `Plant`, an object with `step(x, u, dt) -> x` (your simulator), a reference to
+            either, or other parameters of the same equations, {"leak": 0.02}. None: the configuration's, or equal to
+            `known`.
+        oracle: the estimate of h: linear (none), constant, l2nw, dnn or perfect.
         train: whether the hidden layers of dnn are trained; needs torch.
-        config: a configuration: its file, the name of one that comes with Tandem, or a `Config`. None: defaults.
-        settings: what is otherwise in it, as in the file: `rate=50, controller={"horizon": 40}`.
+        config: a configuration: its file, the name of a shipped one, or a `Config`. None: defaults.
+        settings: changes of the configuration, as in the file: `rate=50, controller={"horizon": 40}`.
 
     Raises:
-        ConfigError: what was given admits no controller; says what, and what would be right.
+        ConfigError: the arguments admit no controller; the text says why and what would be right.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Loop:
         return self._lockstep.core.plant
 
     def step(self) -> Step:
-        """One period: the plant's state, and the input that the controller gives to it.
+        """Run one period; return the plant's state, and the controller's input to it.
 
         Raises:
             PlantError: the true plant left every state from which its motion can be followed.
@@ -115,16 +115,16 @@ class Loop:
         return self._step(None)
 
     def control(self, x: ArrayLike) -> np.ndarray:
-        """The input, (m,), for a plant that moves elsewhere: in your simulator, or your own loop.
+        """Return the input, (m,), for a plant that moves elsewhere: in your simulator, or your own loop.
 
-        One call is one period. The input is taken to act from now until the next call, which the label h of this period
-        is made from.
+        One call is one period. The input acts from now until the next call; the label h of this period
+        is made from it.
 
         Args:
             x: its state now, (d,), in its own units.
 
         Raises:
-            ValueError: not d finite numbers; nothing has happened then.
+            ValueError: not d finite numbers; nothing has changed then.
         """
         state, d = np.array(x, dtype=float), self.plant.d
         if state.shape != (d,) or not np.isfinite(state).all():
@@ -135,12 +135,12 @@ class Loop:
         return self._step(state).u
 
     def manual(self, u: ArrayLike | Mapping[str, float]) -> None:
-        """From the next step on this input acts by hand, until `auto`; the controller goes on learning.
+        """Let this input act manually from the next step on, until `auto`; the controller goes on learning.
 
-        It is clipped to U. Where the plant would leave X its controller takes over before that, for good.
+        It is clipped to U. If the plant would leave X, its controller takes over before that and stays in control.
 
         Args:
-            u: (m,), in the plant's own units; or some of the inputs, by name, and the others stay what they are.
+            u: (m,), in the plant's own units; or some of the inputs, by name; the others stay unchanged.
 
         Raises:
             ValueError: not m finite numbers, or no input of that name.
@@ -162,44 +162,44 @@ class Loop:
         self._lockstep.manual(given)
 
     def auto(self) -> None:
-        """From the next step on the controller's commands act again."""
+        """Let the controller's commands act again from the next step on."""
         self._lockstep.auto()
 
     @property
     def by_hand(self) -> bool:
-        """Whether the input acts by hand, or will from the next step on."""
+        """Whether the input acts manually, now or from the next step on."""
         return self._lockstep.plant.hand.acts
 
     def set_point(self, values: Mapping[str, float], over: float = 0.0, lease: float | None = None) -> None:
-        """Where outputs shall be, from the next period on: {"y": 1.8}.
+        """Give set-points of outputs from the next period on: {"y": 1.8}.
 
         Args:
             values: by the name of a state, plant units.
-            over: seconds in which a straight line leads there; 0: at once.
-            lease: seconds after which the configured reference is back; None: it stays.
+            over: seconds of a straight line to the values; 0: at once.
+            lease: seconds after which the configured reference returns; None: never.
 
         Raises:
-            ValueError: no such state, or a value outside X; nothing has happened then.
+            ValueError: no such state, or a value outside X; nothing has changed then.
         """
         self.reference(set_points.set_point(values, over, lease))
 
     def reference(self, reference: Reference | None) -> None:
-        """Where the plant shall go, from the next period on; None: where the configuration says.
+        """Give a reference from the next period on; None: the configured one.
 
         Args:
             reference: for instance of `tandem.operating.set_points.trajectory`, or `from_file`.
 
         Raises:
-            ValueError: it is none of this plant; nothing has happened then.
+            ValueError: the reference does not fit this plant; nothing has changed then.
         """
         asked = reference or Reference(run_id=set_points.UNSAID, seq=0, kind="configured")
         change_of(asked, self.plant, self.config.period)
         self._lockstep.ask(asked)
 
     def start_again(self) -> None:
-        """Another episode: the plant is put back, what was learned is kept, and no label reaches across.
+        """Begin another episode: the plant is put back, the memory is kept, and no label spans both episodes.
 
-        With `control` the next x is where it begins.
+        With `control` the next x is its first state.
         """
         with one_blas_thread():
             try:
@@ -209,7 +209,7 @@ class Loop:
         self._lost = None
 
     def run(self, steps: int) -> Result:
-        """So many periods more, or fewer where the plant is lost; what they and those before them came to."""
+        """Run so many more periods, or fewer if the plant is lost; return the result of all periods so far."""
         if steps < 1:
             raise ValueError(f"steps = {steps}: at least 1")
         with one_blas_thread():
@@ -241,17 +241,17 @@ class Loop:
 
 
 class Result:
-    """What the steps of a loop came to. n steps, d states, m inputs; NaN where a step has no such figure."""
+    """Result of the steps of a loop. n steps, d states, m inputs; NaN where a step has no such figure."""
 
     def __init__(self, run: Run, lost: str | None = None):
         self.run = run
         """Every message, as a log has it."""
         self.lost = lost
-        """Why the true motion could not be followed any further; None: it could."""
+        """Why the true motion ended; None: it did not."""
 
     @cached_property
     def traces(self) -> Traces:
-        """The arrays below, and what pictures need besides."""
+        """The arrays below, and the data of the pictures."""
         return traces(self.run)
 
     @property
@@ -261,7 +261,7 @@ class Result:
 
     @property
     def x(self) -> np.ndarray:
-        """(n + 1, d) the plant's states, the last one behind the last step; (n, d) of a plant that moves elsewhere."""
+        """(n + 1, d) the plant's states, the last one after the last step; (n, d) of a plant that moves elsewhere."""
         return self.traces.motion.x
 
     @property
@@ -271,17 +271,17 @@ class Result:
 
     @property
     def h(self) -> np.ndarray:
-        """(n, d) x - A x_before - B u_before: what the model missed in the period before each step."""
+        """(n, d) x - A x_before - B u_before: the model's error in the period before each step."""
         return self.traces.h
 
     @property
     def h_hat(self) -> np.ndarray:
-        """(n, d) what the oracle had said of it."""
+        """(n, d) the oracle's estimate of it."""
         return self.traces.h_hat
 
     @property
     def solve_ms(self) -> np.ndarray:
-        """(n,) milliseconds that each solve took."""
+        """(n,) duration of each solve in milliseconds."""
         return self.traces.solve_ms
 
     @cached_property
@@ -290,7 +290,7 @@ class Result:
         return summarise(self.run)
 
     def plot(self) -> Figure:
-        """All of it on one page. Needs matplotlib."""
+        """Plot all of it on one page. Needs matplotlib."""
         from run_log.reporting import plots
         from run_log.reporting.report import title
 
@@ -300,7 +300,7 @@ class Result:
         """Write the log, for `tandem replay` and `tandem report`. Needs mcap.
 
         Raises:
-            LogError: something is there already, or it cannot be written.
+            LogError: the file exists already, or it cannot be written.
         """
         from run_log.writing.save import save
 
@@ -313,7 +313,7 @@ def _resolved(
     settings: Mapping[str, Any],
     arguments: Mapping[str, tuple[str, Any]],
 ) -> Config:
-    """The configuration with the settings in it, and with the arguments that are not None, (key, value) by name."""
+    """Return the configuration with the settings and with the arguments that are not None, (key, value) by name."""
     folder, where = None, "Loop"
     names = (*arguments, "config", *Config.__struct_fields__)
     for name in settings:
@@ -338,9 +338,9 @@ def _resolved(
 
 
 def _name_of(given: object, moves: bool = False) -> object:
-    """What a configuration calls it; of an object a name that nobody takes for a plant of Tandem's.
+    """Name of a plant in a configuration; for an object, a name that no plant of Tandem has.
 
-    A truth that is an object has such a name too: without one a log would say that the plant moved as known.
+    A truth that is an object has such a name too: without it a log would say that the plant moved as known.
     """
     if given is None or isinstance(given, str):
         return given
@@ -353,7 +353,7 @@ def _name_of(given: object, moves: bool = False) -> object:
 def _merge(
     tree: dict[str, Any], changes: Mapping[str, Any], section: Section, above: str, origins: dict[str, str]
 ) -> None:
-    """Lay `changes` over the tree of `section`. A table that is no section has names for keys, and replaces the old."""
+    """Merge `changes` into the tree of `section`. A table that is no section replaces the old one."""
     for name, value in changes.items():
         key = f"{above}{name}"
         inner = getattr(section, name, None)
@@ -368,7 +368,7 @@ def _merge(
 
 
 def _given(config: Config, known: object, truth: Known | Plant | TrueMotion | None) -> GivenPlant | None:
-    """The objects that stand for what the configuration would name. Raises `ConfigError`."""
+    """Return the objects that replace names of the configuration. Raises `ConfigError`."""
     if not isinstance(known, Known | Plant) and truth is None:
         return None
     own = known if isinstance(known, Known | Plant) else None

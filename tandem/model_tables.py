@@ -9,9 +9,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 UNKNOWN = 2.0
-"""Standard errors below which an entry cannot be told from zero."""
+"""Standard errors below which an entry does not differ from zero."""
 ROUNDING = 1e-9
-"""Of an entry in half-widths, what rounding leaves."""
+"""Rounding error of an entry, in half-widths."""
 
 
 def plain(*columns: Column) -> Table:
@@ -27,13 +27,13 @@ def matrix_tables(
     scales: tuple[np.ndarray, np.ndarray],
     errors: np.ndarray | None = None,
 ) -> Iterator[Table]:
-    """x+ of each state, one a row, from each of `columns`; as many tables beneath one another as `width` makes needed.
+    """x+ of each state, one a row, from each of `columns`; split into several tables if `width` requires it.
 
     Args:
         width: of the console, characters.
-        values: (d, n); a number that is rounding, in half-widths, is a dot.
+        values: (d, n); a number within rounding, in half-widths, is a dot.
         scales: half-widths of the rows, (d,), and of the columns, (n,).
-        errors: standard errors, (d, n), below their numbers. A number that is not known from zero is dim.
+        errors: standard errors, (d, n), below their numbers. A number that does not differ from zero is dim.
     """
     share = np.abs(values) * scales[1] / scales[0][:, None]
     cells = [
@@ -82,7 +82,7 @@ def poles_text(poles: np.ndarray) -> str:
 
 
 def percent(share: float) -> str:
-    """A share with two digits, as "12 %"; rounding is 0."""
+    """A share with two digits, as "12 %"; a share within rounding is 0."""
     if share < ROUNDING:
         return "0 %"
     return f"{100.0 * share:.2g} %" if share < 1.0 else f"{100.0 * share:.0f} %"

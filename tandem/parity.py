@@ -1,6 +1,6 @@
-"""Whether numpy, CasADi and torch compute one and the same network of an architecture, and whether phi is bounded.
+"""Check that numpy, CasADi and torch compute the same network of an architecture, and that phi is bounded.
 
-The controller's network is made of the first two and the trainer's of the third, all from one `forward`.
+The controller's network uses the first two and the trainer's the third, all from one `forward`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trainer_node.network import Network
 
 ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
 VALUE, SLOPE, BOUND = 1e-12, 1e-11, 1e-12
-"""How far values and slopes may be apart, and an entry of phi beyond 1."""
+"""Largest difference of values and slopes, and largest excess of an entry of phi over 1."""
 POINTS = 5
 LONGEST_TEXT = 300
 _Pair = tuple[np.ndarray, np.ndarray]
@@ -32,7 +32,7 @@ class Parity(NamedTuple):
     """The largest of each over some points, in float64."""
 
     value: float
-    """Between h_hat of CasADi, of numpy and of torch, in units of the output scale."""
+    """Difference between h_hat of CasADi, of numpy and of torch, in units of the output scale."""
     slope: float
     """Between its slopes along every entry of the window, CasADi's and torch's, in units of the scales; relative where
     slopes are above 1, since they are sums that cancel."""
@@ -45,12 +45,12 @@ class Parity(NamedTuple):
         return self.value < VALUE and self.slope < SLOPE and self.phi <= 1.0 + BOUND
 
     def worst(self, other: Parity) -> Parity:
-        """The larger of each; NaN is larger than all."""
+        """Return the larger of each; NaN counts as larger than all."""
         return Parity(*(float(np.maximum(a, b)) for a, b in zip(self, other, strict=True)))
 
 
 def drawn(name: str, rng: np.random.Generator) -> NetworkDescription:
-    """A network of that architecture with random sizes, activations, scales and options.
+    """Return a network of that architecture with random sizes, activations, scales and options.
 
     Raises:
         ValueError: the architecture refuses these sizes; the text is its own.
@@ -80,7 +80,7 @@ def _any(of: tuple[Activation, ...], count: int, rng: np.random.Generator) -> li
 
 
 def parity(description: NetworkDescription, seed: int, size: float = 1.0) -> Parity:
-    """Of random weights of that size at a few random points.
+    """Measure random weights of that size at a few random points.
 
     Raises:
         ConfigError: `forward` fails; the text says with which of the three.
@@ -132,7 +132,7 @@ def _torch(
 
 
 def _casadi(oracle: DnnOracle, theta: np.ndarray, windows: np.ndarray) -> _Pair:
-    """The same, in the expressions that the solver has."""
+    """The same in CasADi expressions, as the solver has them."""
     d, m = oracle.d, oracle.m
     su, parameters = ca.MX.sym("su", d + remembered(oracle) + m), ca.MX.sym("theta", oracle.parameters)
     parts = oracle.split(parameters)

@@ -1,4 +1,4 @@
-"""A plant of numbers as a file of Python, for a person to read and to change."""
+"""Write a plant of numbers as a Python file that a person can read and change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from node_runtime.printable import printable
 from tandem.terminal import Refused
 
 DIGITS = 12
-"""Of a matrix: more than any log tells, and enough for what a horizon makes of them."""
+"""Of a matrix: more than any log determines, and enough for a horizon."""
 COMMENTS = {
     "A": "x+ = A x + B u in deviations from (x_e, u_e)",
     "offset": "x+ - x at (x_e, u_e): Tandem takes the nearest point of rest for (x_e, u_e)",
@@ -22,11 +22,11 @@ COMMENTS = {
     "period": "s: A and B hold at this rate only",
     "dead_time": "s, from when an input is written until the plant begins to answer: A and B are what follows then",
 }
-"""What a reader is told of a field, on the line before it."""
+"""Comment of a field, on the line before it."""
 
 
 def require_new(file: Path) -> None:
-    """Raises `Refused` for a plant file that cannot be written there."""
+    """Raise `Refused` if a plant file cannot be written there."""
     if file.suffix != ".py":
         raise Refused(f"{file}: the name of a plant file ends in .py")
     if os.path.lexists(file):
@@ -36,7 +36,7 @@ def require_new(file: Path) -> None:
 
 
 def write_new(file: Path, text: str) -> None:
-    """Raises `Refused` where that cannot be; nothing is overwritten."""
+    """Write the file; raise `Refused` if that fails. Nothing is overwritten."""
     require_new(file)
     try:
         with file.open("x", encoding="utf-8") as opened:
@@ -46,13 +46,13 @@ def write_new(file: Path, text: str) -> None:
 
 
 def source(fields: Mapping[str, Any], about: Sequence[str]) -> str:
-    """The text of a file in which PLANT is `Known.from_matrices(**fields)`.
+    """Return the text of a file in which PLANT is `Known.from_matrices(**fields)`.
 
     Args:
         fields: arguments of `Known.from_matrices`: arrays, tuples, mappings, texts, numbers; None is left out.
         about: lines of the file's docstring.
     """
-    # Names may be a stranger's, and files' names any bytes.
+    # Names may come from another person, and file names may be any bytes.
     lines = ['"""' + printable("\n".join(about)).replace("\\", "/").replace('"""', "'''") + '"""', ""]
     given = {key: _text(value, 4) for key, value in fields.items() if value is not None}
     if any("inf" in text for key, text in given.items() if key.endswith(("_min", "_max"))):
@@ -66,7 +66,7 @@ def source(fields: Mapping[str, Any], about: Sequence[str]) -> str:
 
 
 def shared_fields(known: Known) -> dict[str, Any]:
-    """What a model with other matrices has in common with this one, as `from_matrices` takes it; names come first."""
+    """Fields that a model with other matrices shares with this one, as `from_matrices` takes them; names come first."""
     names = (
         *("name", "states", "inputs", "units", "x_e", "u_e", "x_min", "x_max", "u_min", "u_max"),
         *("u_rate_max", "x0", "safe_input", "safe_gain", "performance", "kernel", "poles"),
@@ -77,7 +77,7 @@ def shared_fields(known: Known) -> dict[str, Any]:
 
 
 def _text(value: Any, indent: int) -> str:
-    """Python for a value: matrices a row a line, floats with `DIGITS` digits, texts in double quotes."""
+    """Python text of a value: matrices a row a line, floats with `DIGITS` digits, texts in double quotes."""
     if isinstance(value, np.ndarray) and value.ndim == 2:
         pad = " " * (indent + 4)
         rows = "".join(f"{pad}{_text(row, 0)},\n" for row in value)
@@ -95,6 +95,6 @@ def _text(value: Any, indent: int) -> str:
 
 
 def _quoted(text: str) -> str:
-    """In double quotes where it has none; what cannot be seen is written as its number."""
+    """In double quotes unless it contains one; invisible characters are escaped."""
     after_single = repr("'" + text)
     return f'"{after_single[2:]}' if after_single.startswith('"') else repr(text)

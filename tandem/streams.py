@@ -1,7 +1,7 @@
-"""Standard output and standard error of a command: whoever reads them, or has ceased to, nothing here fails by it.
+"""Standard output and standard error of a command. No failure of their reader makes a command fail.
 
-A pipe may be closed, a disk full, a terminal gone or of another encoding. What cannot be written is dropped, what
-cannot be encoded is written as ASCII, and the command goes on to its end; only its exit code tells of it.
+A pipe may be closed, a disk full, a terminal gone or of another encoding. Text that cannot be written is dropped,
+text that cannot be encoded is written as ASCII, and the command continues to its end. Only its exit code reports it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TextIO
 
-# One cell for one cell, so that what stands in columns stays there.
+# One cell for one cell, so that columns stay aligned.
 _STAND_INS = dict(zip("─━├┤┼●◀▶→–…▁▂▃▄▅▆▇█╸╺•’", "-=||+o<>>-._.:-=+*#==*'", strict=True))
 
 
 class Sink(io.RawIOBase):
-    """Writes to a file descriptor until that fails; what comes later is dropped."""
+    """Writes to a file descriptor until that fails; later text is dropped."""
 
     def __init__(self, number: int):
         self.number = number
@@ -38,7 +38,7 @@ class Sink(io.RawIOBase):
         return self._terminal
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        """All of `data`, or nothing any more."""
+        """Write all of `data`, or nothing after a failure."""
         while self.failed is None:
             try:
                 return os.write(self.number, data)
@@ -52,20 +52,20 @@ class Sink(io.RawIOBase):
 
     @property
     def lost(self) -> str:
-        """Why it failed; "" where it has not, or where only the reader has gone, who may."""
+        """Why writing failed; "" if it did not, or if only the reader closed the pipe, which is allowed."""
         if self.failed is None or self._terminal or self.failed.errno == errno.EPIPE:
             return ""
         return os.strerror(self.failed.errno or 0)
 
 
 class Output:
-    """What became of standard output."""
+    """State of standard output."""
 
     def __init__(self, sink: Sink | None = None):
         self._sink = sink
 
     def exit_code(self, code: int) -> int:
-        """The command's own, or 1 where all went well but what it had to say could not be written."""
+        """Return the command's own exit code, or 1 if the command succeeded but its output could not be written."""
         sys.stdout.flush()
         lost = self._sink.lost if self._sink is not None else ""
         if lost:
@@ -75,9 +75,9 @@ class Output:
 
 @contextmanager
 def never_failing() -> Iterator[Output]:
-    """Meanwhile `sys.stdout` and `sys.stderr` are streams that never fail. One that is closed is the null device."""
+    """Replace `sys.stdout` and `sys.stderr` by streams that never fail. A closed one becomes the null device."""
     own = sys.stdout, sys.stderr
-    if own != (sys.__stdout__, sys.__stderr__):  # somebody has put others there, to read what is written
+    if own != (sys.__stdout__, sys.__stderr__):  # a caller has replaced them to capture the output
         yield Output()
         return
     while (
@@ -100,11 +100,11 @@ def never_failing() -> Iterator[Output]:
 
 
 def blocked(stream: IO[str]) -> bool:
-    """Whether writing would wait for the reader: a full pipe, a terminal that was stopped with Ctrl-S."""
+    """Return whether writing would wait for the reader: a full pipe, a terminal that was stopped with Ctrl-S."""
     try:
         ready = select.poll()
         ready.register(stream.fileno(), select.POLLOUT)
-    except OSError:  # it is no file
+    except OSError:  # not a file
         return False
     return not ready.poll(0)
 
@@ -123,7 +123,7 @@ def _ascii(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def _escaped(character: str) -> str:
-    if "\u2500" <= character <= "\u28ff":  # lines, blocks, marks, and the dots that turn while one waits
+    if "\u2500" <= character <= "\u28ff":  # lines, blocks, marks and spinner dots
         return "*"
     return character.encode("ascii", "backslashreplace").decode()
 

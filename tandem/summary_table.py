@@ -1,4 +1,4 @@
-"""The figures of a run as commands give them: one JSON object, or a table."""
+"""The figures of a run as commands print them: one JSON object, or a table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.text import Text
 from run_log.reporting.summary import ADDS, Summary
 
 FOR_A_PERSON = ("skipped_slots",)
-"""Shown in the table alone; programs may count on everything else, in `run` and `simulate` alike."""
+"""Figures of the table alone; programs may rely on all others, in `run` and `simulate` alike."""
 
 MEANING = {
     "ticks": "control steps",
@@ -48,7 +48,7 @@ MEANING = {
     "log": "",
 }
 ABSENT = {"settled_s": "not settled", "excess_between_samples": "unknown"}
-"""What null means, where it is more than that there is no such figure."""
+"""Meaning of null, if it is more than a missing figure."""
 OF_EACH_STATE = {
     "overshoot": "share",
     "settled_by_state_s": "settled_s",
@@ -57,7 +57,7 @@ OF_EACH_STATE = {
     "constant_weight": "share",
     "noise": "",
 }
-"""Which figure of each performance state these are."""
+"""States to which these figures of each performance state belong."""
 WHERE_THERE_IS_ONE = (
     "unreached_ticks",
     "violated_rows",
@@ -68,8 +68,8 @@ WHERE_THERE_IS_ONE = (
     "constant_weight",
     "noise",
 )
-"""Rows that the table of another run has not: one without a reference, an estimator, or such a fault."""
-# Anything but zero is worth a look.
+"""Rows that appear only where they apply: with a reference, an estimator, or such a fault."""
+# Any value but zero is highlighted.
 SHOULD_BE_ZERO = (
     "late_ticks",
     "skipped_slots",
@@ -87,12 +87,12 @@ SHOULD_BE_ZERO = (
 
 
 def of(summary: Summary) -> dict[str, Any]:
-    """The object that `--json` prints."""
+    """Return the object that `--json` prints."""
     return {key: value for key, value in msgspec.to_builtins(summary).items() if key not in FOR_A_PERSON}
 
 
 def table(summary: Summary) -> Table:
-    """The same for a person, with what else there is to know."""
+    """Return the same as a table, with explanations."""
     columns = Column(style="bold"), Column(justify="right"), Column(style="dim")
     shown = Table(*columns, show_header=False, box=None, pad_edge=False, padding=(0, 2, 0, 0))
     figures = msgspec.to_builtins(summary)

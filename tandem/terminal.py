@@ -1,6 +1,6 @@
-"""What a person reads (rich) and what a program reads (one JSON object on standard output).
+"""Output for a person (rich) and for a program (one JSON object on standard output).
 
-What it needs is imported when something is shown: every process comes by here, and most show nothing.
+rich is imported on first use: every process imports this module, and most print nothing.
 """
 
 from __future__ import annotations
@@ -19,53 +19,53 @@ if TYPE_CHECKING:
 
 
 class Refused(Exception):
-    """What was asked cannot be done; the text says why and what to do, and is all that is shown."""
+    """The request cannot be done; the text says why and what to do, and is all that is shown."""
 
 
 def console(as_json: bool) -> Console:
-    """Where to write for a person: standard output, or standard error when a program reads the former."""
+    """Where to write for a person: standard output, or standard error if a program reads standard output."""
     from tandem.console import PlainConsole
 
     return PlainConsole(stderr=as_json)
 
 
 def say(console: Console, *lines: str, style: str | None = None) -> None:
-    """Lines for a person as they are: none is broken."""
+    """Print lines for a person without breaking any."""
     for text in lines:
         console.print(text, style=style, soft_wrap=True)
 
 
 def write(text: str) -> None:
-    """Text on standard output for a person or a program, without a console's widths and styles."""
+    """Print text to standard output for a person or a program, without a console's widths and styles."""
     sys.stdout.write(printable(text))
     sys.stdout.flush()
 
 
 def emit(result: Mapping[str, Any]) -> None:
-    """One JSON object on standard output, in ASCII; NaN becomes null, which JSON has."""
+    """Print one JSON object to standard output, in ASCII; NaN becomes null, since JSON has no NaN."""
     import msgspec
 
-    # msgspec's own encoder refuses the name of a file that is not UTF-8.
+    # msgspec's own encoder refuses a file name that is not UTF-8.
     tree = _finite(msgspec.to_builtins(result, enc_hook=_plain))
     write(json.dumps(tree, separators=(",", ":")) + "\n")
 
 
 def complain(text: str, as_json: bool) -> None:
-    """A message for a person on standard error; for a program too, `{"error": ...}` on standard output."""
+    """Print a message for a person to standard error; for a program also `{"error": ...}` to standard output."""
     say(console(as_json=True), f"tandem: {text}", style="red")
     if as_json:
         emit({"error": text})
 
 
 def progress_bar(console: Console) -> Progress:
-    """A bar of things done, on a terminal."""
+    """A progress bar of counted items, on a terminal."""
     from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
     return _bar(console, MofNCompleteColumn(), TimeRemainingColumn())
 
 
 def share_bar(console: Console) -> Progress:
-    """A bar of shares of a whole, on a terminal."""
+    """A progress bar of shares of a whole, on a terminal."""
     from rich.progress import TaskProgressColumn, TimeElapsedColumn
 
     return _bar(console, TaskProgressColumn(), TimeElapsedColumn())
@@ -85,7 +85,7 @@ def _bar(console: Console, *columns: ProgressColumn) -> Progress:
 
 
 def limited(option: str, value: float, low: float, high: float) -> None:
-    """Raises `Refused` for an option's value that is not from `low` to `high`; NaN is not."""
+    """Raise `Refused` if an option's value is not from `low` to `high`, or NaN."""
     if value < low:
         raise Refused(f"{option} {value:g}: at least {low:g}")
     if not value <= high:
@@ -93,7 +93,7 @@ def limited(option: str, value: float, low: float, high: float) -> None:
 
 
 def _finite(value: Any) -> Any:
-    """A plain tree with null for every number that JSON does not have."""
+    """Return a plain tree with null for every number that JSON does not have."""
     if isinstance(value, dict):
         return {key: _finite(below) for key, below in value.items()}
     if isinstance(value, list | tuple):
@@ -102,7 +102,7 @@ def _finite(value: Any) -> Any:
 
 
 def _plain(value: object) -> Any:
-    """numpy scalars and arrays, paths, anything with a plain form."""
+    """Convert numpy scalars and arrays, paths, and other objects with a plain form."""
     for method in ("tolist", "item"):
         convert = getattr(value, method, None)
         if convert is not None:

@@ -1,1 +1,1 @@
-"""The trainer: collects samples, trains the hidden layers, and sends them to the controller."""
+"""The trainer: it collects samples, trains the hidden layers, and sends them to the controller."""

@@ -1,8 +1,8 @@
-"""Adam on the hidden layers: of one network, or of many of one shape in one step.
+"""Adam on the hidden layers, of one network or of several networks of one shape in each step.
 
-Many: their layers, samples and output weights are stacked, and every operation of a step is called once for all of
-them. Nothing is summed across plants, so a plant's numbers never enter another's. To rounding the result is
-that of `descend` alone; a stack sums in another order.
+For several networks the layers, samples and output weights are stacked, and every operation of a step is called once
+for all of them. No sum runs across plants, so a plant's numbers never influence another's. Up to rounding the result is
+that of `descend` for each network, because a stack sums in another order.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from network_model.description import NetworkDescription
 from trainer_node.network import ACTIVATIONS, BACKWARD, Loss, Network, build_loss
 
 CACHED_ROWS = 2048
-"""Samples of a stack on a CPU: with more at once every step goes to memory, and is slower than one by one."""
+"""Samples in a stack on a CPU. With more, every step accesses main memory and is slower than separate steps."""
 LOOK_EVERY = 10
-"""Steps between two looks at what is held out; the last step is looked at too."""
+"""Steps between two evaluations of the held-out samples; the last step is evaluated too."""
 LANES = 256
-"""Plants of a stack on a GPU."""
+"""Plants in a stack on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -32,29 +32,29 @@ class Problem:
     """One plant's training."""
 
     network: Network
-    """Holds the hidden layers to start from."""
+    """Contains the initial hidden layers."""
     window: np.ndarray
     """(M, k (d + m)), plant units."""
     h: np.ndarray
     """(M, d)."""
     K: np.ndarray
-    """(1 + n_L, d), fixed."""
+    """(1 + n_L, d), constant."""
     held_out: tuple[np.ndarray, np.ndarray] | None = None
-    """Windows and h of samples that are not trained on and say when to stop; None: all steps are taken."""
+    """Windows and h of samples that are not trained on and determine the best step; None takes all steps."""
 
 
 class Descent(NamedTuple):
-    """What became of one plant's hidden layers."""
+    """The result for one plant's hidden layers."""
 
     hidden: list[np.ndarray]
-    """W_1..W_{L-1}, (1 + n_{i-1}, n_i) each; not finite where the samples or K lead there."""
+    """W_1..W_{L-1}, (1 + n_{i-1}, n_i) each; not finite if the samples or K cause that."""
     before: float
     after: float
-    """The losses."""
+    """Losses before and after."""
 
 
 def shape_of(description: NetworkDescription) -> Hashable:
-    """Equal for networks that can be trained in one stack: all but the scales, which are data."""
+    """Return a key that is equal for networks that can be stacked. Scales may differ, because they are data."""
     d = description
     return (
         d.states,
@@ -68,7 +68,7 @@ def shape_of(description: NetworkDescription) -> Hashable:
 
 
 def descend(problem: Problem, steps: int, learning_rate: float) -> Descent:
-    """`steps` of Adam on one network; of those up to where it was best on what is held out, where there is such."""
+    """Take `steps` of Adam on one network. With held-out samples the best evaluated step is the result."""
     network = problem.network
     loss = build_loss(network, problem.window, problem.h, problem.K)
     if problem.held_out is not None:
@@ -82,7 +82,7 @@ def descend(problem: Problem, steps: int, learning_rate: float) -> Descent:
 
 
 def _best(network: Network, loss: Loss, held_out: Loss, steps: int, learning_rate: float) -> float:
-    """Leave the network where `held_out` was lowest on the way, and return that."""
+    """Train, leave the network at the lowest value of `held_out`, and return that value."""
     best = [held_out.value(), network.flat.detach().clone()]
 
     def look(taken: int) -> None:
@@ -96,7 +96,7 @@ def _best(network: Network, loss: Loss, held_out: Loss, steps: int, learning_rat
 
 
 def descend_together(problems: Sequence[Problem], steps: int, learning_rate: float) -> list[Descent]:
-    """`descend` for networks of one shape on one device, in one stack.
+    """Do `descend` for networks of one shape on one device, in one stack.
 
     Raises:
         ValueError: the networks have different shapes.
@@ -119,7 +119,7 @@ def _descend(problems: Sequence[Problem], steps: int, learning_rate: float) -> l
     before = stack.values().tolist()
     _adam(stack.flat, stack.gradient, steps, learning_rate)
     after = stack.values().tolist()
-    # One copy from the device, not one for each layer of each plant.
+    # One copy from the device for all layers and plants.
     rows = stack.flat.cpu()
     hidden = [[W.numpy().astype(np.float64) for W in stack.network.layers(row)] for row in rows]
     return [Descent(*parts) for parts in zip(hidden, before, after, strict=True)]
@@ -137,7 +137,7 @@ def _adam(
         taken = torch.zeros((), device=parameter.device)
         for number in range(steps):
             slope = gradient()
-            # What torch.optim.Adam calls. The class would import the rest of torch, over a second.
+            # The function that torch.optim.Adam calls. The class would import much of torch, which takes over a second.
             adam(
                 [parameter],
                 [slope],
@@ -158,7 +158,7 @@ def _adam(
 
 
 class _Stack(ABC):
-    """P problems as tensors, and their losses. A plant with fewer than M samples is filled up with rows of weight 0."""
+    """P problems as tensors, and their losses. Plants with fewer than M samples are padded with rows of weight 0."""
 
     def __init__(self, problems: Sequence[Problem]):
         self.network = problems[0].network
@@ -185,23 +185,23 @@ class _Stack(ABC):
         self.weights = K[:, 1:].contiguous()
         """(P, n_L, d)"""
         self.share = stacked([tensor([[1.0 / len(p.window)]] * len(p.window)) for p in problems])
-        """(P, M, 1): what a row counts in its plant's mean."""
+        """(P, M, 1): weight of a row in its plant's mean."""
 
     @abstractmethod
     def values(self) -> torch.Tensor:
-        """The loss of each plant, (P,)."""
+        """Return the loss of each plant, (P,)."""
 
     @abstractmethod
     def gradient(self) -> torch.Tensor:
-        """(P, N), one row a plant; the next call may overwrite it."""
+        """Return the gradients, (P, N), one row per plant; the next call may overwrite them."""
 
 
 class _Mapped(_Stack):
-    """Any architecture: its loss mapped over the plants."""
+    """Losses of any architecture, mapped over the plants."""
 
     def __init__(self, problems: Sequence[Problem]):
         super().__init__(problems)
-        # Only here: it takes a while to import, and a single plant does without.
+        # Imported here, because the import is slow and a single plant does not need it.
         from torch.func import grad, vmap
 
         network = self.network
@@ -230,7 +230,7 @@ class _Mapped(_Stack):
 
 
 class _Dense(_Stack):
-    """Dense layers, their gradient by hand, as `DenseLoss` with one more dimension in front."""
+    """Losses of dense layers with a handwritten gradient: `DenseLoss` with a leading dimension of plants."""
 
     def __init__(self, problems: Sequence[Problem]):
         super().__init__(problems)

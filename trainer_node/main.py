@@ -23,17 +23,17 @@ def main(config: Config, stop: threading.Event | None = None, plants: str | None
     """Train until told to stop.
 
     Args:
-        config: of this process; the networks' shapes come from the controllers. An architecture of one's own has to be
-            named in it, for what a message names is never loaded.
-        stop: ends it; signals do too.
-        plants: names of the plants, as a pattern of fnmatch; None: all of `trainer.fleet`, or, where that is empty,
-            the one plant of the configuration.
+        config: the configuration of this process; the shapes of networks come from the controllers. A user's
+            architecture must be configured here, because a file named in a message is never loaded.
+        stop: ends the training; signals do too.
+        plants: names of the plants, as a pattern for fnmatch; None for all of `trainer.fleet`, or for the configured
+            plant if that list is empty.
 
     Returns:
-        0 when told to stop; 2 when this machine cannot train as configured, or the pattern leaves no plant.
+        0 when told to stop; 2 if this machine cannot train as configured, or no plant matches the pattern.
 
     Raises:
-        ConfigError: the file of the architecture is not there, or cannot be used.
+        ConfigError: the file of the architecture does not exist or cannot be used.
     """
     register_architecture(config)
     try:

@@ -1,9 +1,9 @@
 """The network of network_model/description.py in torch, for training its hidden layers under a fixed output layer.
 
-A layer is (1 + n_{i-1}, n_i) with its bias as the first row. All layers lie one behind the other in a single
-parameter. The gradient of dense layers is written out by hand: with layers of this size nearly all the time of a
-training step is the cost of calling torch, and this makes the fewest calls: about half the time of autograd, which
-does every other architecture.
+A layer is (1 + n_{i-1}, n_i) with its bias as the first row. All layers are stored in a single parameter. The gradient
+of dense layers is written by hand. For layers of this size most of the time of a training step is the cost of calling
+torch, and the handwritten gradient needs the fewest calls, about half the time of autograd. Autograd is used for all
+other architectures.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from network_model.description import NetworkDescription
 from network_model.operations import Activation
 from network_model.registry import get_architecture
 
-# torch's softplus becomes the identity above `threshold`; at its default, 20, that is off by 2e-9.
+# Above `threshold` torch's softplus is the identity; at the default of 20 its error would be 2e-9.
 ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
     "tanh": torch.tanh,
     "sigmoid": torch.sigmoid,
@@ -28,7 +28,7 @@ ACTIVATIONS: dict[Activation, Callable[[torch.Tensor], torch.Tensor]] = {
     "relu": torch.relu,
 }
 
-# Each activation's way back, from the gradient g and its value s = psi(a) alone.
+# Backward pass of each activation from the gradient g and its value s = psi(a).
 BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
     "tanh": torch.ops.aten.tanh_backward,
     "sigmoid": torch.ops.aten.sigmoid_backward,
@@ -39,7 +39,7 @@ BACKWARD: dict[Activation, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]]
 
 
 class _Tensors:
-    """The operations of `network_model.operations`: a value is (M, n), a layer its bias (n,) and weights (n_a, n)."""
+    """The operations of `network_model.operations`. A value is (M, n); a layer is bias (n,) and weights (n_a, n)."""
 
     def affine(self, layer: tuple[torch.Tensor, torch.Tensor], a: torch.Tensor) -> torch.Tensor:
         return torch.addmm(layer[0], a, layer[1])
@@ -52,14 +52,14 @@ class _Tensors:
 
 
 class Network:
-    """h_hat(x, u) = output_scale * K' phi(x, u), with W_1..W_{L-1} as its only parameter and K given.
+    """h_hat(x, u) = output_scale * K' phi(x, u), with W_1..W_{L-1} as its only parameter and a given K.
 
-    What it is given is (x, u) (M, d + m), or a window of k pairs, oldest first, (M, k (d + m)): one row a sample.
+    Its input is (x, u) (M, d + m), or a window of k pairs, oldest first, (M, k (d + m)): one row per sample.
 
     Args:
         description: sizes, activations and scaling.
         dtype: float32 to train; float64 to compare with another implementation.
-        device: where it lives; it cannot be moved afterwards.
+        device: the device of its tensors, which cannot be changed later.
     """
 
     def __init__(
@@ -79,15 +79,15 @@ class Network:
 
     @property
     def dense(self) -> bool:
-        """Whether its gradient is written out by hand."""
+        """Whether its gradient is written by hand."""
         return self.description.architecture == "mlp"
 
     def tensor(self, values: np.ndarray | list[float] | list[list[float]]) -> torch.Tensor:
-        """A copy of `values` in this network's dtype, on its device."""
+        """Return a copy of `values` in this network's dtype, on its device."""
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 
     def layers(self, of: torch.Tensor | None = None) -> list[torch.Tensor]:
-        """W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each; `of`: of these (..., N) instead."""
+        """Return W_1..W_{L-1} as views, (1 + n_{i-1}, n_i) each, of `of` (..., N) or of the parameter."""
         flat = self.flat if of is None else of
         views, start = [], 0
         for rows, columns in self.description.layer_shapes:
@@ -96,7 +96,7 @@ class Network:
         return views
 
     def load(self, hidden: list[np.ndarray]) -> None:
-        """Take over W_1..W_{L-1}. Raises `ValueError` when the shapes are not the description's."""
+        """Take over W_1..W_{L-1}. Raises `ValueError` if the shapes differ from the description's."""
         shapes = [tuple(layer.shape) for layer in hidden]
         if shapes != self.description.layer_shapes:
             raise ValueError(f"hidden layers have shapes {shapes}, expected {self.description.layer_shapes}")
@@ -105,22 +105,22 @@ class Network:
                 view.copy_(self.tensor(layer))
 
     def hidden(self) -> list[np.ndarray]:
-        """W_1..W_{L-1} as float64 arrays, (1 + n_{i-1}, n_i) each."""
+        """Return W_1..W_{L-1} as float64 arrays, (1 + n_{i-1}, n_i) each."""
         return [layer.detach().cpu().numpy().astype(np.float64) for layer in self.layers()]
 
     def scaled(self, window: torch.Tensor) -> torch.Tensor:
-        """Windows in units of `input_scale`."""
+        """Return windows in units of `input_scale`."""
         return window / self._input_scale
 
     def activations(
         self, scaled: torch.Tensor, layers: Sequence[tuple[torch.Tensor, torch.Tensor]]
     ) -> torch.Tensor:
-        """phi without its leading 1, (M, n_L), of scaled windows under these biases and weights."""
+        """Return phi without its leading 1, (M, n_L), of scaled windows under these biases and weights."""
         pairs = scaled.split(self.description.pair, dim=1)
         return self._architecture.forward(_Tensors(), self._sizes, layers, pairs)
 
     def scaled_targets(self, h: torch.Tensor) -> torch.Tensor:
-        """h, (M, d), in units of `output_scale`."""
+        """Return h, (M, d), in units of `output_scale`."""
         return h / self._output_scale
 
 
@@ -128,8 +128,8 @@ class Loss(ABC):
     """Mean over M samples of |(h - h_hat) / output_scale|^2 under a fixed K, and its gradient.
 
     Args:
-        network: whose hidden layers are trained.
-        window: what it is given, (M, k (d + m)), plant units.
+        network: the network whose hidden layers are trained.
+        window: its inputs, (M, k (d + m)), plant units.
         h: (M, d), units of h.
         K: (1 + n_L, d), fixed; a copy is kept.
     """
@@ -138,32 +138,32 @@ class Loss(ABC):
         self._network = network
         output = network.tensor(K)
         self._inputs = network.scaled(network.tensor(window))
-        # K' phi - h is one fused call when the targets are folded into the bias of the output layer.
+        # With the targets folded into the bias of the output layer, K' phi - h is one fused call.
         self._offset = output[0] - network.scaled_targets(network.tensor(h))
         self._weights = output[1:]
         self._gradient = torch.zeros_like(network.flat, requires_grad=False)
 
     @abstractmethod
     def value(self) -> float:
-        """The loss at the present hidden layers."""
+        """Return the loss at the present hidden layers."""
 
     @abstractmethod
     def gradient(self) -> torch.Tensor:
-        """The gradient at the present layers, laid out as `network.flat`; the next call overwrites it."""
+        """Return the gradient at the present layers in the layout of `network.flat`; the next call overwrites it."""
 
 
 def build_loss(network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray) -> Loss:
-    """The loss as it is computed fastest for this network; arguments as for `Loss`."""
+    """Return the fastest implementation of the loss for this network; arguments as for `Loss`."""
     kind = DenseLoss if network.dense else AutogradLoss
     return kind(network, window, h, K)
 
 
 class AutogradLoss(Loss):
-    """Of any architecture."""
+    """The loss of any architecture, by autograd."""
 
     def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
         super().__init__(network, window, h, K)
-        # Leaves of their own on the same memory: views of one parameter would each give a gradient of its full length.
+        # Separate leaves on the same memory. Views of one parameter would each give a gradient of its full length.
         self._layers = [
             (layer[0].detach().requires_grad_(), layer[1:].detach().requires_grad_())
             for layer in network.layers()
@@ -189,7 +189,7 @@ class AutogradLoss(Loss):
 
 
 class DenseLoss(Loss):
-    """Of dense layers, its gradient by hand."""
+    """The loss of dense layers, with a handwritten gradient."""
 
     def __init__(self, network: Network, window: np.ndarray, h: np.ndarray, K: np.ndarray):
         super().__init__(network, window, h, K)
@@ -206,7 +206,7 @@ class DenseLoss(Loss):
         ]
 
     def _forward(self) -> tuple[list[torch.Tensor], torch.Tensor]:
-        """The input's and every hidden layer's values without their leading 1, and the residual, (M, d)."""
+        """Return the values of the input and every hidden layer without their leading 1, and the residual, (M, d)."""
         values = [self._inputs]
         for layer in self._layers:
             values.append(layer.activation(torch.addmm(layer.bias, values[-1], layer.weights)))
@@ -232,7 +232,7 @@ class DenseLoss(Loss):
 
 
 class _Layer(NamedTuple):
-    """Views into the parameter and its gradient, made once: each costs as much as a small product."""
+    """Views of the parameter and its gradient, created once because each costs as much as a small product."""
 
     bias: torch.Tensor
     weights: torch.Tensor

@@ -1,7 +1,7 @@
-"""The live shell around one plant's `Trainer`: collect samples, train when due, publish.
+"""The live loop around one plant's `Trainer`: it collects samples, trains when due, and publishes.
 
-It may start before, with or long after the controller, and may be restarted at any time: one query to the
-controller gives the hidden layers in force, another one the samples that were missed.
+It may start before, with or long after the controller, and may be restarted at any time. One query to the controller
+returns the hidden layers in use, and another one the samples that were missed.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from trainer_node.training import Draw, Trainer
 log = logging.getLogger(__name__)
 
 POLL = 0.02
-"""Seconds between two looks at what has arrived."""
+"""Seconds between two checks for messages."""
 JOIN_EVERY = 0.5
-"""Seconds between two questions for the hidden layers, at least."""
+"""Minimum seconds between two queries for the hidden layers."""
 REFILL_EVERY = 1.0
-"""Seconds between two questions for missed samples, at least."""
+"""Minimum seconds between two queries for missed samples."""
 TRAIN_EVERY = 0.4
-"""Seconds between the beginnings of two trainings, at least: a fast loop's samples would keep a core busy for good,
-and it is the loop that needs it."""
+"""Minimum seconds between the starts of two trainings. Without it, a fast loop's samples would keep a core busy all the
+time, and the loop needs that core."""
 SHARE = 0.5
-"""Of the time, at most, is spent training: a network that takes long to train is trained less often."""
+"""Largest share of the time spent on training. A network that is slow to train is trained less often."""
 VERDICT_PERIODS, VERDICT_PATIENCE = 3, 0.1
-"""A controller that has not adopted a set after so many periods, and seconds, is asked what it judged."""
+"""Periods, and seconds, after which a controller that has not adopted a set is queried for its decision."""
 ADOPTION_PATIENCE = 2.0
-"""Seconds after which a set that was not judged either is taken for lost, or for kept out by somebody else's."""
+"""Seconds after which a set without a decision counts as lost or as displaced by another trainer's set."""
 SENT_KNOWN = 64
-"""Sets that were sent last, known again when the controller says what it judged."""
+"""Number of the last sent sets that are recognised in the controller's answers."""
 OUTBOX = 20_000
-"""Samples to ask for when the buffer can make use of more than it holds."""
+"""Number of samples to query for if the buffer can use more than it holds."""
 
 COUNTERS = (
     "samples",
@@ -62,24 +62,24 @@ COUNTERS = (
     "joined",
     "samples of other runs",
 )
-"""Of a node, beside those of its `Trainer`."""
+"""Counters of a node, in addition to those of its `Trainer`."""
 WAITING = "waiting for a controller with a network"
 DISABLED = "trainer.enabled is false: hidden layers are not trained"
 
 
 Judged = tuple[int, str]
-"""Version and sha256 of hidden weights that a controller adopted or refused."""
+"""Version and SHA-256 of the hidden weights that a controller adopted or refused last."""
 
 
 class TrainerNode:
-    """One plant's trainer on the bus. All but waiting for answers happens in the thread that calls.
+    """One plant's trainer on the bus. Everything except waiting for answers happens in the calling thread.
 
     Args:
-        config: with the plant's name.
-        bus: the plant's.
-        health: what is said of this trainer.
-        counts: this node's own figures, kept up to date here; other threads may copy it.
-        askers: who waits for answers.
+        config: the configuration with the plant's name.
+        bus: the plant's bus.
+        health: publishes the state of this trainer.
+        counts: the node's counters, which are updated here; other threads may copy them.
+        askers: runs the threads that wait for answers.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class TrainerNode:
 
     @property
     def settings(self) -> TrainerConfig:
-        """How it trains: the same for all nodes of a process."""
+        """The settings of the training, which are equal for all nodes of a process."""
         return self._config.trainer
 
     @property
@@ -118,13 +118,13 @@ class TrainerNode:
         return self._trainer
 
     def start(self) -> None:
-        """Say that it is here."""
+        """Publish the initial health."""
         self._health.set("ready", WAITING if self._config.trainer.enabled else DISABLED)
 
     def listen(self, now: float) -> None:
-        """Look at all that has arrived, and ask for what is missing; `now` in seconds on the monotonic clock.
+        """Handle all messages, and query for missing data; `now` in seconds on the monotonic clock.
 
-        While a question is open, messages stay where they are: what is missing is known again after its answer.
+        While a query is open, messages wait, because its answer determines what is missing.
         """
         if not self._config.trainer.enabled:
             return
@@ -136,7 +136,7 @@ class TrainerNode:
             self._follow(received.message, now)
         if self._must_join() and now >= self._join_at and not answered:
             self._join_at = now + JOIN_EVERY
-            # Of the controller that sends K; before that, of any that answers.
+            # Ask the controller that sends K, or any controller before the first K.
             self._questions.ask_hidden(self._joined)
             return
         for batch in self._samples.take_all():
@@ -148,19 +148,19 @@ class TrainerNode:
             self._waits_since = now
 
     def update_counters(self) -> None:
-        """Bring the figures up to date."""
+        """Update the counters."""
         if self._trainer is not None:
             self._counts.update(self._trainer.counters, buffer=len(self._trainer.buffer))
 
     def waits_since(self, now: float) -> float | None:
-        """Since when this plant could be trained, None when it cannot be now."""
+        """Return since when this plant has been ready for training; None if it is not ready."""
         ready = now >= self._train_at and not self._questions.open and self._may_train()
         return self._waits_since if ready else None
 
     # -- which controller, which hidden layers ---------------------------------------------------------------
 
     def _follow(self, output: m.OutputWeights, now: float) -> None:
-        """Take note of the newest K, and of whether the controller holds the hidden layers it was sent."""
+        """Record the newest K, and check whether the controller uses the hidden layers that were sent to it."""
         self._output = output
         if self._trainer is None or output.run_id != self._run:
             return
@@ -169,13 +169,13 @@ class TrainerNode:
                 self._count("adopted")
             self._asks, self._sent_at = False, None
             return
-        # Refused, rolled back, still on the way, or another's were adopted: the controller knows which.
+        # They were refused, rolled back, not received yet, or displaced by others. The controller knows which.
         under_way = self._sent_at is not None and output.hidden_version < self._trainer.version
         if not under_way or now - (self._sent_at or 0.0) > self._verdict_patience:
             self._asks = True
 
     def _must_join(self) -> bool:
-        """Whether the hidden layers here are not, or may not be, those of the controller that sends K."""
+        """Return whether the hidden layers here may differ from those of the controller that sends K."""
         if self._trainer is None or self._asks:
             return True
         return self._output is not None and self._output.run_id != self._run
@@ -187,7 +187,7 @@ class TrainerNode:
                 return
 
     def _take_over(self, snapshot: m.HiddenSnapshot) -> bool:
-        """Follow the controller that holds these hidden layers; whether they can be used."""
+        """Follow the controller with these hidden layers; return whether they are usable."""
         judged = (snapshot.judged_version, snapshot.judged_sha256)
         followed = self._trainer is not None and snapshot.run_id == self._run
         if followed and not self._is_settled(snapshot, judged):
@@ -199,7 +199,7 @@ class TrainerNode:
             return False
         self._asks, self._sent_at = False, None
         if judged not in self._explained:
-            # Whoever sent it: from now on it says nothing new.
+            # A decision is evaluated once, no matter which process sent the set.
             self._explained.append(judged)
         if followed and trainer is self._trainer:
             return True
@@ -213,52 +213,58 @@ class TrainerNode:
         return True
 
     def _is_settled(self, snapshot: m.HiddenSnapshot, judged: Judged) -> bool:
-        """Why the controller that is followed holds other hidden layers than those it was sent.
+        """Determine why the followed controller uses other hidden layers than those that were sent.
 
         Returns:
-            Whether to go on from its own; not where those it was sent are in use by now, or may be on their way.
+            True to continue from the controller's layers; False if the sent ones are in use now or may still arrive.
         """
         assert self._trainer is not None
         ours, held = self._trainer.version, snapshot.hidden_version
         sent = self._explained[-1] if self._sent_at is not None else None
         if snapshot.hidden_sha256 == self._trainer.sha256:
-            # What it says of K will count it.
+            # The next K with these layers counts the adoption.
             self._asks = False
             return False
         if held > ours or judged not in self._explained:
             text = "the controller was sent hidden weights version %d by another trainer; it holds version %d"
             log.warning(text, judged[0] if judged not in self._explained else held, held)
             self._count("others' sets")
-            # A version that a controller would not take must not become ours.
+            # A version that the controller would refuse must not be used.
             self._trainer.leap(judged[0])
         elif sent is None or (judged == sent and held >= ours):
             self._count("rolled back")
-            log.info("the controller went back from hidden weights version %d; going on from there", ours)
+            log.info(
+                "the controller rolled back hidden weights version %d; continuing from its present ones", ours
+            )
             self._join_at = 0.0
         elif judged == sent:
             self._count("not adopted")
-            log.info("the controller refused hidden weights version %d; going on from version %d", ours, held)
+            log.info(
+                "the controller refused hidden weights version %d; continuing from version %d", ours, held
+            )
             self._join_at = 0.0
         elif clock.now() - (self._sent_at or 0.0) > self._patience:
             self._count("not adopted")
-            log.warning("hidden weights version %d were never judged; going on from version %d", ours, held)
+            log.warning(
+                "there was no decision on hidden weights version %d; continuing from version %d", ours, held
+            )
             self._trainer.leap()
         else:
             return False
         return True
 
     def _trainer_from(self, snapshot: m.HiddenSnapshot) -> Trainer:
-        """One that goes on from these hidden layers: the present one where the network is the same.
+        """Return a trainer that continues from these hidden layers, the present one if the network is the same.
 
         Raises:
-            ValueError: they are damaged, or not acceptable for their network.
+            ValueError: the layers are damaged, or not acceptable for their network.
         """
         before, version = self._trainer, max(0, snapshot.hidden_version)
         layers = [layer.numpy().astype(float) for layer in snapshot.layers]
         if hash_layers(layers) != snapshot.hidden_sha256:
             raise ValueError("sha256 does not match the layers")
         description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
-        # Before any memory is taken for it.
+        # Check before allocating memory for the layers.
         if (reason := why_unacceptable(description, layers)) is not None:
             raise ValueError(reason)
         if before is not None and before.description == description:
@@ -267,7 +273,7 @@ class TrainerNode:
         config = self._config
         trainer = Trainer(description, config.trainer, config.seed, self._bus.run_id, layers, version)
         if before is not None:
-            # Samples of another network's plant are of no use, but versions go on rising.
+            # The samples of another network are not usable, but versions must keep rising.
             trainer.version = max(trainer.version, before.version)
             trainer.counters.update(before.counters)
         return trainer
@@ -275,19 +281,19 @@ class TrainerNode:
     # -- samples ---------------------------------------------------------------------------------------------
 
     def _merge(self, batch: m.Samples) -> None:
-        """Add live samples. Where one may have been lost before them, the outbox will be asked."""
+        """Add live samples. If samples before them may be missing, the outbox will be queried."""
         if self._trainer is None or batch.run_id != self._run:
-            # Not lost: once that run's K has come, joining it asks its outbox for all of them.
+            # These samples are not lost: after the first K of that run, its outbox is queried for all samples.
             self._count("samples of other runs")
             return
         last = self._trainer.buffer.last(self._run)
-        # Ticks that the controller missed leave gaps too; then the outbox has nothing more either.
+        # Ticks without a sample leave gaps too, for which the outbox has no more samples.
         if batch.samples and batch.samples[0].seq > last + 1 and self._gap is None:
             self._gap = last
         self._add(topics.SAMPLES, batch)
 
     def _refill(self, since: int) -> None:
-        """Ask for all samples after `since`. Without an answer the gap stays, and is asked for again."""
+        """Query for all samples after `since`. Without an answer the gap stays and is queried again."""
         if self._trainer is None:
             return
         settings = self._config.trainer
@@ -300,12 +306,12 @@ class TrainerNode:
         for batch in batches:
             if batch.run_id == self._run:
                 self._gap = None
-            # A controller that was started again keeps samples of its earlier runs.
+            # A restarted controller also keeps samples of its earlier runs.
             new += self._add(SAMPLES_ANSWER, batch)
         if new:
             self._count("gaps filled")
         if self._trainer.buffer.last(self._run) <= since:
-            # No answer, but nothing came after the gap either: nothing is known to be missing.
+            # Without an answer and without later samples, nothing is known to be missing.
             self._gap = None
 
     def _add(self, topic: Topic, batch: m.Samples) -> int:
@@ -321,7 +327,7 @@ class TrainerNode:
     # -- training --------------------------------------------------------------------------------------------
 
     def _may_train(self) -> bool:
-        """Whether it is time, and the newest K belongs to the hidden layers that would be trained."""
+        """Return whether training is due and the newest K belongs to the hidden layers to be trained."""
         trainer, output = self._trainer, self._output
         return (
             trainer is not None
@@ -332,22 +338,22 @@ class TrainerNode:
         )
 
     def begin(self) -> Draw | None:
-        """Begin a training, None when the hidden layers stay; only while `waits_since` gives a time."""
+        """Begin a training; None if the hidden layers are kept. Call it only while `waits_since` returns a time."""
         assert self._trainer is not None
         assert self._output is not None
         self._waits_since = None
         return self._trainer.begin(self._output, self._run)
 
     def rest(self, now: float, took: float) -> None:
-        """Not to be trained again too soon after a round that began at `now` and took this long, in seconds."""
+        """Delay the next training after a round that began at `now` and took `took` seconds."""
         self._counts["last training, ms"] = round(took * 1e3)
         self._train_at = now + max(TRAIN_EVERY, took / SHARE)
 
     def finish(self, draw: Draw, descent: Descent) -> None:
-        """Publish what the training found, if it is any good."""
+        """Publish the result of a training if it is an improvement."""
         assert self._trainer is not None
         weights = self._trainer.finish(draw, descent)
-        self._say_worth(self._trainer.worth)
+        self._report_worth(self._trainer.worth)
         if weights is None:
             return
         self._bus.publish(topics.HIDDEN_WEIGHTS, weights)
@@ -355,8 +361,8 @@ class TrainerNode:
         self._explained.append((weights.seq, weights.sha256))
         self._count("published")
 
-    def _say_worth(self, worth: Worth | None) -> None:
-        """What the last training was good for: in health, and in the log where that is new."""
+    def _report_worth(self, worth: Worth | None) -> None:
+        """Report the benefit of the last training in health, and in the log if it changed."""
         words = f"following {self._run}" + ("" if worth is None else f"; {worth}")
         pays = None if worth is None else worth.pays
         if worth is not None and pays != self._pays:

@@ -1,8 +1,8 @@
-"""When to train again where labels are noisy: later and later where there is nothing to gain.
+"""The pace of training with noisy labels: trainings become rarer while they bring no gain.
 
-After a training that gained nothing the next one waits for twice as many new samples as this one did, until a share of
-the buffer is new. It begins at once when the newest samples are predicted worse than what was held out then. Losses and
-gains are shares of the labels' variance: a network that predicts h has a loss of 1.
+After a training without gain the next one waits for twice as many new samples as this one did, up to a share of the
+buffer. It starts at once if the newest samples are predicted worse than the samples held out before. Losses and gains
+are in units of the labels' variance: a network that predicts h exactly has a loss of 1.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 GAIN = 0.05
-"""What is less is nothing: its fit would be one of the noise."""
+"""Smallest gain that counts. A smaller one would fit the noise."""
 RISE = 1.0
-"""By how much the loss on the newest samples is higher where something has changed."""
+"""Increase of the loss on the newest samples that indicates a change of the plant."""
 RENEWED = 0.25
-"""Share of the buffer that is new, at most, before the next training."""
+"""Share of new samples in the buffer after which the next training is always due."""
 
 
 @dataclass(frozen=True)
 class Worth:
-    """What a training was good for."""
+    """The benefit of a training."""
 
     gain: float
-    """By how much the loss fell on samples that were not trained on."""
+    """Decrease of the loss on samples that were not trained on."""
     pays: bool
-    """Whether hidden layers came of it."""
+    """Whether the training gave new hidden layers."""
 
     def __str__(self) -> str:
         if self.pays:
@@ -33,11 +33,11 @@ class Worth:
 
 
 class Pace:
-    """Counts samples that are new since the last training began.
+    """Counts the new samples since the start of the last training.
 
     Args:
-        shortest: samples between two trainings where there is something to gain, and between two looks at the loss.
-        capacity: of the buffer.
+        shortest: samples between two trainings with gain, and between two evaluations of the loss.
+        capacity: capacity of the buffer.
     """
 
     def __init__(self, shortest: int, capacity: int):
@@ -46,29 +46,29 @@ class Pace:
         self.hurry()
 
     def hurry(self) -> None:
-        """The next training is due as soon as after one that gained something."""
+        """Make the next training due as soon as after one with gain."""
         self._wait = self._looked_at = self._shortest
 
     def trained(self, fresh: int, loss: float, worth: Worth) -> None:
-        """After a training that began with so many new samples, and from this loss on what it held out."""
+        """Record a training that began with `fresh` new samples and the held-out loss `loss`."""
         self.hurry()
         if not worth.pays:
-            # Where trainings are farther apart than they need be, it is that distance which doubles.
+            # If trainings were farther apart than necessary, that distance is doubled.
             self._wait = min(2 * max(fresh, self._shortest), self._longest)
             self._loss, self._looked_at = loss, 0
 
     def over(self, fresh: int) -> bool:
-        """Whether so many new samples are enough."""
+        """Return whether `fresh` new samples are enough for a training."""
         return fresh >= self._wait
 
     def must_look(self, fresh: int) -> bool:
-        """Whether so many new samples are enough to look at the loss on the newest of them again."""
+        """Return whether `fresh` new samples are enough to evaluate the loss on the newest of them again."""
         if fresh < self._looked_at + self._shortest:
             return False
         self._looked_at = fresh
         return True
 
     def look(self, loss: float) -> None:
-        """Hurry where the loss on the newest samples has risen."""
+        """Make a training due if the loss on the newest samples has risen."""
         if loss > self._loss + RISE:
             self.hurry()

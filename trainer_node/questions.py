@@ -1,4 +1,4 @@
-"""What a trainer asks its plant's controller, one question at a time, while its own thread goes on."""
+"""A trainer's queries to its plant's controller, one at a time, without blocking its thread."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from protocol import messages as m
 from protocol.topics import Topic
 
 TIMEOUT_S = 2.0
-"""Until a question counts as unanswered."""
+"""Seconds after which a query counts as unanswered."""
 
-# An answer is checked like a message of a topic.
+# Answers are checked like messages of a topic.
 HIDDEN_ANSWER = Topic(topics.HIDDEN_QUERY, m.HiddenSnapshot, "bulk", "controller", topics.WEIGHTS_LIMIT)
 SAMPLES_ANSWER = Topic(topics.OUTBOX_QUERY, m.Samples, "bulk", "controller", topics.SAMPLES.max_bytes)
 
@@ -22,11 +22,11 @@ _Answer = TypeVar("_Answer", m.HiddenSnapshot, m.Samples)
 
 
 class Questions:
-    """At most one question is open.
+    """Sends queries, at most one at a time.
 
     Args:
-        bus: the plant's.
-        askers: who waits for answers, so that a controller that gives none holds up nobody else.
+        bus: the plant's bus.
+        askers: runs the threads that wait for answers, so that a silent controller delays no other plant.
     """
 
     def __init__(self, bus: Bus, askers: Executor):
@@ -35,11 +35,11 @@ class Questions:
 
     @property
     def open(self) -> bool:
-        """Whether one still waits to be settled."""
+        """Whether a query is not settled yet."""
         return self._asked is not None
 
     def ask_hidden(self, then: Callable[[Iterator[m.HiddenSnapshot]], None]) -> None:
-        """For the hidden layers in force. `then` gets the answers from `settle`; none when nobody answered."""
+        """Query for the hidden layers in use. `settle` passes the answers to `then`, none if there were none."""
         self._ask(
             topics.HIDDEN_QUERY, {}, lambda found: then(self._decoded(HIDDEN_ANSWER, found, m.HiddenSnapshot))
         )
@@ -47,7 +47,7 @@ class Questions:
     def ask_samples(
         self, run_id: str, since: int, most: int, then: Callable[[Iterator[m.Samples]], None]
     ) -> None:
-        """For the samples of a run after number `since`, the `most` newest of them; `then` as above."""
+        """Query for the samples of a run after number `since`, limited to the newest `most`; `then` as above."""
         parameters = {"run": run_id, "since": str(since), "last": str(most)}
         self._ask(
             topics.OUTBOX_QUERY,
@@ -56,7 +56,7 @@ class Questions:
         )
 
     def settle(self) -> bool:
-        """Hand on the answers to the open question where they have come. Returns whether they had."""
+        """Pass on the answers to the open query if they have arrived; return whether they had."""
         if self._asked is None or not self._asked[0].done():
             return False
         (answers, then), self._asked = self._asked, None

@@ -1,4 +1,4 @@
-"""The replay buffer: every sample until p_max, then a named rule of replacement."""
+"""The replay buffer: it stores every sample until p_max and then replaces samples by a selected rule."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import numpy as np
 from node_runtime.config.literals import Strategy
 
 STRETCHES = 10_000
-"""Stretches of sequence numbers remembered for one run."""
+"""Number of intervals of sequence numbers stored for one run."""
 RUNS = 8
-"""Runs whose sequence numbers are remembered."""
+"""Number of runs whose sequence numbers are stored."""
 STALE_LOOKS = 16
-"""Outdated nearest neighbours looked up again in one insertion, at most; keeps it O(capacity)."""
+"""Largest number of outdated nearest neighbours that one insertion recomputes, which keeps it O(capacity)."""
 
 
 class Seen:
-    """Which samples were met before, by (run_id, seq), in bounded memory.
+    """Remembers the seen samples by (run_id, seq) in bounded memory.
 
-    Sequence numbers are kept as stretches without a hole, so a run takes no more memory the longer it lasts. Of a run
-    with more than `stretches` of them the oldest hole counts as met.
+    Sequence numbers are stored as contiguous intervals, so memory does not grow with the length of a run. If a run has
+    more than `stretches` intervals, its oldest gap counts as seen.
     """
 
     def __init__(self, stretches: int = STRETCHES, runs: int = RUNS):
         self._stretches = stretches
         self._runs = runs
         self._known: OrderedDict[str, tuple[list[int], list[int]]] = OrderedDict()
-        """Of each run the first and the last number of every stretch, rising."""
+        """First and last numbers of every interval, ascending, by run."""
 
     def add(self, run_id: str, seq: int) -> bool:
-        """Remember a sample. Returns whether it was new."""
+        """Add a sample; return whether it was new."""
         if run_id not in self._known:
             self._known[run_id] = [], []
             while len(self._known) > self._runs:
@@ -57,29 +57,29 @@ class Seen:
         return True
 
     def last(self, run_id: str) -> int:
-        """The newest sequence number of a run, -1 when there is none."""
+        """Return the newest sequence number of a run, -1 if there is none."""
         _, last = self._known.get(run_id, ([], []))
         return last[-1] if last else -1
 
 
 class ReplayBuffer:
-    """Up to `capacity` samples (x, u, h), or (window, h) where the network sees more pairs than (x, u).
+    """Up to `capacity` samples (x, u, h), or (window, h) for a network with a window.
 
-    Strategies, once the buffer is full:
-        fifo: the oldest makes room.
-        reservoir: Vitter's algorithm R; every sample ever offered is kept with the same probability.
-        novelty: of the closest pair among the stored samples and the new one, the younger goes. The distance
-            is Euclidean, (x, u) in units of `scale`. A sample nearer to a stored one than any two stored ones
-            are is not stored, so a plant that settles cannot crowd out how it came there; nor are the labels
-            of a known region renewed, so a plant that changes wants another strategy.
+    Strategies for a full buffer:
+        fifo: the oldest sample is replaced.
+        reservoir: Vitter's algorithm R; every sample offered so far is kept with the same probability.
+        novelty: of the closest pair among the stored samples and the new one, the younger is dropped. The distance is
+            Euclidean, with (x, u) in units of `scale`. A sample that is nearer to a stored one than any two stored ones
+            are to each other is not stored. A plant at rest thus cannot displace the samples of its approach. Labels of
+            a known region are not renewed, however, so a changing plant needs another strategy.
 
     Args:
         capacity: p_max.
         strategy: one of the above.
-        seed: of the reservoir's draws.
-        scale: units of (x, u) that count as 1, (d + m,), or those of a window of k pairs, (k (d + m),).
+        seed: seed of the reservoir.
+        scale: units of (x, u) that count as 1, (d + m,), or of a window of k pairs, (k (d + m),).
 
-    The same samples in the same order with the same seed leave the same buffer, byte for byte.
+    The same samples in the same order with the same seed give the same buffer, byte for byte.
     """
 
     def __init__(self, capacity: int, strategy: Strategy, seed: int, scale: list[float]):
@@ -90,7 +90,7 @@ class ReplayBuffer:
         self._seen = Seen()
         self._length = 0
         self.offered = 0
-        """Different samples ever offered."""
+        """Number of different samples offered so far."""
         self._next = 0
         self._xu = np.empty((0, len(self._scale)))
         self._h = np.empty((0, 0))
@@ -100,14 +100,14 @@ class ReplayBuffer:
         return self._length
 
     def last(self, run_id: str) -> int:
-        """The newest sequence number met of a run, -1 when there is none."""
+        """Return the newest sequence number seen of a run, -1 if there is none."""
         return self._seen.last(run_id)
 
     def add(self, run_id: str, seqs: Sequence[int], windows: np.ndarray, h: np.ndarray) -> int:
-        """Offer samples, one after the other: windows (n, k (d + m)), h (n, d). Returns how many were not met before.
+        """Offer samples in order: windows (n, k (d + m)), h (n, d). Return how many were new.
 
         Raises:
-            ValueError: wrong lengths, or something is not finite; nothing is stored or remembered then.
+            ValueError: a length is wrong or a number is not finite. Nothing is stored then.
         """
         width = self._h.shape[1] if self._length else h.shape[1]
         if windows.shape[1:] != self._scale.shape or h.shape[1] != width or len(h) != len(windows):
@@ -128,16 +128,16 @@ class ReplayBuffer:
         return len(new)
 
     def sample(self, M: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """M different samples at random, all when there are fewer: windows (M, k (d + m)), and h (M, d)."""
+        """Return M different random samples, or all if there are fewer: windows (M, k (d + m)), and h (M, d)."""
         chosen = rng.permutation(self._length)[:M]
         return self._xu[chosen], self._h[chosen]
 
     def contents(self) -> tuple[np.ndarray, np.ndarray]:
-        """Copies of all that is stored: windows (len, k (d + m)), and h (len, d)."""
+        """Return copies of all stored samples: windows (len, k (d + m)), and h (len, d)."""
         return self._xu[: self._length].copy(), self._h[: self._length].copy()
 
     def _slot(self, scaled: np.ndarray) -> int | None:
-        """Where the sample goes, or None when it is not kept."""
+        """Return the slot for a sample, or None if it is not stored."""
         if self._pairs is not None:
             return self._pairs.insert(scaled)
         if self._length < self.capacity:
@@ -151,13 +151,13 @@ class ReplayBuffer:
         self._length = max(self._length, slot + 1)
 
     def _store_in_turn(self, xu: np.ndarray, h: np.ndarray) -> None:
-        """First in, first out, for many at once: a buffer is a ring."""
+        """Store several samples by first in, first out, in a ring."""
         n = len(xu)
         if not n:
             return
         self._make_room(min(self.capacity, self._length + n), h.shape[1])
         slots = (self._next + np.arange(n)) % self.capacity
-        # Where they are more than the buffer holds, the last ones stay.
+        # If there are more than the buffer holds, the last ones are stored.
         kept = slice(max(0, n - self.capacity), n)
         self._xu[slots[kept]], self._h[slots[kept]] = xu[kept], h[kept]
         self._length = min(self.capacity, self._length + n)
@@ -172,10 +172,10 @@ class ReplayBuffer:
 
 
 class _ClosestPairs:
-    """The `novelty` rule: points with their nearest neighbours, O(capacity) for an insertion.
+    """The `novelty` rule: points with their nearest neighbours, with O(capacity) per insertion.
 
-    When a point goes, the distances of those whose nearest neighbour it was become lower bounds, and are
-    looked up again only when they come up as the smallest.
+    If a point is removed, the distances of points with this nearest neighbour become lower bounds. They are recomputed
+    only when one of them is the smallest.
     """
 
     def __init__(self, capacity: int, dimensions: int):
@@ -188,7 +188,7 @@ class _ClosestPairs:
         self._births = 0
 
     def insert(self, point: np.ndarray) -> int | None:
-        """The slot the point took, or None when it is the younger one of the closest pair."""
+        """Return the slot of the inserted point, or None if it is the younger one of the closest pair."""
         distances = self._distances(point)
         if self._length < self._capacity:
             slot = self._length
@@ -225,7 +225,7 @@ class _ClosestPairs:
             self._nearest[slot], self._neighbour[slot] = np.inf, -1
 
     def _closest(self) -> tuple[int, int]:
-        """The closest pair stored. With one point, that point twice."""
+        """Return the closest stored pair; a single point is returned twice."""
         if self._length == 1:
             return 0, 0
         for _ in range(STALE_LOOKS):

@@ -1,7 +1,7 @@
-"""The slow timescale: hidden layers trained on the replay buffer, under output weights held fixed at K_{T_k}.
+"""The slow timescale: training of the hidden layers on the replay buffer, with output weights fixed at K_{T_k}.
 
-Pure: no bus, no clock. The same samples and output weights in the same order with the same seed give the same
-hidden layers, bit for bit, on a CPU with one thread (`use_one_thread`).
+The module is pure, without bus and clock. The same samples and output weights in the same order with the same seed give
+the same hidden layers, bit for bit, on a CPU with one thread (`use_one_thread`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from trainer_node.pace import GAIN, Pace, Worth
 from trainer_node.replay_buffer import ReplayBuffer
 
 BASES = 8
-"""Sets of hidden layers remembered, newest last: one of them must be what the controller's K belongs to."""
+"""Number of stored sets of hidden layers, newest last. The controller's K must belong to one of them."""
 LEAP = 1000
-"""From one version to the next where somebody else sends weights too: more than a stranger sends meanwhile."""
+"""Increase of the version while another trainer sends weights too, larger than that trainer's increase meanwhile."""
 HELD_OUT = 0.25
-"""Share of the samples drawn that is not trained on, where labels are noisy."""
+"""Share of the drawn samples that is held out with noisy labels."""
 LEAST_VARIANCE = 1e-4
-"""Of a label, in (output scale)^2: none counts as better known."""
+"""Smallest variance of a label, in (output scale)^2."""
 FARTHEST = 10**8
-"""How far versions may run ahead of the adopted: a controller refuses those that are 1e9 ahead."""
+"""Largest lead of a version over the adopted one. A controller refuses a lead of 1e9."""
 
 
 def use_one_thread() -> None:
@@ -42,11 +42,11 @@ def use_one_thread() -> None:
 
 
 class TrainerError(RuntimeError):
-    """This machine cannot train as it was asked to."""
+    """This machine cannot train as configured."""
 
 
 def pick_device(wanted: str) -> torch.device:
-    """Resolve "auto", "cpu" or "cuda". Raises `TrainerError` when CUDA is asked for and not there."""
+    """Resolve "auto", "cpu" or "cuda". Raises `TrainerError` if CUDA is requested and not available."""
     available = torch.cuda.is_available()
     if wanted == "cuda" and not available:
         raise TrainerError(
@@ -58,13 +58,13 @@ def pick_device(wanted: str) -> torch.device:
 
 @dataclass(frozen=True)
 class Draw:
-    """A training that has begun: what to minimise, and the message it answers."""
+    """A training that has begun: its problem, and the message that it answers."""
 
     problem: Problem
     output: OutputWeights
     for_run: str
     newest: int
-    """The last sample of that run that could be drawn, -1 where there is none."""
+    """The last sample of that run that could be drawn, -1 if there is none."""
 
 
 class Trainer:
@@ -72,15 +72,15 @@ class Trainer:
 
     Args:
         description: the network.
-        config: buffer and training.
-        seed: of the drawn samples and of the reservoir.
-        run_id: this trainer's, written into what it publishes.
-        hidden: W_1..W_{L-1} that the controller holds, (1 + n_{i-1}, n_i) each.
-        version: of `hidden`; the first training's weights get the next one.
+        config: settings of buffer and training.
+        seed: seed of the drawn samples and of the reservoir.
+        run_id: this trainer's id, written into its messages.
+        hidden: the controller's W_1..W_{L-1}, (1 + n_{i-1}, n_i) each.
+        version: version of `hidden`; the first trained weights get the next one.
 
     Raises:
         ValueError: the hidden layers are not acceptable for this network.
-        TrainerError: there is no such device.
+        TrainerError: the device does not exist.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Trainer:
         self.config = config
         self.run_id = run_id
         self.version = version
-        """Of the newest hidden layers; never falls."""
+        """Version of the newest hidden layers; it never decreases."""
         self.counters: Counter[str] = Counter()
         scale = description.input_scale * description.window
         self.buffer = ReplayBuffer(config.capacity, config.strategy, seed, scale)
@@ -104,9 +104,9 @@ class Trainer:
         self._network = Network(description, device=pick_device(config.device))
         self._bases: OrderedDict[str, list[np.ndarray]] = OrderedDict()
         self.worth: Worth | None = None
-        """Of the last training; None where labels are exact."""
+        """Benefit of the last training; None for exact labels."""
         self._fresh = self._waited = 0
-        # 1 / (deviation of the newest labels in output scales), over sqrt d; None: they are exact.
+        # 1 / (standard deviation of the newest labels in output scales), over sqrt d; None for exact labels.
         self._weights: np.ndarray | None = None
         self._latest: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=config.train_every)
         self._pace = Pace(config.train_every, config.capacity)
@@ -114,11 +114,11 @@ class Trainer:
         self.resume(hidden, version)
 
     def resume(self, hidden: list[np.ndarray], version: int = 0) -> None:
-        """Go on from the controller's hidden layers, forgetting what was trained. Samples are kept.
+        """Continue from the controller's hidden layers and drop the trained ones. Samples are kept.
 
         Args:
             hidden: W_1..W_{L-1}, (1 + n_{i-1}, n_i) each.
-            version: theirs; whatever is trained next has a higher one.
+            version: their version; the next trained layers have a higher one.
 
         Raises:
             ValueError: they are not acceptable for this network.
@@ -132,26 +132,26 @@ class Trainer:
         self._pace.hurry()
 
     def leap(self, heard: int = 0) -> None:
-        """From now on leave gaps between versions: somebody else sends weights under this trainer's name.
+        """Leave gaps between versions from now on, because another trainer sends weights under the same name.
 
-        He is ahead by a few versions, and a controller takes none that is behind what it heard.
+        The other trainer is a few versions ahead, and a controller refuses versions below those it received.
 
         Args:
-            heard: the version that the controller judged last; what is trained next is above it, unless it lies so far
-                ahead that no controller would follow.
+            heard: the version that the controller decided on last. The next version is above it, unless it is so far
+                ahead that no controller would accept that.
         """
         self._step = LEAP
         if heard <= self.version + FARTHEST:
             self.version = max(self.version, heard)
 
     def add(self, run_id: str, samples: Iterable[Sample]) -> int:
-        """Offer samples of one controller run; bad ones are counted, left out. Returns how many are new."""
+        """Offer samples of one controller run; invalid ones are counted and left out. Return how many are new."""
         batch = list(samples)
         try:
             new = self._add(run_id, batch)
         except ValueError:
             if len(batch) > 1:
-                # Which ones are bad, is found out one by one.
+                # Find the invalid ones by adding one sample at a time.
                 return sum(self.add(run_id, [sample]) for sample in batch)
             new, batch = 0, []
             self.counters["bad samples"] += 1
@@ -161,7 +161,7 @@ class Trainer:
         return new
 
     def _add(self, run_id: str, samples: list[Sample]) -> int:
-        """How many are new. Raises `ValueError` when one is bad, and takes none then."""
+        """Return how many samples are new. Raises `ValueError` without adding any if one is invalid."""
         if not samples:
             return 0
         rows = [[*itertools.chain.from_iterable(sample.past), *sample.x, *sample.u] for sample in samples]
@@ -174,9 +174,9 @@ class Trainer:
         return new
 
     def _weights_for(self, variance: np.ndarray) -> np.ndarray:
-        """Of each state, (d,), so that labels of this variance, (d,), add 1 to the loss, and each state as much of it.
+        """Return weights of the states, (d,), with which labels of this variance, (d,), contribute 1 to the loss.
 
-        Raises `ValueError` for what is no variance.
+        All states contribute equally. Raises `ValueError` for an invalid variance.
         """
         if variance.shape != (self.description.states,):
             raise ValueError("no variance")
@@ -187,9 +187,9 @@ class Trainer:
         return 1.0 / np.sqrt(len(noise) * np.maximum(noise, LEAST_VARIANCE))
 
     def due(self, output: OutputWeights) -> bool:
-        """Whether enough new samples came since the last training began; `Pace` says it where labels have a variance.
+        """Return whether enough new samples arrived since the last training; with noisy labels `Pace` decides.
 
-        output: the newest; the loss on new samples is that under its K.
+        output: the newest output weights, used for the loss on new samples.
         """
         if self._fresh < self.config.train_every or len(self.buffer) < self.config.min_samples:
             return False
@@ -200,7 +200,7 @@ class Trainer:
         return self._pace.over(self._fresh)
 
     def _loss_on_latest(self, output: OutputWeights) -> float:
-        """Of the hidden layers that K belongs to; 0 where it cannot be used."""
+        """Return the loss of the hidden layers that K belongs to; 0 if K is not usable."""
         K = output.K.numpy()
         if self._unusable(K, output.hidden_sha256) is not None:
             return 0.0
@@ -209,25 +209,25 @@ class Trainer:
         return build_loss(self._network, windows, *self._weighted(h, K)).value()
 
     def _weighted(self, h: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Labels, (n, d), and output weights, (1 + n_L, d), each state as it counts in the loss."""
+        """Return labels, (n, d), and output weights, (1 + n_L, d), with each state's weight in the loss."""
         weights = 1.0 if self._weights is None else self._weights
         with np.errstate(over="ignore"):
             return h * weights, K * weights
 
     def train(self, output: OutputWeights, for_run: str) -> HiddenWeights | None:
-        """Train W_1..W_{L-1} with K = `output.K` fixed, starting from the hidden layers that K belongs to.
+        """Train W_1..W_{L-1} with fixed K = `output.K`, starting from the hidden layers that K belongs to.
 
-        M samples are drawn from the buffer, and `steps` Adam steps taken on all of them, in float32. Adam
-        starts afresh each time. Where labels have a variance, states count in the loss by its inverse, and a quarter of
-        the samples is held out: the steps count up to where these were predicted best, and the old layers stay where
-        that is within the noise.
+        M samples are drawn from the buffer, and `steps` Adam steps are taken on all of them, in float32. Adam starts
+        anew each time. For noisy labels the loss weights states by the inverse variance, and a quarter of the samples
+        is held out: the step that predicts them best is the result, and the old layers are kept if the gain is within
+        the noise.
 
         Args:
             output: K_{T_k}, (1 + n_L, d), and the hash of the hidden layers it was adapted to.
-            for_run: the controller run it came from.
+            for_run: the controller run of `output`.
 
         Returns:
-            The new hidden layers, or None when the old ones stay; `counters["kept: <reason>"]` says why.
+            The new hidden layers, or None if the old ones are kept; `counters["kept: <reason>"]` has the reason.
         """
         draw = self.begin(output, for_run)
         if draw is None:
@@ -235,9 +235,9 @@ class Trainer:
         return self.finish(draw, descend(draw.problem, self.config.steps, self.config.learning_rate))
 
     def begin(self, output: OutputWeights, for_run: str) -> Draw | None:
-        """The first part of `train`, up to the Adam steps; None when the old hidden layers stay.
+        """Begin a training, up to the Adam steps; None if the old hidden layers are kept.
 
-        The problem holds this trainer's own network: one draw at a time.
+        The problem contains this trainer's network, so only one training can be open at a time.
         """
         self._waited, self._fresh = self._fresh, 0
         self.counters["trainings"] += 1
@@ -256,7 +256,7 @@ class Trainer:
         return Draw(Problem(self._network, xu[:kept], h[:kept], K, held_out), output, for_run, newest)
 
     def finish(self, draw: Draw, descent: Descent) -> HiddenWeights | None:
-        """The last part of `train`: judge what the Adam steps found, and take it over or leave it."""
+        """Finish a training: accept or reject the result of the Adam steps."""
         output, trained = draw.output, descent.hidden
         noisy = draw.problem.held_out is not None
         why = self._unwanted(descent, GAIN if noisy else 0.0)
@@ -287,7 +287,7 @@ class Trainer:
         )
 
     def _unusable(self, K: np.ndarray, base_sha256: str) -> str | None:
-        """Why no training can begin under this K; None: one can."""
+        """Return why no training can begin with this K; None if one can."""
         if K.shape != (self.description.features, self.description.states):
             return "K has the wrong shape"
         if not np.isfinite(K).all():
@@ -299,22 +299,22 @@ class Trainer:
         return None if len(self.buffer) else "no samples"
 
     def _unwanted(self, descent: Descent, least: float) -> str | None:
-        """Why the old hidden layers are kept; None: those that were found lower the loss by more than `least`."""
+        """Return why the old hidden layers are kept; None if the new ones reduce the loss by more than `least`."""
         if not all(np.isfinite(layer).all() for layer in descent.hidden):
             return "not finite"
         if why_unacceptable(self.description, descent.hidden) is not None:
-            # Their shapes are those of the network that was trained.
+            # The shapes are valid, because they are those of the trained network.
             return "norm bound"
         if not math.isfinite(descent.after):
             return "not finite"
-        # Within what the labels' noise alone comes to there is nothing to gain, and its fit would cost.
+        # A gain within the effect of noise would fit the noise.
         return None if descent.before - descent.after > least else "loss not lower"
 
     def _take(self, hidden: list[np.ndarray]) -> None:
         self.hidden = [np.array(layer, dtype=np.float32).astype(np.float64) for layer in hidden]
         """The newest hidden layers, float32 values in float64, (1 + n_{i-1}, n_i) each."""
         self.sha256 = hash_layers(self.hidden)
-        """Their hash."""
+        """SHA-256 of `hidden`."""
         self._bases[self.sha256] = self.hidden
         self._bases.move_to_end(self.sha256)
         while len(self._bases) > BASES:

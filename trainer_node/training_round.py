@@ -10,14 +10,14 @@ from trainer_node.node import TrainerNode
 from trainer_node.training import Draw
 
 MOST_STACKED = 16
-"""Trained in one round: the others' samples wait for as long as it takes."""
+"""Largest number of plants in a round. Samples of the other plants wait until it is finished."""
 
 
 def train_round(nodes: Sequence[TrainerNode], now: float) -> float:
-    """Train up to `MOST_STACKED` of one shape; who has waited longest says which shape.
+    """Train up to `MOST_STACKED` plants of one shape, that of the plant that has waited longest.
 
     Returns:
-        Seconds that it took.
+        The duration in seconds.
     """
     waiting = sorted(
         (since, k) for k, node in enumerate(nodes) if (since := node.waits_since(now)) is not None

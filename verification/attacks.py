@@ -1,4 +1,4 @@
-"""Lock-step runs with a trainer that was stolen: it sends hidden weights of its own, valid in form, to do harm."""
+"""Lock-step runs with a stolen trainer: it sends hidden weights of its own that are valid in form and harmful."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from trainer_node.node import ADOPTION_PATIENCE
 
 Layers = list[np.ndarray]
 KNOWN = 80
-"""Newest samples that the attacker has heard."""
+"""Number of the newest samples that the attacker knows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Known:
     good: Layers
     """Hidden layers in use, or those that were just trained."""
     points: np.ndarray
-    """(n, d + m) the newest (x, u), scaled as the network sees them."""
+    """(n, d + m) newest pairs (x, u), in the network's scale."""
 
 
 Forge = Callable[[Known, np.random.Generator], Layers]
@@ -76,7 +76,7 @@ class _Attacked(LockStep):
         super()._learn(seq, outputs)
 
     def _rejoin(self, outputs: Outputs) -> None:
-        """As the live trainer: when others' layers have been in use for long enough, it goes on from those."""
+        """Continue from another sender's layers when these have been in use long enough, as the live trainer does."""
         output = outputs.output_weights
         if self.trainer is None or output is None or output.hidden_sha256 == self.trainer.sha256:
             self.strange = 0
@@ -129,24 +129,24 @@ def crude(known: Known, rng: np.random.Generator) -> Layers:
 
 
 def reversed_sign(known: Known, _rng: np.random.Generator) -> Layers:
-    """Of the last hidden layer."""
+    """Reverse the sign of the last hidden layer."""
     return [*known.good[:-1], -known.good[-1]]
 
 
 def random(known: Known, rng: np.random.Generator) -> Layers:
-    """Of the size of the good ones."""
+    """Random layers of the size of the good ones."""
     return [rng.standard_normal(layer.shape) * np.std(layer) for layer in known.good]
 
 
 def noise(share: float) -> Forge:
-    """The good ones with noise, `share` of their own spread."""
+    """The good layers with noise, `share` of their own standard deviation."""
     return lambda known, rng: [
         layer + share * np.std(layer) * rng.standard_normal(layer.shape) for layer in known.good
     ]
 
 
 def drift(known: Known, _rng: np.random.Generator) -> Layers:
-    """The good ones a little further in a direction that is always the same."""
+    """The good layers, moved further each time in one direction."""
     always = np.random.default_rng(5)
     return [layer + 0.01 * np.std(layer) * always.standard_normal(layer.shape) for layer in known.good]
 

@@ -1,4 +1,4 @@
-"""Certified sets put to the test: many states, hostile disturbances, inputs chosen by a liar.
+"""Certified sets under test: many states, worst-case disturbances, and inputs that an adversary chooses.
 
     python -m verification.certified_sets states sets.json --states 100000 --steps 200
     python -m verification.certified_sets closed-loop sets.json --seeds 100
@@ -48,7 +48,7 @@ class Crowd:
         self.move = one_period(model)
 
     def start(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """States (count, d), half of them in the first piece, and the piece of each (count,)."""
+        """Return states (count, d), half of them in the first piece, and the piece of each (count,)."""
         pieces = np.zeros(count, dtype=int)
         if len(self.bodies) > 1:
             pieces[count // 2 :] = self.rng.integers(1, len(self.bodies), count - count // 2)
@@ -60,7 +60,7 @@ class Crowd:
     def step(
         self, x: np.ndarray, pieces: np.ndarray, disturbance: Disturbance
     ) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """Next states and their pieces; states without a certified input, and states that left their target."""
+        """Return next states and their pieces, states without a certified input, and states that left their target."""
         after, reached = np.empty_like(x), np.empty_like(pieces)
         infeasible = left = 0
         for i in np.unique(pieces):
@@ -91,7 +91,7 @@ class Crowd:
 
 
 class Rows:
-    """A piece's target in unit rows T x <= t, and what it asks of u: low - per_low x <= u <= high - per_high x."""
+    """A piece's target in unit rows T x <= t, and its condition on u: low - per_low x <= u <= high - per_high x."""
 
     def __init__(self, certificate: Certificate, index: int, model: Model, half: np.ndarray):
         piece = certificate.pieces[index]
@@ -115,7 +115,7 @@ def states(
     steps: int = 200,
     seed: int = 0,
 ) -> dict[str, float | int | str]:
-    """Many states and hostile disturbances, all three kinds; each on its share of the states."""
+    """Test many states against worst-case disturbances of all three kinds, each on its share of the states."""
     certificate = read_sets(file).certificate
     model = build_model(get_plant(certificate.model.plant), certificate.model.period)
     low, high = (np.array(bound) for bound in certificate.model.X)
@@ -142,7 +142,7 @@ def states(
 def closed_loop(
     file: Path, seeds: int = 100, steps: int = 60, oracle: OracleName = "linear"
 ) -> dict[str, float | int | str]:
-    """The control step with a solver that lies, errors of measurement and late commands: ticks outside, by case."""
+    """Run the control step with a false solver, measurement errors and late commands; count ticks outside, by case."""
     certificate = read_sets(file).certificate
     model = build_model(get_plant(certificate.model.plant), certificate.model.period)
     loop = ClosedLoop(certificate, model, oracle)
@@ -164,7 +164,7 @@ def closed_loop(
 
 
 if __name__ == "__main__":
-    # Many small products: threads would only wait for each other.
+    # The products are small, so threads would only wait for each other.
     with one_blas_thread():
         found = tyro.extras.subcommand_cli_from_dict(
             {"states": states, "closed-loop": closed_loop}, config=(tyro.conf.PositionalRequiredArgs,)

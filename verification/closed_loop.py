@@ -1,4 +1,4 @@
-"""The guard and the delay put to the test: a controller whose solver lies, measurements that are off, late commands.
+"""The guard and the delay under test: a controller with a false solver, measurement errors and late commands.
 
     python -m verification.certified_sets closed-loop sets.json --seeds 100
 
@@ -38,19 +38,19 @@ HORIZON = 3
 
 @dataclass(frozen=True)
 class Case:
-    """What is wrong in a run, and who chooses the inputs."""
+    """The errors of a run, and the source of its inputs."""
 
     inputs: Inputs
     noise: float = 0.0
-    """Bound of each state's error of measurement, uniform, as a share of X's half-width."""
+    """Bound of each state's measurement error, uniform, as a share of X's half-width."""
     delay: float = 0.0
-    """Seconds from a sample until the command that answers it acts."""
+    """Seconds from a sample until its command acts."""
     known: bool = True
     """Whether the controller begins with this delay, or with none."""
 
 
 class LyingSolver:
-    """Takes any input inside the first input's bounds."""
+    """A solver that returns any input inside the bounds of the first input."""
 
     def __init__(self, model: Model, inputs: Inputs, rng: np.random.Generator):
         self._model, self._inputs, self._rng = model, inputs, rng
@@ -91,7 +91,7 @@ class LyingSolver:
 
 
 class LyingOracle(LinearOracle):
-    """Says that h is a tenth of X's half-widths, whatever the state: no command may trust it with the sets."""
+    """An oracle whose h is a tenth of X's half-widths for every state: the sets must hold without it."""
 
     def __init__(self, model: Model):
         super().__init__(model.d, model.m)
@@ -103,14 +103,14 @@ class LyingOracle(LinearOracle):
 
 @dataclass(frozen=True)
 class Found:
-    """Of one run: ticks from which the true state was outside the sets, and its smallest margin."""
+    """Of one run: ticks with the true state outside the sets, and its smallest margin."""
 
     outside: int
     margin: float
 
 
 class ClosedLoop:
-    """A plant and a controller of it. The sets hold for any oracle; over a delay, too."""
+    """A plant and its controller. The sets hold for any oracle, also over a delay."""
 
     def __init__(self, certificate: Certificate, model: Model, oracle: OracleName = "linear"):
         self.certificate, self.model, self._flow = certificate, model, _flow(model)
@@ -123,7 +123,7 @@ class ClosedLoop:
         self._judge = Guard(certificate)
 
     def run(self, case: Case, seed: int, steps: int, x0: np.ndarray | None = None) -> Found:
-        """From x0, (d,), deviation, by default the plant's own; held there until the first command acts."""
+        """Run from x0, (d,), a deviation, by default the plant's own; it is held until the first command acts."""
         rng, plant, period = np.random.default_rng(seed), self.model.plant, self.model.period
         half = (plant.x_max - plant.x_min) / 2
         solver = LyingSolver(self.model, case.inputs, rng)
@@ -142,7 +142,7 @@ class ClosedLoop:
             if not (np.isfinite(here) and np.isfinite(x).all()):
                 return Found(outside + steps - number, -np.inf)
             outside, margin = outside + (here < 0.0), min(margin, here)
-            # As the plant says it: what acted, where there was more than one input or not all of a period.
+            # As the plant reports it: the inputs that acted, if there were several or not a whole period of one.
             rest = (period - case.delay, u)
             if not case.delay:
                 applied = u
@@ -172,7 +172,7 @@ def _flow(model: Model) -> ca.Function:
 
 
 def cases() -> list[Case]:
-    """Every kind of error of measurement, and every delay with the largest of them, for both kinds of inputs."""
+    """Every kind of measurement error, and every delay with the largest of them, for both kinds of inputs."""
     kinds: tuple[Inputs, ...] = ("random", "bang-bang")
     noisy = [Case(inputs, noise) for inputs in kinds for noise in (1e-7, 1e-6)]
     return noisy + [

@@ -1,9 +1,9 @@
-"""Whether a rate limit of the input holds whoever commands: `python -m verification.input_rates`.
+"""Check that a rate limit of the input holds for every source of input: `python -m verification.input_rates`.
 
-Without a hand on the switch, in each seed: the compressor begins elsewhere, commands come up to a fifth of a period
-early or late, and the controller falls silent again and again, for up to twice its horizon: the plan, the backup policy
-and the safe input act. Every input that is written is kept, with its time. By hand, in lock-step: a person drives by
-random inputs now and then, until a random moment or until the plant would leave X; in the last row behind a dead time.
+Automatic, in each seed: the compressor starts at another state, commands come up to a fifth of a period early or
+late, and the controller is silent repeatedly, for up to twice its horizon. Plan, backup policy and safe input
+act. Every written input is stored with its time. Manual, in lock-step: a person drives by random inputs at times,
+until a random moment or until the plant would leave X; the last row has a dead time.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from tandem.experiments.simulation.lockstep import LockStep
 
 SETTINGS = ["controller.horizon=20", "trainer.enabled=false", "network.hidden=[8,8]"]
 LATE = 0.2
-"""Share of a period by which a command is early or late at most, about its usual time."""
+"""Largest share of a period by which a command is early or late, about its usual time."""
 BY_HAND = [
     "plant.x0=[0.4, 1.6, 1.1547, 0.0]",
     "controller.oracle=constant",
     "controller.solver.compile=never",
 ]
 DEAD_TIME = 0.125
-"""Seconds, a broken number of periods: of one more row."""
+"""Seconds, a fraction of a period too: dead time of one more row."""
 SILENT = 0.08
-"""Of all ticks those at which a silence begins."""
+"""Share of the ticks at which a silence begins."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """Of one seed. Shares are of rate x period, of 1 at most where the limit holds."""
+    """Result of one seed. Shares are of rate x period; at most 1 where the limit holds."""
 
     steps: float
     """Largest difference of two inputs that acted within one period."""
     samples: float
     """Largest difference of `applied` from sample to sample: means over a period."""
     sources: dict[str, int]
-    """Samples by what acted before them."""
+    """Number of samples by the source that acted before them."""
 
 
 class Recording(Motion):
-    """A simulated plant that remembers what is written to it."""
+    """A simulated plant that stores what is written to it."""
 
     def __init__(self, *args: object, **options: object):
         super().__init__(*args, **options)  # type: ignore[arg-type]
@@ -66,7 +66,7 @@ class Recording(Motion):
 
 
 def follow(config: Config, seed: int, ticks: int) -> Found:
-    """One seed, `ticks` long."""
+    """Run one seed for `ticks` ticks."""
     rng, plant, period = np.random.default_rng(seed), MOORE_GREITZER, config.period
     core = ControllerCore(override(config, [f"seed={seed}"]), "controller")
     x0 = plant.x_e + rng.uniform(-0.4, 0.4, 4) * plant.x_scale * [1.0, 1.0, 0.2, 0.01]
@@ -80,7 +80,7 @@ def follow(config: Config, seed: int, ticks: int) -> Found:
             shield.advance(t, motion)
             state = shield.sample(t, motion.read(t))
         except PlantError:
-            # Nobody commanded it for too long; what was written until then counts.
+            # The plant was without commands for too long; inputs written until then count.
             break
         shield.renew(t, np.array(state.x), motion)
         sources[state.source] = sources.get(state.source, 0) + 1
@@ -100,7 +100,7 @@ def follow(config: Config, seed: int, ticks: int) -> Found:
 
 
 def by_hand(config: Config, seed: int, ticks: int) -> Found:
-    """One seed, `ticks` long, with a person at the switch now and then; shares as of `Found`."""
+    """Run one seed for `ticks` ticks, with manual control at times; shares as in `Found`."""
     rng, plant = np.random.default_rng(seed), MOORE_GREITZER
     loop = LockStep(config)
     states, until = [], int(rng.integers(5, 20))
@@ -114,7 +114,7 @@ def by_hand(config: Config, seed: int, ticks: int) -> Found:
         try:
             states.append(loop.step()[0])
         except PlantError:
-            # Lost, with so slow an input; what was written until then counts.
+            # The plant left X with so slow an input; inputs written until then count.
             break
     rate, period = float(loop.core.plant.input_rates[0]), config.period
     written, t = [(-np.inf, float(plant.safe_input[0]))], 0.0
@@ -138,7 +138,7 @@ def _largest(written: list[tuple[float, float]], rate: float, period: float) -> 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Whether a rate limit of the input holds, through jitter, silence of the controller and manual hand-over."""
+    """Check that a rate limit of the input holds, through jitter, silence of the controller and manual control."""
 
     seeds: int = 20
     ticks: int = 200

@@ -1,12 +1,12 @@
-"""What learning costs where sensors are noisy: `python -m verification.noisy_plants --out DIR`.
+"""The cost of learning with noisy sensors: `python -m verification.noisy_plants --out DIR`.
 
-Lock-step runs of four plants with white noise on all states, an estimator that is told its size, and J of the true
-states. What is asked of the network at each level of noise: its median J is at most 1.03 times the smaller median of
-linear MPC and of the best constant, each seed's at most 1.15 times the best of that seed, no plant is lost, and X is
-left at most 1.2 times as often as by linear MPC or with the true h. With `--episodes 5`: later episodes are within 5 %
-of those with the true h.
+Lock-step runs of four plants with white noise on all states and an estimator that knows its size. J is that of the
+true states. Requirements on the network at each level of noise: its median J is at most 1.03 times the smaller median
+of linear MPC and of the best constant; each seed's J is at most 1.15 times the best of that seed; no plant is lost;
+and it leaves X at most 1.2 times as often as linear MPC or the true h. With `--episodes 5`, later episodes must be
+within 5 % of those with the true h.
 
-Finished runs stay in the folder: the same command goes on from there.
+Finished runs stay in the folder, and the same command continues from there.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NO_ESTIMATOR = "none"
 
 
 class Noisy(NamedTuple):
-    """A plant, and what is run of it."""
+    """A plant, and the runs of it."""
 
     config: str
     """A shipped configuration, or a file."""
@@ -69,12 +69,12 @@ class Case(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What a case came to, one entry a seed."""
+    """Results of a case, one entry a seed."""
 
     J: list[float]
-    """Of the first episode; infinite where the plant was lost in it."""
+    """J of the first episode; infinite if the plant was lost in it."""
     later: list[float]
-    """The worst of the others; NaN where there are none."""
+    """The worst J of the other episodes; NaN without any."""
     outside: int
     """Samples outside X or U, of all seeds."""
     lost: int
@@ -82,13 +82,13 @@ class Row(NamedTuple):
 
 
 def job(case: Case, seed: int, episodes: int, more: list[str]) -> Job:
-    """One run of a case, deterministic."""
+    """Return one run of a case; deterministic."""
     noisy, level = PLANTS[case.plant], case.level
     noise = [f"plant.sensors.noise={level}", f"estimator.noise={level}", "estimator.kind=kalman"]
     settings = [*noisy.settings, *([] if level == NO_ESTIMATOR else noise), *ORACLES[case.oracle]]
     config = load(config_file(noisy.config), [*settings, *more, f"seed={seed}"])
     if case.oracle != "dnn" and not config.plant.sensors.random:
-        # Nothing is drawn: all seeds are one run.
+        # Nothing is random, so all seeds are one run.
         config = msgspec.structs.replace(config, seed=0)
     return Job(config=config, steps=noisy.steps, episodes=episodes, faults=Faults())
 
@@ -105,7 +105,7 @@ def row(records: list[Record]) -> Row:
 
 
 def failures(rows: dict[str, Row], without: Row | None = None) -> list[str]:
-    """What is asked of dnn at one level and not met; `rows` by oracle, `without`: dnn without noise and estimator."""
+    """List unmet requirements on dnn at one level; `rows` by oracle, `without`: dnn without noise and estimator."""
     dnn, others = rows["dnn"], {name: one for name, one in rows.items() if name not in ("dnn", "perfect")}
     best = min(median(one.J) for one in others.values())
     worst = max(
@@ -129,7 +129,7 @@ def failures(rows: dict[str, Row], without: Row | None = None) -> list[str]:
 
 
 def show(rows: dict[Case, Row], console: Console) -> bool:
-    """A line for each plant and level; whether all is met."""
+    """Print a line for each plant and level; return whether all requirements are met."""
     table = Table("plant", "noise", *ORACLES, "", box=None)
     met = True
     for plant, level in dict.fromkeys((case.plant, case.level) for case in rows):
@@ -166,7 +166,7 @@ def main(
     set: tuple[str, ...] = (),
     jobs: int = 1,
 ) -> int:
-    """Run and print; 1 where something is not met.
+    """Run and print; return 1 if a requirement is not met.
 
     Args:
         out: a folder for the runs.

@@ -1,8 +1,8 @@
-"""What becomes of the true plant when its controller falls silent: `python -m verification.outage`, decision 0025.
+"""The true plant after its controller falls silent: `python -m verification.outage`, decision 0025.
 
 Lock-step runs from the paper's x0, in which commands act some time after their samples. After each tick of the first
-four seconds the controller is taken away for good, and the plant is followed for three seconds, the length of a plan,
-and for six, with what it has: the rest of the plan, or the backup policy; after their end a constant safe input, or one
+four seconds the controller is silenced permanently. The plant continues for three seconds, the length of a plan, and
+for six, with the rest of the plan or with the backup policy, and after their end with a constant safe input or one
 with feedback.
 """
 
@@ -39,14 +39,14 @@ OUTSIDE = 1e-9
 
 
 class Silence(NamedTuple):
-    """The motion after one tick: how deep outside X, as a share of its half-widths, negative inside."""
+    """Motion after one tick: largest distance outside X, as a share of its half-widths, negative inside."""
 
     within_short: float
     within_long: float
 
 
 def measure(seeds: range) -> dict[str, list[Silence]]:
-    """Every case's outages, over all seeds and ticks."""
+    """Return every case's outages, over all seeds and ticks."""
     found: dict[str, list[Silence]] = {}
     for seed, delay in product(seeds, DELAYS):
         config = load(None, [f"seed={seed}"])
@@ -91,7 +91,7 @@ def _silence(
     delay: float,
     backup: m.Backup | None,
 ) -> Silence:
-    """The true plant from this tick's sample on, with its last command and nothing after it."""
+    """Simulate the true plant from this tick's sample on, with its last command and none after it."""
     assert tick.state is not None
     truth = true_motion(build_plant(config))
     sim = PlantSim(plant, truth, config.period, np.array(tick.state.x), config.plant.plan_patience, PLANT)
@@ -131,7 +131,7 @@ def table(found: dict[str, list[Silence]]) -> str:
 
 
 def main(seeds: int = 3, document: Path | None = None) -> None:
-    """What becomes of the true plant when its controller falls silent.
+    """Measure the motion of the true plant after its controller falls silent.
 
     Args:
         seeds: runs, from seed 0 on.

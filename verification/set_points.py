@@ -1,8 +1,8 @@
-"""How set-points are followed where the model is wrong: `python -m verification.set_points`.
+"""Tracking of set-points with a wrong model: `python -m verification.set_points`.
 
-Lock-step runs of the compressor with a slope of 1.4 in the place of its model's 1.5, of the tanks and of the quadrotor
-in wind. How far an output is from its set-point some seconds after each step. And of the compressor: how far on a ramp,
-with a preview and without; and what a step costs.
+Lock-step runs of the compressor with a slope of 1.4 instead of its model's 1.5, of the tanks, and of the quadrotor in
+wind. The table has the distance of an output from its set-point some seconds after each step. For the compressor it
+also has the distance on a ramp, with a preview and without, and the processor time of a step.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tandem.operating.set_points import set_point, trajectory
 HALF = 0.5
 """Half-width of y."""
 EACH = 1.2
-"""How long a step lasts, as a share of the time after which it is looked at."""
+"""Duration of a step, as a share of the time after which it is evaluated."""
 RAMP = ([0.0, 4.0, 8.0, 10.0], [1.65, 1.65, 1.75, 1.75])
 WARM = 40
 """Ticks that are not timed."""
@@ -40,7 +40,7 @@ class Steps:
     """A shipped configuration, or a file."""
     values: dict[str, tuple[float, ...]]
     after: float = 5.0
-    """Seconds after each, when it is looked at."""
+    """Seconds after each step at which it is evaluated."""
 
 
 START = ["plant.truth.slope=1.4", "plant.x0=[0.4, 1.6, 1.1547, 0.0]"]
@@ -92,7 +92,7 @@ def _config(oracle: str, chosen: SetPoints, name: str = "compressor-cheap") -> C
 
 
 def _steps(config: Config, steps: Steps) -> Iterator[float]:
-    """The largest |y - r| so many seconds after each, of the half-width; each is asked for when it begins."""
+    """Largest |y - r| so many seconds after each step, in half-widths; each step is given when it begins."""
     loop = Loop(config=config)
     own = [loop.plant.states.index(name) for name in steps.values]
     for row in zip(*steps.values.values(), strict=True):
@@ -103,7 +103,7 @@ def _steps(config: Config, steps: Steps) -> Iterator[float]:
 
 
 def _ramp(config: Config, previewed: bool) -> float:
-    """Mean |y - r| on the ramp, of the half-width. Not previewed: in each period the value of now is asked for."""
+    """Mean |y - r| on the ramp, in half-widths. Without a preview, each period asks for the present value."""
     loop, (times, values) = LockStep(config), RAMP
     off = []
     for step in range(round(times[2] * config.rate)):
@@ -120,7 +120,7 @@ def _ramp(config: Config, previewed: bool) -> float:
 
 
 def _costs(config: Config) -> list[float]:
-    """Processor time of a step with a set-point, on a ramp and with a corner ahead, of that of one without."""
+    """Processor time of a step with a set-point, on a ramp and with a corner ahead, relative to a step without one."""
     asked = [None, set_point({"y": 1.7}), trajectory([0.0, 1e3], {"y": [1.62, 1.82]}), None]
     corner = trajectory([0.0, 0.4, 1.0], {"y": [1.65, 1.65, 1.67]})
     loops = [LockStep(config) for _ in asked]

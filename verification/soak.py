@@ -1,9 +1,9 @@
-"""`make soak`: does anything grow, and is anything late, when it runs for long?
+"""`make soak`: check for growth and lateness in a long run.
 
-    python -m verification.soak --minutes 30 --document docs/faults.md
+    python -m verification.soak --minutes 30 --document docs/results/faults.md
 
-`tandem run` at 50 Hz with its trainer, recorder and live view. The resident memory of every process is read every ten
-seconds. Beside it run the empty loops of `benchmarks.live.stalls`: ticks that the machine itself made late are known.
+`tandem run` runs at 50 Hz with its trainer, recorder and live view. The memory of every process is read every ten
+seconds. The idle loops of `benchmarks.live.stalls` run beside it and show which ticks the machine itself made late.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage, stalls
-from node_runtime import provenance
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
@@ -62,30 +61,30 @@ class Soak:
     minutes: float = 30.0
     rate: float = 50.0
     split_minutes: float = 5.0
-    """A new part of the log after so long; the recorder's memory goes up until then, and down again."""
+    """Minutes of a part of the log; the recorder's memory rises until its end and falls again."""
     every: float = 10.0
     """Seconds between two readings of the memory."""
     warm: float = 60.0
-    """Seconds that do not count: what is loaded once, buffers that fill."""
+    """Seconds that do not count: modules are loaded and buffers fill."""
     set: list[str] = field(default_factory=list)
     """More section.key=value for `tandem run`."""
     out: Path = Path("runs/soak")
-    """Where figures and picture go."""
+    """Folder of figures and picture."""
     document: Path | None = None
-    """Where the table goes between its two marks; the picture goes beside it."""
+    """Document that receives the table between its two marks; the picture is placed beside it."""
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """Of one process. kB, and minutes since the first command; the slope is that after the first minute."""
+    """Memory of one process in kB, over minutes since the first command; the slope is that after the first minute."""
 
     minutes: list[float]
     rss: list[int]
     slope: float | None
     """kB a minute."""
     uncertainty: float | None
-    """The slope lies within it, either way, with 95 % confidence."""
+    """Half-width of the slope's 95 % confidence interval."""
     second_half: float | None
-    """The slope in the second half of the run, where buffers that are bounded have filled."""
+    """Slope in the second half of the run, where bounded buffers are full."""
 
 
 class Lateness(msgspec.Struct, frozen=True):
@@ -93,16 +92,16 @@ class Lateness(msgspec.Struct, frozen=True):
 
     ticks: int
     late: int
-    """Began late, ended after their period, or were skipped."""
+    """Ticks that began late, ended after their period, or were skipped."""
     by_machine: int
-    """Of these, while an empty loop above everything was late too."""
+    """Of these, ticks while an idle loop of the highest priority was late too."""
     stalls: int
-    """Times that an empty loop woke more than 2 ms late."""
+    """Times that an idle loop woke more than 2 ms late."""
     longest_stall_ms: float
 
 
 def main(settings: Soak) -> int:
-    """0; 1 when the run failed; 2 when the document lacks the marks."""
+    """Return 0, 1 if the run failed, or 2 if the document lacks the marks."""
     console = Console(stderr=True)
     try:
         MARKS.check(settings.document)
@@ -132,7 +131,7 @@ def main(settings: Soak) -> int:
 
 
 def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memory], dict[str, Any]] | None:
-    """Memory by process, and what the run says of itself; None when it failed, which is said."""
+    """Return memory by process and the run's own summary; None if it failed, with a message."""
     seconds = 60.0 * settings.minutes
     words = ["run", "--json", "--rate", str(settings.rate), "--seconds", str(seconds)]
     words += ["--log", str(folder / "run.mcap"), "--set", f"log.split_minutes={settings.split_minutes}"]
@@ -153,7 +152,7 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
             if "the run begins" in line:
                 break
         with (folder / "said.txt").open("w") as rest, Progress(console=console) as bar:
-            # The run must not wait for somebody who reads what it says.
+            # The run must not wait for a slow reader of its output.
             subprocess.Popen(["cat"], stdin=running.stderr, stdout=rest)
             task = bar.add_task(f"{settings.minutes:g} minutes at {settings.rate:g} Hz", total=seconds)
             began = time.monotonic()
@@ -173,7 +172,7 @@ def _run(settings: Soak, folder: Path, console: Console) -> tuple[dict[str, Memo
 
 
 def fit(readings: list[tuple[float, int]], warm: float) -> Memory:
-    """The slope after the first `warm` minutes, by least squares, and its confidence."""
+    """Return the slope after the first `warm` minutes, by least squares, and its confidence."""
     minutes, rss = [at for at, _ in readings], [value for _, value in readings]
     slope, uncertainty = _slope(minutes, rss, warm)
     half, _ = _slope(minutes, rss, max(warm, minutes[-1] / 2.0))
@@ -186,12 +185,12 @@ def _slope(minutes: list[float], rss: list[int], since: float) -> tuple[float | 
         return None, None
     line = stats.linregress(*np.array(kept, dtype=float).T)
     wide = stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(kept) - 2) * line.stderr
-    # Not a byte more or less: there is no error to speak of, and scipy says nan.
+    # All readings are equal: the fit has no error, and scipy returns nan.
     return float(line.slope), float(np.nan_to_num(wide))
 
 
 def late(parts: list[Path], noted: list[stalls.Stall], rate: float) -> Lateness:
-    """Walks the log once; a tick's place in time is that of the state that it used."""
+    """Read the log once; the time of a tick is that of the state that it used."""
     period = 1.0 / rate
     ticks: set[int] = set()
     when: dict[int, tuple[float, float]] = {}
@@ -214,7 +213,7 @@ def late(parts: list[Path], noted: list[stalls.Stall], rate: float) -> Lateness:
 
 
 def _timed(parts: list[Path]) -> Iterator[m.Message]:
-    """Ticks and their timings; what two parts both have comes twice."""
+    """Return ticks and their timings; a tick in two parts appears twice."""
     names = {f"raw/{topic.name}": topic for topic in (topics.TICK, topics.TIMING)}
     for part in parts:
         channels: dict[int, topics.Topic] = {}
@@ -226,7 +225,7 @@ def _timed(parts: list[Path]) -> Iterator[m.Message]:
 
 
 def replayed(parts: list[Path]) -> list[str]:
-    """What a replay of each part found, in a few words."""
+    """Return the outcome of a replay of each part, in a few words."""
     found = []
     for part in parts:
         try:
@@ -241,7 +240,7 @@ def replayed(parts: list[Path]) -> list[str]:
 
 
 def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
-    """Change of each process's memory since the first minute, over time, into a PNG."""
+    """Plot the change of each process's memory since the first minute into a PNG."""
     figure = Figure(figsize=(8.0, 4.2), layout="constrained", dpi=120)
     ax = figure.subplots()
     for name, (colour, line) in LOOKS.items():
@@ -252,7 +251,7 @@ def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
         change = (np.array(one.rss) - one.rss[at]) / 1024.0
         label = f"{name}, {one.rss[at] / 1024:.0f} MB"
         ax.plot(one.minutes, change, color=colour, linestyle=line, linewidth=1.6, label=label)
-    # What is loaded in the first minute is many times what comes later; the picture is about the rest.
+    # The first minute loads many times more than what follows; the picture shows the rest.
     later = [
         (value - one.rss[at]) / 1024.0
         for one in memory.values()
@@ -276,10 +275,9 @@ def draw(memory: dict[str, Memory], warm: float, path: Path) -> None:
 def _table(
     memory: dict[str, Memory], lateness: Lateness, replays: list[str], run: dict[str, Any], picture: str
 ) -> list[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "verification.soak", *sys.argv[1:]])
     lines = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}.",
+        *conditions(command),
         "",
         f"![Resident memory of every process over time]({picture})",
         "",
@@ -299,14 +297,21 @@ def _table(
     return [
         *lines,
         "",
-        f"{lateness.ticks:,} ticks, {lateness.late} of them late or skipped, {lateness.by_machine} of these while the "
-        f"machine itself stood still: an empty loop on each core, above all of Tandem, woke more than 2 ms late "
-        f"{lateness.stalls} times, at most by {lateness.longest_stall_ms:.1f} ms. "
-        f"Solve {_spread(solve)}, tick {_spread(tick)} ms (p50, p99, largest). "
-        f"These, constraint violations, {run.get('constraint_violations')}, and ticks lost to the log, "
-        f"{run.get('lost_ticks')}, are of its first part.",
+        "| lateness | |",
+        "| --- | ---: |",
+        f"| ticks | {lateness.ticks:,} |",
+        f"| late or skipped | {lateness.late} |",
+        f"| of these during a stall of the machine | {lateness.by_machine} |",
+        f"| times that an empty loop above all of Tandem woke more than 2 ms late | {lateness.stalls} |",
+        f"| longest stall | {lateness.longest_stall_ms:.1f} ms |",
+        f"| solve, first part of the log: p50, p99, largest | {_spread(solve)} ms |",
+        f"| tick, first part of the log: p50, p99, largest | {_spread(tick)} ms |",
+        f"| constraint violations, first part of the log | {run.get('constraint_violations')} |",
+        f"| ticks lost to the log, first part of the log | {run.get('lost_ticks')} |",
         "",
-        f"Replay of the log's {len(replays)} parts: {'; '.join(replays)}.",
+        f"Replay of the log's {len(replays)} parts:",
+        "",
+        *(f"- {part}" for part in replays),
     ]
 
 

@@ -1,8 +1,8 @@
-"""What the trial of hidden weights lets through: `python -m verification.stolen_trainer` prints decision 0020's table.
+"""What the trial of hidden weights admits: `python -m verification.stolen_trainer` prints the tables of attacks.
 
-Lock-step runs of the paper's start: undisturbed, with measurement noise, and under a stolen trainer that sends a set at
-every tick, at every seventh, or in place of each set that the real one trained; each with the trial and without it.
-What follows the number of seeds is settings of every run, and then only those with the trial are made. With noise:
+Lock-step runs of the paper's start: without an attack, with measurement noise, and with a stolen trainer that sends a
+set at every tick, at every seventh tick, or in place of each trained set; each with the trial and without it.
+Settings after the number of seeds apply to every run. Then only runs with the trial are made. With noise:
 
     python -m verification.stolen_trainer 1 plant.sensors.noise=0.01 estimator.kind=kalman
 """

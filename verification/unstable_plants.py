@@ -1,8 +1,8 @@
-"""What each oracle costs on plants that run away within their horizon: `python -m verification.unstable_plants`.
+"""The cost of each oracle on plants that are unstable within their horizon: `python -m verification.unstable_plants`.
 
-Lock-step runs of dx/dt = a x + a u and of inverted pendulums, at N = 60 or the largest horizon that a start allows. The
-pendulums start near their equilibrium, where h is nearly 0, and far from it. What is asked: no oracle costs more than
-1.02 times what linear MPC costs, and every solve converges.
+Lock-step runs of dx/dt = a x + a u and of inverted pendulums, at N = 60 or the largest horizon that a start allows.
+The pendulums start near their equilibrium, where h is nearly 0, and far from it. Requirements: no oracle costs more
+than 1.02 times what linear MPC costs, and every solve converges.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ORACLES = ("constant", "l2nw", "dnn", "perfect")
 
 
 def plants() -> dict[str, Plant]:
-    """By what they are called in the table."""
+    """Plants by their names in the table."""
     rates = {f"a = {a:g} /s": unstable(a) for a in (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)}
     rods = {f"pendulum, {length:g} m": inverted(length) for length in (1.0, 0.3, 0.1)}
     far = {f"{name}, from 0.6 rad": replace(plant, x0=np.array([0.6, 0.0])) for name, plant in rods.items()}
@@ -40,7 +40,7 @@ def largest_horizon(plant: Plant) -> int:
 
 
 def cost(plant: Plant, oracle: str, horizon: int) -> tuple[float, bool]:
-    """J of a run, and whether every solve converged."""
+    """Return J of a run, and whether every solve converged."""
     PLANTS[plant.name] = plant
     settings = [f"plant.model={plant.name}", f"controller.oracle={oracle}", f"controller.horizon={horizon}"]
     outcome = follow(load(None, [*settings, f"rate={RATE}", "controller.solver.compile=never"]), STEPS)
@@ -49,7 +49,7 @@ def cost(plant: Plant, oracle: str, horizon: int) -> tuple[float, bool]:
 
 
 def main() -> int:
-    """Print the table. 0: nothing is worse than asked."""
+    """Print the table; return 0 if all requirements are met."""
     console = Console(width=160, highlight=False)
     console.print(f"| plant | N | linear, J | {' | '.join(ORACLES)} |")
     console.print("| --- " * (3 + len(ORACLES)) + "|")

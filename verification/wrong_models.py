@@ -1,7 +1,7 @@
-"""What each oracle costs where the nominal model is wrong: `python -m verification.wrong_models`.
+"""The cost of each oracle with a wrong nominal model: `python -m verification.wrong_models`.
 
 Lock-step runs in episodes of the compressor with other parameters than its model's, and of two of the examples, at
-several horizons. What is asked: where `perfect`, which knows the true plant, keeps X, the network is within 2 % of the
+several horizons. Requirement where `perfect`, which knows the true plant, keeps X: the network is within 2 % of the
 better of it and the best constant h_hat from the second episode on, and within 10 % in the first.
 """
 
@@ -28,7 +28,7 @@ from tandem.experiments.simulation.lockstep import follow
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 LATER, FIRST = 1.02, 1.10
-"""What the network's J may be of the better of `perfect`'s and the best constant's."""
+"""Largest J of the network relative to the better of `perfect`'s and the best constant's."""
 ROWS = {
     "linear": ["controller.oracle=linear"],
     **{f"constant {g}": ["controller.oracle=constant", f"constant.gain={g}"] for g in (0.2, 0.5, 1)},
@@ -40,7 +40,7 @@ ROWS = {
 
 @dataclass(frozen=True)
 class Wrong:
-    """A plant whose model is wrong."""
+    """A plant with a wrong model."""
 
     config: str
     """A shipped configuration, or a file."""
@@ -48,7 +48,7 @@ class Wrong:
     steps: int = 200
     """Of an episode."""
     second: float = 1.0
-    """Seconds that a horizon of 1 stands for: slow plants need minutes."""
+    """Seconds of one unit of the horizon: slow plants need minutes."""
 
 
 def _truth(parameters: dict[str, float]) -> list[str]:
@@ -77,7 +77,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     horizon: float
     oracle: str
     J: list[float]
-    """Of each episode; infinite from the one on in which the plant was lost."""
+    """J of each episode; infinite from the episode in which the plant was lost."""
     violations: int
     """Samples outside X or U, in all episodes."""
     iteration_limit: int
@@ -98,7 +98,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run_one(plant: str, horizon: float, oracle: str, episodes: int, more: list[str]) -> Row:
-    """One run, deterministic."""
+    """Return one run; deterministic."""
     wrong = WRONG[plant]
     seconds = f"controller.horizon_seconds={horizon * wrong.second}"
     config = load(config_file(wrong.config), [*wrong.settings, *ROWS[oracle], *more, seconds])
@@ -128,7 +128,7 @@ def _chatter(run: Run, last: int) -> float:
 
 
 def verdict(rows: list[Row]) -> tuple[bool, str]:
-    """Whether what is asked of the network is met, and in words; `rows` are all oracles of one plant and horizon."""
+    """Return whether the requirement is met, and a sentence; `rows` are all oracles of one plant and horizon."""
     of = {row.oracle: row for row in rows}
     perfect, dnn = of.get("perfect"), of.get("dnn")
     constants = [row for name, row in of.items() if name.startswith("constant")]
@@ -147,7 +147,7 @@ def verdict(rows: list[Row]) -> tuple[bool, str]:
 
 
 def show(rows: list[Row], console: Console) -> bool:
-    """A line a run and a verdict for each plant and horizon; whether all is met."""
+    """Print a line a run and a verdict for each plant and horizon; return whether all are met."""
     all_met = True
     for (plant, horizon), group in groupby(rows, key=lambda row: (row.plant, row.horizon)):
         same = list(group)
@@ -176,7 +176,7 @@ def main(
     jobs: int = 1,
     json: bool = False,
 ) -> int:
-    """Run and print; 1 where something is not met.
+    """Run and print; return 1 if a requirement is not met.
 
     Args:
         plants: names of `WRONG`.

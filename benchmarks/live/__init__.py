@@ -1,1 +1,1 @@
-"""Live runs: how punctual they are and what they take of the machine."""
+"""Live runs: their punctuality and their use of the machine."""

@@ -1,10 +1,10 @@
-"""One trainer for many plants: time from samples to weights, and what a stack saves.
+"""One trainer for many plants: time from samples to weights, and the savings of a stack.
 
-    python -m benchmarks.live.fleet --document docs/fleet.md
+    python -m benchmarks.live.fleet --document docs/results/fleet.md
 
-A real router and a real `tandem trainer --plants 'plant*'`. The controllers are simulated, all in this process: each
-publishes ten samples and its K twice a second, as a loop at 20 Hz does, answers what the trainer asks, and takes what
-it is sent.
+A real router and a real `tandem trainer --plants 'plant*'` run. The controllers are simulated, all in this process.
+Each publishes ten samples and its K twice a second, as a loop at 20 Hz does, answers the trainer's questions, and
+accepts its weights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import tyro
 import zenoh
 from rich.console import Console
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage
 from benchmarks.live.ports import free_port
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
@@ -49,21 +49,21 @@ SAMPLES, EVERY_S = 10, 0.5
 
 @dataclass(frozen=True)
 class Fleet:
-    """One trainer for many plants, measured."""
+    """Measure one trainer for many plants."""
 
     plants: tuple[int, ...] = (1, 8, 64, 256)
     seconds: float = 40.0
-    """For each number of plants."""
+    """Samples for each number of plants."""
     warm: float = 20.0
     """Seconds at the beginning that do not count."""
     batch: tuple[int, ...] = (512, 64)
     """`trainer.batch`: the samples drawn for one training."""
     document: Path | None = None
-    """Where the tables go between their two marks."""
+    """Document that receives the tables between their two marks."""
 
 
 class Simulated:
-    """A controller that is only its messages."""
+    """A controller reduced to its messages."""
 
     def __init__(self, name: str, number: int):
         self.name, self.run_id, self.seq = name, f"controller-{name}", -1
@@ -74,10 +74,10 @@ class Simulated:
         self._rng = rng
         self._told: list[tuple[int, float]] = []
         self.waited: list[tuple[float, float]] = []
-        """When weights came, and how long the oldest sample in them that was in none before had waited; seconds."""
+        """Times at which weights came, and the age of the oldest sample that was new in them; seconds."""
 
     def speak(self, session: zenoh.Session) -> None:
-        """Ten samples of a plant of its own, and K."""
+        """Publish ten samples of a plant of its own, and K."""
         xu = self._rng.uniform(-1, 1, (SAMPLES, 5)) * NETWORK.input_scale
         h = 0.01 * np.sin(3.0 * xu[:, :4]) * np.tanh(xu[:, 4:])
         samples = []
@@ -121,7 +121,7 @@ class Simulated:
 
     @property
     def oldest(self) -> float | None:
-        """When the oldest sample was said that no weights have come for."""
+        """Time of the oldest sample that is in no weights yet."""
         return self._told[0][1] if self._told else None
 
     def _put(self, session: zenoh.Session, topic: topics.Topic, message: m.Message) -> None:
@@ -132,15 +132,15 @@ class Simulated:
 
 @dataclass
 class Row:
-    """What one number of plants gave."""
+    """Results for one number of plants."""
 
     plants: int
     batch: int
     waited: list[float] = field(default_factory=list)
     trainings: list[int] = field(default_factory=list)
-    """Weights that each plant got while it counted."""
+    """Weights that each plant received during the measurement."""
     waits: float = 0.0
-    """For how long the oldest sample had waited at the end."""
+    """Age of the oldest waiting sample at the end, in seconds."""
     cpu: float = 0.0
     """Of the trainer, cores."""
 
@@ -153,7 +153,7 @@ def main() -> int:
     except DocumentError as error:
         console.print(str(error), markup=False)
         return 2
-    rows, text = [], [_command(settings)]
+    rows, text = [], _command(settings)
     text += _ratios(settings, console)
     for batch in settings.batch:
         for plants in settings.plants:
@@ -166,10 +166,9 @@ def main() -> int:
     return 0
 
 
-def _command(settings: Fleet) -> str:
-    told = provenance.describe()
+def _command(settings: Fleet) -> list[str]:
     words = "" if settings.seconds == Fleet.seconds else f" --seconds {settings.seconds:g}"
-    return f"`python -m benchmarks.live.fleet{words}`, on {told['processor']}, {told['cores']} cores, {told['system']}."
+    return conditions(f"python -m benchmarks.live.fleet{words}")
 
 
 # -- the trainer as a process ------------------------------------------------------------------------------
@@ -194,7 +193,7 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
                 end = _let_speak(session, controllers, arrived, settings.seconds, begin)
                 cpu = (process_usage.processor_seconds(trainer.pid) - cpu) / (end - begin)
             finally:
-                # One that is overwhelmed takes long to leave its plants.
+                # An overloaded trainer takes long to leave its plants.
                 trainer.kill()
                 trainer.wait()
             del declared
@@ -211,7 +210,7 @@ def _measure(plants: int, batch: int, settings: Fleet) -> Row:
 def _serve(
     session: zenoh.Session, controllers: dict[str, Simulated], arrived: list[tuple[str, bytes, float]]
 ) -> list[object]:
-    """What the trainer asks and says; kept as long as the list is."""
+    """Messages from the trainer; kept as long as the list exists."""
 
     def hidden(query: zenoh.Query) -> None:
         with query:
@@ -223,7 +222,7 @@ def _serve(
         arrived.append((str(sample.key_expr).split("/")[1], sample.payload.to_bytes(), time.monotonic()))
 
     def outbox(query: zenoh.Query) -> None:
-        """What was said before the trainer came is not kept."""
+        """Messages from before the trainer's start are not kept."""
         with query:
             controller = controllers.get(str(query.key_expr).split("/")[1])
             if controller is not None:
@@ -245,7 +244,7 @@ def _let_speak(
     seconds: float,
     begin: float | None,
 ) -> float:
-    """Every controller speaks twice a second, one after the other; the time at the end."""
+    """Let every controller publish twice a second, one after the other; return the time at the end."""
     begin = time.monotonic() if begin is None else begin
     everyone = list(controllers.values())
     gap, turn = EVERY_S / len(everyone), 0
@@ -253,7 +252,7 @@ def _let_speak(
         while arrived:
             name, payload, at = arrived.pop(0)
             controllers[name].take(codec.decode_as(m.HiddenWeights, payload), at)
-            # A controller says K at every tick.
+            # A controller publishes K at every tick.
             controllers[name].say_weights(session)
         due = begin + turn * gap
         if now >= due:
@@ -268,7 +267,7 @@ def _let_speak(
 
 
 def _ratios(settings: Fleet, console: Console) -> list[str]:
-    """The descent alone, in a process of its own, in turns."""
+    """Time the descent alone, in a process of its own, in turns."""
     plants = [count for count in settings.plants if count > 1]
     ran = subprocess.run(
         [sys.executable, "-m", "benchmarks.live.stacked_descent", json.dumps([settings.batch, plants])],
@@ -292,8 +291,8 @@ def _ratios(settings: Fleet, console: Console) -> list[str]:
 
 def _table(rows: list[Row], settings: Fleet) -> list[str]:
     lines = [
-        f"Of {settings.seconds:g} s with so many plants, after {settings.warm:g} s of warming up; a training is "
-        f"{TrainerConfig().steps} steps.",
+        f"Each row: {settings.seconds:g} s with this number of plants, after {settings.warm:g} s of warming up. "
+        f"A training has {TrainerConfig().steps} steps.",
         "",
         "| plants | samples drawn | from samples to weights, s: median | p99 | longest | still waiting at the end, s "
         "| weights a plant, fewest, most | trainings a second | trainer, cores |",

@@ -1,4 +1,4 @@
-"""Ports of this machine for runs that must not meet."""
+"""Free ports of this machine for runs that must not collide."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import socket
 
 
 def free_port() -> int:
-    """One on loopback on which nobody listens at this moment."""
+    """Return a port on loopback that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,4 +1,4 @@
-"""The processes of a `tandem run`, seen from outside: their memory and the time they take of the cores."""
+"""The processes of a `tandem run` as the operating system sees them: memory and processor time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 def of(supervisor: int) -> Iterator[tuple[str, Path]]:
-    """(name, folder in /proc) of `tandem run`, by its pid, and of what it has started."""
+    """(name, folder in /proc) of `tandem run`, by its pid, and of the processes that it started."""
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
@@ -40,7 +40,7 @@ def resident(supervisor: int) -> dict[str, int]:
 
 
 def busy(supervisor: int) -> dict[str, float]:
-    """Seconds of a core that each has taken so far, by process."""
+    """Seconds of processor time so far, by process."""
     found = {}
     for name, entry in of(supervisor):
         try:
@@ -51,7 +51,7 @@ def busy(supervisor: int) -> dict[str, float]:
 
 
 def processor_seconds(pid: int) -> float:
-    """Seconds of a core that a process has taken so far."""
+    """Seconds of processor time of one process so far."""
     return _processor_seconds(Path(f"/proc/{pid}"))
 
 
@@ -60,5 +60,5 @@ def _processor_seconds(entry: Path) -> float:
 
 
 def _fields(entry: Path) -> list[str]:
-    """Of /proc/PID/stat, from the state on: what stands before it may have spaces in it."""
+    """Fields of /proc/PID/stat from the state on; earlier fields may contain spaces."""
     return (entry / "stat").read_text().rpartition(")")[2].split()

@@ -1,12 +1,12 @@
-"""How punctual the live loop is at one rate after the other, and the machine beside it at the same time.
+"""Punctuality of the live loop at several rates, and of the machine at the same time.
 
-    python -m benchmarks.live.rates --document docs/rates.md
+    python -m benchmarks.live.rates --document docs/results/rates.md
 
-For each rate and solver mode `tandem run` goes on for a while, with its trainer, recorder and live view. Beside it runs
-the empty loop of `benchmarks.live.wakeups`, one priority above: nothing of Tandem delays it, so what is late there is
-late because of the machine; and so is, most likely, a tick that was late at the same moment. Late is what the
-configuration calls late: begun later than a fifth of a period after its slot, or ended after its period; a slot that
-was skipped counts too.
+For each rate and solver mode `tandem run` runs for a while, with its trainer, recorder and live view. The idle
+loop of `benchmarks.live.wakeups` runs beside it with a higher priority, so Tandem does not delay it. If it is
+late, the machine is the cause, and a tick that is late at the same moment most likely has the same cause. "Late" is
+defined as in the configuration: a tick begins later than a fifth of a period after its slot, or ends after its period.
+A skipped slot counts too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.document_block import DocumentError, Marks
+from benchmarks.document_block import DocumentError, Marks, conditions
 from benchmarks.live import process_usage
 from node_runtime import provenance
 from node_runtime.config.literals import SolverMode
@@ -45,8 +45,8 @@ COLUMNS = (
     "late",
     "skipped",
     "empty loop on time, %",
-    "late ones beside its misses, %",
-    "others, %",
+    "late ticks beside a miss, %",
+    "other ticks beside a miss, %",
     "tick p50 / p99, ms",
     "solve p50 / p99, ms",
     "of a core: controller, plant, router, others",
@@ -58,7 +58,7 @@ FIRST = ("controller", "plant", "router")
 
 @dataclass(frozen=True)
 class Rates:
-    """Rates and modes, and how long each of them runs."""
+    """Rates and modes, and the length of each run."""
 
     rates: tuple[int, ...] = (20, 100, 200, 500, 1000)
     """Samples a second."""
@@ -68,11 +68,11 @@ class Rates:
     set: list[str] = field(default_factory=list)
     """More section.key=value for `tandem run`."""
     document: Path | None = None
-    """Where the table goes between its two marks."""
+    """Document that receives the table between its two marks."""
 
 
 def main(settings: Rates) -> int:
-    """Measure, print a Markdown table, and put it into the document where one is given."""
+    """Measure, print a Markdown table, and write it into the document if one is given."""
     try:
         MARKS.check(settings.document)
     except DocumentError as error:
@@ -83,12 +83,13 @@ def main(settings: Rates) -> int:
 
 
 def _table(settings: Rates) -> Iterator[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "benchmarks.live.rates", *sys.argv[1:]])
     overrides = " ".join(f"--set {override}" for override in _overrides(settings, "SOLVER"))
     run = f"tandem run --rate RATE --seconds {settings.seconds:g} {overrides}"
     head = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}. Each row is `{run}`.",
+        *conditions(command, "Each row is the run"),
+        "",
+        *("```text", run, "```"),
         "",
         f"| {' | '.join(COLUMNS)} |",
         f"| {' | '.join(['---:'] * len(COLUMNS))} |",
@@ -147,7 +148,7 @@ def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
 def _beside(
     rate: int, seconds: float, running: subprocess.Popen[str]
 ) -> tuple[dict[str, Any] | None, list[float]]:
-    """From the middle of the run: the empty loop's figures, None when it did not run, and what took the cores."""
+    """From the middle of the run: the idle loop's figures, None if it did not run, and processor time by process."""
     # Processes need some seconds to start; the loop waits here for the controller's first tick, not for the clock.
     assert running.stderr is not None
     for line in running.stderr:
@@ -165,13 +166,13 @@ def _beside(
 
 
 def _beside_misses(run: Run, empty: dict[str, Any]) -> list[str]:
-    """Of the ticks that were late or came after skipped slots, and of all others: how many percent lie beside a miss.
+    """Percentage of late ticks, and of all other ticks, that lie beside a miss of the idle loop.
 
-    Beside: within a period of a moment at which the empty loop should have run and did not.
+    Beside: within a period of a moment at which the idle loop should have run and did not.
     """
     timing = {timing.seq: timing.tick_ms * 1e-3 for timing in run.timings}
     entries, period = run.entries(topics.TICK), run.config.period
-    # The slots' own clock against that of the log; the message that took least from the one to the other says it best.
+    # Offset of the slots' clock against that of the log, from the message with the shortest delay.
     to_unix = min(
         entry.log_time * 1e-9 - entry.message.t - timing.get(entry.message.seq, 0.0) for entry in entries
     )

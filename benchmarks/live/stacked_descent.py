@@ -1,4 +1,4 @@
-"""What a stack of networks saves: their descents one by one and together, in turns, in a process of its own.
+"""Savings of a stack of networks: their descents one by one and together, in turns, in a process of its own.
 
     python -m benchmarks.live.stacked_descent '[[512, 64], [8, 64]]'
 
@@ -23,11 +23,11 @@ from trainer_node.training import use_one_thread
 from trainer_node.training_round import MOST_STACKED
 
 TURNS = 5
-"""The first of them does not count."""
+"""The first repetition does not count."""
 
 
 def main(batches: Sequence[int], counts: Sequence[int]) -> list[list[float]]:
-    """One row a batch and number of networks, up to the most that are ever stacked."""
+    """One row for each batch and number of networks, up to the largest stack."""
     use_one_thread()
     stacks = sorted({min(count, MOST_STACKED) for count in counts})
     return [[batch, count, *_times(batch, count)] for batch in batches for count in stacks]

@@ -1,7 +1,8 @@
-"""Empty loops that note when the machine itself kept them waiting; what is late then is late in every loop.
+"""Idle loops that record when the machine itself stalled; every loop is late at such a moment.
 
-A virtual machine's cores are taken away now and then. The loops run on one core each, above all priorities of Tandem,
-and write down when they woke late: a tick that the machine made late is told apart from one that Tandem made late.
+A host takes the cores of a virtual machine away at times. One loop runs on each core, above all priorities of Tandem,
+and records when it woke late. A tick that the machine made late is thereby distinguished from one that Tandem
+made late.
 
     python stalls.py FILE CORE PRIORITY       is how `watched` starts each
 """
@@ -17,18 +18,18 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 PERIOD = 0.002
-"""Seconds. A stall is seen where a loop should have woken during it, so none longer than this and `NOTED` is missed."""
+"""Seconds. A stall shows if a loop should have woken during it, so one longer than this and `NOTED` always shows."""
 NOTED = 0.002
 ABOVE = 5
-"""How far their priority lies above the loops' own."""
+"""Difference between their priority and that of the loops."""
 
 Stall = tuple[float, float]
-"""When a loop should have woken, and how late it did; seconds, on the monotonic clock."""
+"""When a loop should have woken, and how late it woke; seconds, on the monotonic clock."""
 
 
 @contextmanager
 def watched(path: Path, priority: int) -> Iterator[None]:
-    """Note the machine's stalls to `path` while the body runs. priority: SCHED_FIFO of Tandem's loops; 0: none."""
+    """Record the machine's stalls to `path` while the body runs. priority: SCHED_FIFO of Tandem's loops; 0: none."""
     with ExitStack() as stack:
         for core in sorted(os.sched_getaffinity(0)):
             words = [sys.executable, __file__, str(path), str(core), str(priority + ABOVE if priority else 0)]
@@ -39,18 +40,18 @@ def watched(path: Path, priority: int) -> Iterator[None]:
 
 
 def read(path: Path) -> list[Stall]:
-    """What was noted, in order; a line that is still being written is left out."""
+    """Return the recorded stalls in order; an unfinished line is left out."""
     lines = path.read_text().split("\n")[:-1] if path.exists() else []
     return sorted((float(due), float(late)) for due, late in (line.split() for line in lines))
 
 
 def during(stalls: Sequence[Stall], begin: float, end: float) -> bool:
-    """Whether the machine stood still at some moment between the two."""
+    """Return whether the machine stalled at some moment between the two."""
     return any(due < end and due + late > begin for due, late in stalls)
 
 
 def main(path: str, core: int, priority: int) -> None:
-    """Until killed, or left alone."""
+    """Run until killed or until the parent ends."""
     parent = os.getppid()
     os.sched_setaffinity(0, {core})
     if priority:

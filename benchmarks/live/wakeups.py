@@ -1,9 +1,9 @@
-"""How punctual this machine lets anything be: a loop that sleeps, wakes on its slot, and does nothing else.
+"""Punctuality of this machine: a loop that sleeps, wakes on its slot, and does nothing else.
 
     python -m benchmarks.live.wakeups --rate 1000 --seconds 10
 
-What is late here is late in every loop beside the same load: a busy host takes a virtual machine's cores away, and no
-priority inside it helps. Compare a run's late ticks with this, measured at the same time of day.
+A delay here affects every loop under the same load: a busy host takes the cores of a virtual machine away, and no
+priority inside the machine helps. Compare a run's late ticks with this figure from the same time of day.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from node_runtime.realtime.scheduling import punctual
 
 @dataclass(frozen=True)
 class Wakeups:
-    """The empty loop, at the priority and with the slots of `tandem controller`."""
+    """Run the idle loop, with the priority and the slots of `tandem controller`."""
 
     rate: float = 1000.0
     """Slots a second."""
@@ -35,13 +35,13 @@ class Wakeups:
     priority: int = 50
     """SCHED_FIFO; 0: none."""
     late_fraction: float = 0.2
-    """A slot is late when it begins later than this share of a period, as in the configuration."""
+    """A slot is late if it begins later than this share of a period, as in the configuration."""
     awake: AwakeMode = "auto"
     """As `realtime.awake` in the configuration."""
 
 
 def measure(settings: Wakeups) -> dict[str, Any]:
-    """Late and skipped slots in percent of all, lateness in ms, and between which moments there was none on time.
+    """Late and skipped slots in percent of all, lateness in ms, and intervals without a punctual slot.
 
     The moments of `span` and `missed` are in seconds of Unix time.
     """
@@ -56,7 +56,7 @@ def measure(settings: Wakeups) -> dict[str, Any]:
         pacer = Pacer(Grid(period, clock.now() + period), threading.Event())
         for _ in range(round(settings.seconds * settings.rate)):
             turn = pacer.next()
-            assert turn is not None  # nobody tells it to stop
+            assert turn is not None  # no other process stops it
             slot, late_by = turn
             lateness.append(late_by)
             if late_by > settings.late_fraction * period or slot.skipped:

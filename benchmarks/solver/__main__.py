@@ -1,4 +1,4 @@
-"""Measures, shows, and puts the figures into a document: `python -m benchmarks.solver`."""
+"""Measure, print, and write the figures into a document: `python -m benchmarks.solver`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.solver.measure import QUICK, Scope, measure
 from tandem import terminal
 
 TABLE = 132
-"""Characters that the table of all figures needs."""
+"""Width in characters of the table of all figures."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Benchmark:
     """Time the solver beside others on the same recorded states: horizons, widths, oracles, modes. About 10 minutes."""
 
     quick: bool = False
-    """A few cases only, within a minute."""
+    """Only a few cases, within a minute."""
     document: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Rewrite the figures between the marks in this Markdown file, and the picture beside it."""
     json: bool = False
-    """One JSON object on standard output; what is for a person goes to standard error."""
+    """Print one JSON object to standard output; text for a person goes to standard error."""
 
 
 def main(chosen: Benchmark) -> int:
-    """0; 2 where the document cannot take the figures."""
+    """Return 0, or 2 if the document cannot take the figures."""
     console = terminal.console(chosen.json)
     try:
         reporting.MARKS.check(chosen.document)
@@ -43,7 +43,7 @@ def main(chosen: Benchmark) -> int:
                 QUICK if chosen.quick else Scope(),
                 lambda what, done, of: bar.update(task, description=what, completed=done, total=of),
             )
-        # A table cut to the width of a narrow terminal, or of a pipe, would lose its digits.
+        # A table cut to the width of a narrow terminal, or of a pipe, would lose digits.
         console.width = max(console.width, TABLE)
         console.print(reporting.table(report))
         console.print()

@@ -1,4 +1,4 @@
-"""Everything that can be timed on a recorded tick, behind one shape."""
+"""A common interface of everything that is timed on a recorded tick."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from protocol import messages as m
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One timed part of what a candidate did on one tick."""
+    """One timed part of a candidate's work on one tick."""
 
     mode: str
     seconds: float
     v0: np.ndarray
-    """The first input that came out, (m,), deviation coordinates."""
+    """The first input of the result, (m,), deviation coordinates."""
     iterations: int
     succeeded: bool
 
 
 class Runs(Protocol):
-    """`run` does the work of one tick, the same as often as it is called; `keep` goes on to the next."""
+    """`run` does the work of one tick, the same at each call; `keep` goes on to the next tick."""
 
     def run(self, tick: int) -> list[Part]: ...
 
@@ -40,20 +40,20 @@ class Runs(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Something to time, and what its rows are called."""
+    """A candidate for timing, and the labels of its rows."""
 
     solver: str
     case: Case
     compiled: bool
     runs: Runs
     every: int = 1
-    """Ticks between two runs: the slow ones are given fewer."""
+    """Ticks between two runs: slow candidates run on fewer ticks."""
     once: bool = False
-    """One run on a tick, where others are run in every round."""
+    """One run on a tick; other candidates run in every round."""
 
 
 class Converged:
-    """This solver to convergence, from the optimum of the tick before, shifted."""
+    """This solver to convergence, from the shifted optimum of the previous tick."""
 
     def __init__(self, case: Case, solver: Solver):
         self._case, self._solver = case, solver
@@ -70,9 +70,9 @@ class Converged:
 
 
 class RealTime:
-    """One real-time iteration a tick, prepared at the predicted state, going on from its *own* last plan.
+    """One real-time iteration a tick, prepared at the predicted state, continuing from its *own* last plan.
 
-    It is given the same weights as everybody else. In a loop the preparation has those of the tick before, which
+    It gets the same weights as the other candidates. In a loop the preparation has those of the previous tick, which
     `WholeTick` shows.
     """
 
@@ -101,7 +101,7 @@ class RealTime:
 
 
 class Other:
-    """A solver of somebody else's, from the same start."""
+    """Another solver, from the same start."""
 
     def __init__(self, case: Case, rival: Rival):
         self._case, self._rival = case, rival

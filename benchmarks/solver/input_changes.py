@@ -1,7 +1,7 @@
-"""What rate limits and a weight on input changes cost in a solve: `python -m benchmarks.solver.input_changes`.
+"""Cost of rate limits and of a weight on input changes in a solve: `python -m benchmarks.solver.input_changes`.
 
-The same recorded states and networks are solved with and without, in turn, in one run, each from its own last plan. The
-limit is so low that it acts in most of the solves.
+The same recorded states and networks are solved with and without them, in turn, in one run, each from its own last
+plan. The limit is so low that it is active in most of the solves.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Arguments:
 
 
 class Timed:
-    """One variant, going on from its own last plans."""
+    """One variant, continuing from its own last plans."""
 
     def __init__(self, chosen: Arguments, settings: list[str], realise: Realise):
         config = override(configure(chosen.oracle, chosen.horizon, chosen.width), settings)
@@ -73,7 +73,7 @@ class Timed:
 
 
 def measure(chosen: Arguments, realise: Realise) -> dict[str, Timed]:
-    """Every variant at every recorded tick, `rounds` times, in turn; the first time warms it up."""
+    """Run every variant at every recorded tick, `rounds` times, in turn; the first round warms it up."""
     recording: Recording = record(chosen.ticks, realise)
     variants = {name: Timed(chosen, settings, realise) for name, settings in VARIANTS.items()}
     oracle, model = variants["neither"].oracle, recording.model

@@ -23,10 +23,10 @@ from node_runtime.config.literals import OracleName
 from node_runtime.realtime.scheduling import GarbageCollection, punctual
 
 Progress = Callable[[str, int, int], None]
-"""Told what is going on, and how many steps of how many are done."""
+"""Called with the present step, its number and the number of steps."""
 ORACLES: tuple[OracleName, ...] = ("linear", "constant", "l2nw", "dnn")
 CENTRE, WIDTH = 60, 32
-"""The horizon and the width at which everything is compared."""
+"""The horizon and the width at which all candidates are compared."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Scope:
 
     ticks: int = 60
     rounds: int = 3
-    """How often each tick is repeated by what is quick."""
+    """Repetitions of each tick for fast candidates."""
     horizons: tuple[int, ...] = (10, 20, 60, 100, 200)
     """With networks of width 32."""
     widths: tuple[int, ...] = (16, 32, 64, 128, 256)
@@ -64,20 +64,20 @@ class Row(msgspec.Struct, frozen=True):
     oracle: str
     N: int
     width: int | None
-    """Neurons in each of the two hidden layers; None where there is no network."""
+    """Neurons in each of the two hidden layers; None without a network."""
     compiled: bool
     median_ms: float
     p99_ms: float
     max_ms: float
     cold_median_ms: float
-    """Of runs that found the caches full of something else."""
+    """Median of runs whose caches hold another candidate's data."""
     iterations: float
     """Mean."""
     error: float
     """Largest distance of the first input from the tight optimum, input units."""
     solves: int
     failures: int
-    """Solves that ended otherwise than they should, at the iteration limit for instance."""
+    """Solves with another status than expected, such as the iteration limit."""
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -85,12 +85,12 @@ class Report(msgspec.Struct, frozen=True):
 
     rows: list[Row]
     memory_mb: dict[str, float]
-    """Peak resident memory of a process that does this and nothing else."""
+    """Peak resident memory of a process that does only this."""
     machine: dict[str, str]
     versions: dict[str, str]
     notes: list[str]
     load: float
-    """Processes that wanted a core meanwhile, on average: more than there are cores make times too long."""
+    """Average number of runnable processes meanwhile: more than the cores makes times too long."""
 
     def find(
         self, solver: str, mode: str, oracle: str, N: int, width: int | None, compiled: bool
@@ -107,7 +107,7 @@ class Report(msgspec.Struct, frozen=True):
 
 @dataclass
 class _Taken:
-    """What was measured of one candidate's one mode."""
+    """The measurements of one candidate's one mode."""
 
     seconds: list[float] = field(default_factory=list)
     first_seconds: list[float] = field(default_factory=list)
@@ -121,9 +121,9 @@ def measure(
 ) -> Report:
     """Build everything, warm it up, then go through the ticks.
 
-    Each tick is given to every candidate before the next tick begins, in an order drawn anew each round, so that
-    whatever else the machine does falls on all alike. A turn is the same work twice: the first run finds the caches
-    full of the candidate before (`cold_median_ms`), the second is the one that counts. Garbage is collected between
+    Each tick is given to every candidate before the next tick begins, in a new random order each round, so that
+    other load affects all candidates alike. A turn is the same work twice: the first run has the caches full
+    of the previous candidate's data (`cold_median_ms`), the second one counts. Garbage is collected between
     ticks.
 
     Args:
@@ -230,7 +230,7 @@ def _run(scope: Scope, candidates: list[Candidate], progress: Progress) -> list[
                 if tick % candidate.every or (candidate.once and round_):
                     continue
                 first, parts = candidate.runs.run(tick), candidate.runs.run(tick)
-                # The first tick warms up: nothing had a plan to go on from.
+                # The first tick warms up: no candidate had a plan yet.
                 if tick:
                     _note(taken[index], first, parts, candidate.case.tight[tick].v[0])
         for candidate in candidates:

@@ -51,7 +51,7 @@ def _use(kind: str) -> None:
 
 
 def _peak() -> float:
-    # VmHWM begins anew with each program; getrusage would count what the parent held before it.
+    # VmHWM restarts with each program; getrusage would include the parent's memory before it.
     line = next(line for line in STATUS.read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
 

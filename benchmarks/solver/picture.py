@@ -1,4 +1,4 @@
-"""How the time grows with the horizon and with the width of the network."""
+"""Time over the horizon and over the width of the network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CURVES: tuple[Curve, ...] = (
 
 
 def draw(report: Report, path: Path) -> None:
-    """Two panels, both axes logarithmic, into a PNG at `path`."""
+    """Draw two panels, both axes logarithmic, into a PNG at `path`."""
     figure = Figure(figsize=(10.0, 5.2), layout="constrained", dpi=120)
     left, right = figure.subplots(1, 2, sharey=True)
     for key, label, colour, marker, line in CURVES:

@@ -26,7 +26,7 @@ TIGHT, TIGHT_ITERATIONS = 1e-11, 200
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A closed loop in deviation coordinates: x_t (d,), the input u_t (m,) after it, the h_t (d,) it showed."""
+    """A closed loop in deviation coordinates: x_t (d,), the input u_t (m,) after it, and the resulting h_t (d,)."""
 
     model: Model
     x: list[np.ndarray]
@@ -36,7 +36,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One problem and, tick by tick, what a solver of it is given and should find."""
+    """One problem with the data and the expected result of each tick."""
 
     oracle: OracleName
     horizon: int
@@ -49,7 +49,7 @@ class Case:
     predicted: list[np.ndarray]
     """x_t as the learned model predicted it one tick earlier; the first entry is x_0 itself."""
     warm: list[np.ndarray]
-    """Inputs to start from, (N, m): the optimum of the tick before, shifted by one."""
+    """Inputs to start from, (N, m): the optimum of the previous tick, shifted by one."""
     tight: list[Solution]
     """The optimum."""
 
@@ -60,7 +60,7 @@ class Case:
 
 
 def configure(oracle: OracleName, horizon: int, width: int | None) -> Config:
-    """The shipped configuration with this oracle, horizon and network."""
+    """Return the shipped configuration with this oracle, horizon and network."""
     hidden = [width or RECORDED_WIDTH] * LAYERS
     return load(
         None,
@@ -122,5 +122,5 @@ def build_case(
 
 
 def shifted(solution: Solution) -> np.ndarray:
-    """c of a plan one tick later, (N, m), with the feedback behind its end."""
+    """Return c of a plan one tick later, (N, m), with the feedback after its end."""
     return np.vstack([solution.c[1:], np.zeros_like(solution.c[:1])])

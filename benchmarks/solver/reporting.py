@@ -1,4 +1,4 @@
-"""What follows from the rows: ratios, tables for a terminal, and a document with its picture."""
+"""Results of the rows: ratios, tables for a terminal, and a document with its picture."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("stopped", lambda row: f"{row.failures} of {row.solves}" if row.failures else "-"),
 )
 TEXT = 3
-"""So many columns from the left are words, the rest numbers."""
+"""Number of text columns from the left; the others are numbers."""
 
 
 def milliseconds(value: float) -> str:
-    """Three digits at most, and no more than microseconds."""
+    """Format with at most three digits, and no more than microseconds."""
     return f"{value:.3f}" if value < 1 else f"{value:.3g}"
 
 
 def ratios(report: Report, N: int = CENTRE) -> dict[str, float]:
-    """Medians over medians at the horizon N with a 5-32-32-4 network, by name; without what was not measured."""
+    """Ratios of medians at the horizon N with a 5-32-32-4 network, by name; unmeasured ones are left out."""
     compiled = any(row.compiled for row in report.rows)
 
     def ours(mode: str, oracle: str) -> float | None:
@@ -67,7 +67,7 @@ def ratios(report: Report, N: int = CENTRE) -> dict[str, float]:
 
 
 def table(report: Report) -> Table:
-    """All rows, for a terminal."""
+    """Print all rows, for a terminal."""
     shown = Table(box=None, pad_edge=False, header_style="bold")
     for index, (name, _) in enumerate(COLUMNS):
         shown.add_column(name, justify="left" if index < TEXT else "right", no_wrap=True)
@@ -77,7 +77,7 @@ def table(report: Report) -> Table:
 
 
 def ratio_table(report: Report) -> Table:
-    """The ratios, for a terminal."""
+    """Print the ratios, for a terminal."""
     shown = Table(box=None, pad_edge=False, header_style="bold")
     shown.add_column(f"ratio of medians, N = {CENTRE}")
     shown.add_column("", justify="right")
@@ -87,7 +87,7 @@ def ratio_table(report: Report) -> Table:
 
 
 def write(report: Report, path: Path, command: str) -> Path:
-    """Replace what stands between the marks of `path`; returns the picture's path.
+    """Replace the text between the marks of `path`; return the picture's path.
 
     Raises:
         DocumentError: no such file, or it lacks the marks.

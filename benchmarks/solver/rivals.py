@@ -1,4 +1,4 @@
-"""The same problem in the hands of general solvers: IPOPT, and CasADi's sqpmethod."""
+"""The same problem for general solvers: IPOPT, and CasADi's sqpmethod."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IPOPT = {
     "ipopt.sb": "yes",
     "print_time": False,
     "ipopt.max_iter": 500,
-    # IPOPT otherwise solves a problem whose bounds it has moved by 1e-8, and the first input shows it.
+    # IPOPT otherwise moves the bounds by 1e-8, which shows in the first input.
     "ipopt.bound_relax_factor": 0.0,
 }
 SQPMETHOD = {
@@ -37,11 +37,11 @@ QP_SOLVERS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class _Written:
-    """A nonlinear program with its bounds, and where the inputs are among its variables."""
+    """A nonlinear program with its bounds, and the positions of the inputs among its variables."""
 
     program: dict[str, ca.MX]
     hessian: ca.MX
-    """Gauss-Newton, of the cost."""
+    """Gauss-Newton Hessian of the cost."""
     lbx: np.ndarray
     ubx: np.ndarray
     lbg: np.ndarray
@@ -51,7 +51,7 @@ class _Written:
 
 
 class Rival:
-    """A problem of boxes, handed to a solver of CasADi's.
+    """A problem of boxes for a solver of CasADi.
 
     Args:
         problem: what to solve, states and inputs bounded by boxes.
@@ -82,7 +82,7 @@ class Rival:
         self._solver = ca.nlpsol("rival", plugin, written.program, options)
 
     def solve(self, x: np.ndarray, theta: np.ndarray, warm: np.ndarray) -> tuple[np.ndarray, int, bool]:
-        """Inputs (N, m), iterations, and whether the solver says that it converged."""
+        """Return inputs (N, m), iterations, and whether the solver reports convergence."""
         written = self._written
         found = self._solver(
             x0=self._guess(x, theta, warm),
@@ -109,7 +109,7 @@ class Rival:
 def ipopt(problem: Problem, soft: bool, gauss_newton: bool) -> Rival:
     """IPOPT in multiple shooting, several times faster here than in single shooting; its own tolerance, 1e-8.
 
-    Of a cost per second: a stage's weights, and with them what IPOPT compares, shrink with the period.
+    The cost is per second: a stage's weights, and with them what IPOPT compares, decrease with the period.
     """
     options = {**IPOPT, "ipopt.tol": 1e-8 * problem.model.period}
     return Rival(problem, "ipopt", True, soft, gauss_newton, options)
@@ -206,7 +206,7 @@ def _single(problem: Problem, stage: ca.Function, soft: bool) -> _Written:
 
 
 def _softened(problem: Problem, written: _Written, nominal: ca.MX) -> _Written:
-    """State bounds as rows with slacks e >= 0, in units of each row's scale, at the price penalty (e + e^2 / 2)."""
+    """State bounds as rows with slacks e >= 0, in units of each row's scale, with the penalty (e + e^2 / 2)."""
     rows = Rows(problem)
     count = rows.count_inputs
     scale, lower, upper = rows.penalty.scale[count:], rows.lower[count:], rows.upper[count:]

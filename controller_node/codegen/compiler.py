@@ -1,11 +1,11 @@
-"""Compiles CasADi functions to machine code, once for each problem structure; without a compiler nothing breaks.
+"""Compiles CasADi functions to machine code, once per problem structure. Without a compiler functions are interpreted.
 
-The cache is keyed by the content of the generated C, the compiler and its flags. The key is in the library's *name*,
-because the loader caches by path and would silently go on running old code. Concurrent starts are safe: a library
-appears under its name by an atomic rename, whole or not at all.
+The key of the cache is the generated C, the compiler and its flags. The key is part of the library's *name*, because
+the loader caches by path and would continue to run old code without notice. Concurrent starts are safe: a library gets
+its name by an atomic rename, complete or not at all.
 
-What is loaded runs, and what is damaged may end the process while it is loaded. So a library is looked at before:
-it and its folder belong to this user and nobody else can write there, and its content is what was written.
+A loaded library runs code, and loading a damaged one can end the process. A library is therefore checked first: it and
+its folder must belong to this user and be writable by no other, and its content must be unchanged.
 """
 
 from __future__ import annotations
@@ -41,20 +41,19 @@ FLAGS = (
 )
 TIMEOUT = 300.0
 COST = "solves in CasADi's virtual machine instead, about 4 times slower"
-REMEDY = "XDG_CACHE_HOME names another folder for the cache"
+REMEDY = "set XDG_CACHE_HOME to use another folder for the cache"
 SEAL = b"\ntandem kernel, sha256 of name and content: "
-"""Behind it, at the end of a library, is the checksum. The loader reads what an ELF file's headers name, no further."""
+"""Mark before the checksum at the end of a library. The loader ignores bytes that the ELF headers do not mention."""
 LARGEST = 256 * 1024 * 1024
-"""Bytes of a library that is read at all."""
+"""Largest size in bytes of a library that is read."""
 
 
 class Compiler:
     """Turns CasADi functions into compiled ones with the same name and signature.
 
     Args:
-        cache: where libraries are kept; None: the user's cache directory, or a temporary one where that
-            cannot be written.
-        command: the compiler; None: the first of cc and gcc on the path.
+        cache: folder of the libraries; None for the user's cache folder, or a temporary one if that is not writable.
+        command: the compiler; None for the first of cc and gcc on the path.
     """
 
     def __init__(self, cache: Path | None = None, command: str | None = None):
@@ -62,16 +61,16 @@ class Compiler:
         self._command = command or shutil.which("cc") or shutil.which("gcc")
         self._complained = self._mended = False
         self.note = ""
-        """Which compiler made the functions, or why none did; for the log of a run."""
+        """The compiler of the functions, or the reason why none was used, for the log of a run."""
 
     def __call__(self, function: ca.Function) -> ca.Function:
-        """The compiled function, or the function itself where it cannot be compiled, with one warning."""
+        """Return the compiled function, or the function itself with one warning if it cannot be compiled."""
         try:
             library = self._library(function)
             try:
                 compiled = ca.external(function.name(), str(library))
             except RuntimeError:
-                # What a broken compiler made must not be found again when there is a better one.
+                # The result of a broken compiler must not be found again by a better one.
                 library.unlink()
                 raise
         except (OSError, subprocess.SubprocessError, RuntimeError, CannotCompile) as error:
@@ -111,12 +110,12 @@ class Compiler:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         wanted = self._cache or Path(home) / "tandem" / "kernels"
         directory = wanted
-        with contextlib.suppress(OSError):  # said below, by what is there or not
+        with contextlib.suppress(OSError):  # checked and reported below
             make_private(wanted)
         if not (wanted.is_dir() and os.access(wanted, os.W_OK)):
             directory = Path(tempfile.gettempdir()) / f"tandem-kernels-{os.geteuid()}"
             make_private(directory)
-        # Whoever can write there decides what code runs here.
+        # Anyone who can write there decides which code runs here.
         if (reason := why_not_private(directory)) is not None:
             elsewhere = "" if directory == wanted else f"{wanted} cannot be written, and "
             raise CannotCompile(f"no place for compiled code: {elsewhere}{reason}; {REMEDY}")
@@ -129,7 +128,7 @@ class Compiler:
     def _mend(self, library: Path) -> None:
         if not self._mended:
             self._mended = True
-            log.warning("%s: is not as it was written, and is not loaded; compiled again", library)
+            log.warning("%s: its content has changed, so it is not loaded but compiled again", library)
 
     def _complain(self, reason: str) -> None:
         self.note = f"not compiled: {reason}"
@@ -139,16 +138,16 @@ class Compiler:
 
 
 class CannotCompile(Exception):
-    """Why functions stay in the virtual machine."""
+    """The reason why functions are interpreted."""
 
 
 def sealed(content: bytes, name: str) -> bytes:
-    """What is written for the library `name`: its content, and the checksum of both."""
+    """Return the file content of the library `name`: its code and the checksum of both."""
     return content + SEAL + _checksum(content, name)
 
 
 def is_sealed(data: bytes, name: str) -> bool:
-    """Whether a file holds exactly what was once written for the library `name`."""
+    """Return whether a file is exactly the one written for the library `name`."""
     content, mark, checksum = data.rpartition(SEAL)
     return bool(mark) and checksum == _checksum(content, name)
 
@@ -158,7 +157,7 @@ def _checksum(content: bytes, name: str) -> bytes:
 
 
 def _place(directory: Path, name: str) -> Path:
-    """Where the library goes: beside whatever else than a file has its name."""
+    """Return the path for the library, avoiding names of anything other than a regular file."""
     path = directory / name
     for number in count(2):
         if not os.path.lexists(path) or stat.S_ISREG(path.lstat().st_mode):
@@ -168,7 +167,7 @@ def _place(directory: Path, name: str) -> Path:
 
 
 def _read(library: Path) -> bytes | None:
-    """A library in a folder of ours; None where there is none. Raises `CannotCompile`: others may have written it."""
+    """Read a library in a trusted folder; None if it does not exist. Raises `CannotCompile` if others can write it."""
     try:
         status = library.lstat()
     except FileNotFoundError:
@@ -194,7 +193,7 @@ def _version(command: str) -> str:
 
 
 def _processor() -> str:
-    """Which instructions -march=native may use here: a cache shared between machines must not mix them."""
+    """Return the instruction set of -march=native, because machines that share a cache may differ."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

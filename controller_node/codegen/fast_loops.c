@@ -1,7 +1,7 @@
-// What fast_loops.py splices into CasADi's generated C, where casadi_real and casadi_int are known.
-// It is cut at its lines of comment; these, and empty lines, are not spliced.
+// Code that fast_loops.py inserts into CasADi's generated C, which defines casadi_real and casadi_int.
+// The file is split at its comment lines; comment lines and empty lines are not inserted.
 
-// Vectors of eight and of four in a notation that gcc and clang share; the compiler maps them to what the machine has.
+// Vectors of eight and of four in a notation of gcc and clang. The compiler maps them to the machine's registers.
 #include <string.h>
 typedef double tandem_v8 __attribute__((vector_size(64)));
 typedef double tandem_v4 __attribute__((vector_size(32)));
@@ -9,8 +9,8 @@ typedef long long tandem_i8 __attribute__((vector_size(64)));
 static inline tandem_v8 tandem_load(const double* p) { tandem_v8 v; memcpy(&v, p, sizeof(v)); return v; }
 static inline void tandem_add(double* p, tandem_v8 v) { v += tandem_load(p); memcpy(p, &v, sizeof(v)); }
 
-// CasADi's own product walks the result entry by entry with a dependent sum; this one keeps tiles of it in registers:
-// 8 x 8 and 4 x 8 sums of many columns, and for a single column the sums of 32 rows, so that none waits for itself.
+// CasADi's own product computes one entry after the other, each by a sum of dependent operations. This one keeps tiles
+// of independent sums in registers: 8 x 8 and 4 x 8 for many columns, and 32 rows for a single column.
 static inline tandem_v4 tandem_load4(const double* p) { tandem_v4 v; memcpy(&v, p, sizeof(v)); return v; }
 static inline void tandem_add4(double* p, tandem_v4 v) { v += tandem_load4(p); memcpy(p, &v, sizeof(v)); }
 #define TANDEM_TILE(VECTOR, LOAD, ADD) do { \
@@ -80,8 +80,8 @@ void casadi_mtimes_dense(const casadi_real* restrict x, casadi_int nrow_x, casad
     }
 }
 
-// tanh x = 1 - 2 / (1 + exp 2x), absolute error 2e-16, eight at a time without a branch or a call; libm's takes many
-// times as long. NaN stays NaN. Source and target may be the same array.
+// tanh x = 1 - 2 / (1 + exp 2x) for eight numbers at a time, without a branch or a call. The absolute error is 2e-16,
+// and libm's version takes many times as long. NaN stays NaN. Source and target may be the same array.
 static inline tandem_v8 tandem_tanh8(tandem_v8 x) {
   const tandem_v8 zero = {0};
   /* 1.5 * 2^52: adding it leaves the nearest integer in the low bits. */

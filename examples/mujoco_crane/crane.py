@@ -1,4 +1,4 @@
-"""The true crane: MuJoCo moves it. Tandem is given nothing but `step`."""
+"""The true crane: MuJoCo moves it. Tandem only calls `step`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class MujocoMotion:
-    """The motion of a MuJoCo model whose state is x = (qpos, qvel) and whose controls are u; nothing else moves it."""
+    """The motion of a MuJoCo model with state x = (qpos, qvel) and controls u; no other quantity moves it."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model, self.data, self.timestep = model, mujoco.MjData(model), model.opt.timestep
@@ -21,7 +21,7 @@ class MujocoMotion:
         if steps < 1:
             return np.array(x, dtype=float)
         self.model.opt.timestep = dt / steps
-        # Also forgets where the constraint solver began the last time: the same numbers in, the same numbers out.
+        # This also resets the constraint solver's warm start, so that equal inputs give equal results.
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.qvel[:] = np.split(np.asarray(x, dtype=float), [self.model.nq])
         self.data.ctrl[:] = u

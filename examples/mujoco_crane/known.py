@@ -40,7 +40,7 @@ CRANE = Known.from_matrices(
     # What `tandem model check` finds of h, with MuJoCo as the truth, and a little more.
     W=[0.03, 0.05, 2.5, 4.5],
     x0=[-1.5, 0.0, 0.0, 0.0],
-    # Without a force the wind would carry it off.
+    # Without a force the wind would move it away.
     safe_gain=[[-10.0, 0.0, -15.0, 0.0]],
     performance=[0, 1],
 )

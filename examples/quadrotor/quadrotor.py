@@ -64,7 +64,7 @@ QUADROTOR = Plant(
     x_max=np.array([2.0, 2.0, 0.6, 3.0, 3.0, 6.0]),
     u_min=np.array([0.0, 0.0]),
     u_max=np.array([2 * HOVER, 2 * HOVER]),
-    # A tenth of g, a fifteenth of the largest torque, and what both do within a sample.
+    # A tenth of g, a fifteenth of the largest torque, and the effect of both within a sample.
     W=np.array([0.02, 0.02, 0.2, 1.0, 1.0, 20.0]),
     x0=np.array([-1.5, -1.0, 0.0, 0.0, 0.0, 0.0]),
     safe_input=np.array([HOVER, HOVER]),

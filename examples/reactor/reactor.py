@@ -33,7 +33,7 @@ def equations(k_0: float) -> Rhs:
     return rhs
 
 
-# Near (500, 350), where a constant coolant lets the reaction die or run away.
+# Near (500, 350), where with a constant coolant the reaction stops or runs away.
 REACTOR = Plant(
     name="reactor",
     states=("c", "T"),

@@ -1,4 +1,4 @@
-"""What other settings would have commanded in the states that a log recorded, tick by tick, beside what was commanded.
+"""Inputs that other settings would have commanded in the states of a log, tick by tick, beside the recorded ones.
 
 python what_if.py tanks.mcap controller.oracle=linear "controller.R=[0.1]"
 """
@@ -21,7 +21,7 @@ from run_log.run import Run, plant_of
 
 
 def commanded(run: Run, change: str) -> np.ndarray:
-    """(n, m) the input of each tick under `change`, "section.key=value"; the states stay as they were recorded."""
+    """(n, m) the input of each tick under `change`, "section.key=value"; the states stay as recorded."""
     config = override(run.config, [change])
     core = ControllerCore(config, "what-if", given=given_plant(run, config, {apply_override({}, change)}))
     return np.array([core.step(tick).command.u for tick in run.ticks])
@@ -30,7 +30,7 @@ def commanded(run: Run, change: str) -> np.ndarray:
 def main(
     log: tyro.conf.Positional[Path], changes: tyro.conf.Positional[tuple[str, ...]], out: Path | None = None
 ) -> None:
-    """Say how far each change moves the input, and draw it.
+    """Print how far each change moves the input, and plot it.
 
     Args:
         log: of one controller.

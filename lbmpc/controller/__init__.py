@@ -1,1 +1,1 @@
-"""One control step, and what stands in for a solution where there is none."""
+"""One control step, and the fallback inputs for a tick without a solution."""

@@ -1,4 +1,4 @@
-"""Where a plan leads: the target of the reference now, and those of its knots within the horizon."""
+"""The references of a plan: the target of the present reference and of its knots within the horizon."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from lbmpc.references import Change, Preview, Reference, between, changed, previ
 from lbmpc.targets import SteadyState, TargetSelector
 
 STEP = 0.1
-"""Periods: what is shorter is a step, and no motion that a plan could follow."""
+"""Periods. A shorter interval between two knots is treated as a step, because no plan can follow it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """Of one plan; all None: the equilibrium."""
+    """The target and references of one plan. All fields are None when the plan leads to the equilibrium."""
 
     target: SteadyState | None = None
-    """Of the reference now."""
+    """The target of the present reference."""
     xr: np.ndarray | None = None
-    """(1, d) where nothing changes within the horizon, else (N + 1, d)."""
+    """State references: (1, d) if they are constant over the horizon, else (N + 1, d)."""
     ur: np.ndarray | None = None
-    """(1, m) or (N, m)"""
+    """Input references: (1, m) or (N, m)."""
 
     @property
     def references(self) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """For a solver."""
+        """The references as arguments of a solver."""
         return self.xr, self.ur
 
     @property
     def xu(self) -> np.ndarray:
-        """x and u of the target now, (d + m,); (0,) without one."""
+        """x and u of the present target, (d + m,); (0,) without one."""
         return np.zeros(0) if self.target is None else self.target.xu
 
 
 class Aims:
-    """Finds them.
+    """Finds the targets of plans.
 
     Args:
-        model: the nominal one.
+        model: the nominal model.
         horizon: N.
-        targets: finds the target of one reference; None: every plan leads to the equilibrium.
-        configured: the reference where nobody gave another; None: the equilibrium.
+        targets: finds the target of one reference. With None every plan leads to the equilibrium.
+        configured: the reference until another one is given; None means the equilibrium.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Aims:
 
     @property
     def nothing_yet(self) -> np.ndarray:
-        """A target before there is one, (d + m,); (0,) where plans lead to the equilibrium."""
+        """The target before the first search, (d + m,); (0,) if plans lead to the equilibrium."""
         size = 0 if self._configured is None else self._model.d + self._model.m
         return np.zeros(size)
 
@@ -69,13 +69,13 @@ class Aims:
         x: np.ndarray,
         target: np.ndarray,
     ) -> Reference | None:
-        """The reference of this tick; None: the configured one.
+        """Return the reference of this tick; None means the configured one.
 
         Args:
-            present: of the tick before, one period later.
-            change: what is asked for; None: nothing.
+            present: the reference of the previous tick, advanced by one period.
+            change: the requested change; None if there is none.
             skipped: periods without a tick since then.
-            x: where the plant is, (d,).
+            x: the present state, (d,).
             target: the last target, (d + m,), or (0,).
         """
         if present is not None and skipped:
@@ -88,14 +88,14 @@ class Aims:
     def find(
         self, reference: Reference | None, theta: np.ndarray, last: np.ndarray, ahead: float, new: bool = True
     ) -> Aim:
-        """Where a plan leads that begins `ahead` seconds after now.
+        """Return the aim of a plan that begins `ahead` seconds from now.
 
         Args:
-            reference: in force; None: the configured one.
+            reference: the reference in force; None means the configured one.
             theta: the oracle's parameters.
-            last: the last target, (d + m,), or (0,), where the search begins.
+            last: the last target, (d + m,), or (0,), as start of the search.
             ahead: seconds.
-            new: False: `last` is the target of now already.
+            new: False if `last` already is the present target.
         """
         asked = reference or self._configured
         if asked is None or self.targets is None:
@@ -118,10 +118,10 @@ class Aims:
     def _along(
         self, outputs: tuple[int, ...], seen: Preview, rests: list[np.ndarray], theta: np.ndarray
     ) -> np.ndarray:
-        """x and u over the horizon, (N + 1, d + m), from the rests of its knots, (d + m,) each.
+        """Return x and u over the horizon, (N + 1, d + m), from the rests of its knots, (d + m,) each.
 
-        From knot to knot they are no rests: a plant that is there moves on with the reference. How far that is from the
-        rests is found at the first of two knots.
+        Between two knots the references move, so the points are not rests: a plant on them moves with the reference.
+        The distance from the rests is computed at the first of the two knots.
         """
         assert self.targets is not None
         positions: list[float] = []

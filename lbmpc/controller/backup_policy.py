@@ -1,26 +1,26 @@
-"""What the plant follows when its controller falls silent: an affine policy that keeps X by the learned model.
+"""The backup policy: an affine policy that keeps the learned model in X while no commands reach the plant.
 
-The plan of (e:LBMPC) keeps the constraints of the *nominal* model, step after step only its first input is certified,
-and each new sample mends what h did. Followed blindly it is no more than a guess. So besides it there is a second
-problem, solved where there is time, with the same cost and the learned states in the place of the nominal ones:
+The plan of (e:LBMPC) satisfies the constraints of the *nominal* model. At each step only its first input is certified,
+and each new sample corrects for h. Followed in open loop, the plan has no guarantee. A second problem is therefore
+solved when time permits. It has the same cost, and the learned states replace the nominal ones:
 
     min over v      |z_N - x^r|_P^2 + sum_i |z_i - x^r|_Q^2 + |v_i - u^r|_R^2 + |v_i - v_{i-1}|_S^2
     subject to      z_{i+1} = A z_i + B v_i + h_hat(z_i, v_i),
                     v_i in U,   |v_i - v_{i-1}| <= rate T,   z_{i+1} in (1 - margin) X       i = 0 .. N-1
 
-from z_0, the state to which the command that was just given leads, to the target of that command's plan. Its solution
-is followed with feedback,
+z_0 is the predicted state after the present command, and x^r is the target of that command's plan. The plant follows
+the solution with feedback,
 
     u_i = v_i + K (x_i - z_i),
 
-which takes no more than the plant's own sensors; the plant keeps u to its range and its rate. K is stiffer than the
-model's: what the plan does not know must not add up. Nothing of this is certified: h_hat is what was learned so far.
+which needs only the plant's own sensors. The plant keeps u within its range and rate limits. K is stiffer than the
+model's gain, so that errors of the plan do not accumulate. The policy is not certified, because h_hat is learned.
 
-The margin is room for what h_hat does not know, and where the way to x^r leads along a bound it can cost the way
-itself. So where the plan touches its margin and does not lead back, |z_N - x^r|_P >= 0.9 |z_0 - x^r|_P, the problem is
-solved again without one, and if that costs less a third time, with as much of it as should lead back. What a plan costs
-is the cost above and the penalty for what leaves X itself. Where it ends would not tell: of two plans that are lost,
-the one that leaves X at once may end as near as the one that stays at its edge.
+The margin leaves room for the error of h_hat. If the way to x^r runs along a bound, the margin can block it. A plan
+that touches its margin and does not lead back, |z_N - x^r|_P >= 0.9 |z_0 - x^r|_P, is therefore solved again without
+margin. If that costs less, it is solved a third time with the largest margin that should still lead back. Plans are
+compared by the cost above plus the penalty for leaving X. The final state is no measure: of two plans that do not lead
+back, one that leaves X at once may end as near as one that stays at its edge.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ from lbmpc.solver.riccati import build_rows, build_sweep, with_input
 from lbmpc.solver.subproblem import Subproblem
 
 STEPS = 2
-"""Gauss-Newton steps from the nominal plan, which is near; of what they pass the best is taken."""
+"""Gauss-Newton steps from the nominal plan, which is a good start. The best iterate is used."""
 RAMP = 4
-"""Steps over which the margin grows: at once, it would cost a leap of the input and the swing that follows."""
+"""Steps over which the margin grows. A margin from the first step would require a jump of the input."""
 NEARER = 0.9
-"""Of |z_0 - x^r|_P: where a plan that leads back ends at most."""
+"""A plan leads back if |z_N - x^r|_P is below this share of |z_0 - x^r|_P."""
 CHEAPER = 0.9
-"""Of the cost with all of the margin: what a plan without one costs at most, to be better."""
+"""A plan without margin is preferred if its cost is below this share of the cost with the full margin."""
 TOUCHES = 1e-3
-"""Nearer than this share of the half-width to a margin's edge, the plan may be held up by it."""
+"""A plan touches a margin if it comes nearer than this share of the half-width."""
 STIFFNESS = 25.0
-"""Weight of the plant's performance states in the LQR that K is, against the input, each in units of its half-width."""
+"""Weight of the performance states in the LQR for K, relative to the input, each in units of its half-width."""
 
 
 class Rollout(NamedTuple):
-    """Inputs v, (N, m), the learned states z_1 .. z_N that they lead to, (N, d), and the cost, without penalties."""
+    """Inputs v (N, m), the learned states z_1 .. z_N (N, d), and the cost without penalties."""
 
     v: np.ndarray
     z: np.ndarray
@@ -68,23 +68,23 @@ class Rollout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """u_i = inputs[i] + gain x, deviations, for N periods: inputs (N, m), gain (m, d)."""
+    """The policy u_i = inputs[i] + gain x for N periods, in deviations: inputs (N, m), gain (m, d)."""
 
     inputs: np.ndarray
     gain: np.ndarray
     states: np.ndarray
-    """z_0 .. z_{N-1}, which it expects, (N, d)."""
+    """The expected states z_0 .. z_{N-1}, (N, d)."""
     margin: float
-    """By how much they stay inside X, as a share of its half-widths."""
+    """Distance that the plan keeps from the bounds of X, as a share of the half-widths."""
 
 
 class BackupPlanner:
-    """Solves that problem, always with the same number of steps.
+    """Solves the backup problem with a fixed number of steps.
 
     Args:
-        problem: what the controller solves; its cost, oracle, horizon and U are taken over.
-        margin: by how much X shrinks, as a share of its half-widths, where a plan that leads back is left.
-        realise: what turns a CasADi function into the one that is called.
+        problem: the controller's problem, for its cost, oracle, horizon and U.
+        margin: amount by which X shrinks, as a share of its half-widths, if a plan with it leads back.
+        realise: turns a CasADi function into the function that is called, for example by compiling it.
     """
 
     def __init__(
@@ -111,17 +111,17 @@ class BackupPlanner:
         ur: np.ndarray | None = None,
         previous: np.ndarray | None = None,
     ) -> Policy | None:
-        """The policy from the predicted state s, (D,), on.
+        """Return the policy that starts at the predicted state s.
 
         Args:
-            s: where the command that was just given leads, with its past where the oracle looks back.
+            s: predicted state after the present command, (D,), with its past if the oracle has a window.
             theta: the oracle's parameters.
             plan: the nominal plan from there on, (N, m).
             xr, ur: references as for `lbmpc.solver.gauss_newton.Solver.solve`.
-            previous: that command, (m,), as for `Solver.solve`.
+            previous: the present command, (m,), as for `Solver.solve`.
 
         Returns:
-            None when the numbers are unusable.
+            The policy; None if the numbers are not finite.
         """
         with np.errstate(all="ignore"):
             for rows in (self._kept, self._plain):
@@ -137,9 +137,9 @@ class BackupPlanner:
         return self._end(kept) >= NEARER and _touches(self._kept, kept)
 
     def _less(self, kept: Rollout) -> tuple[float, Rollout]:
-        """The share of the margin, and the plan, that leads back, or else what costs less, if anything does.
+        """Return the largest share of the margin that leads back, with its plan, or else the cheaper plan.
 
-        Where a plan ends is taken for linear in the margin.
+        The share is interpolated, taking the distance at the end of a plan as linear in the margin.
         """
         free = self._best(self._plain, kept.v, 1)
         if free is None or _price(self._plain, free) >= CHEAPER * _price(self._plain, kept):
@@ -151,7 +151,7 @@ class BackupPlanner:
         return (0.0, free) if between is None else (share, between)
 
     def _end(self, rollout: Rollout) -> float:
-        """|z_N|_P of |z_0|_P, both from the last target."""
+        """|z_N|_P relative to |z_0|_P, both measured from the last target."""
         inputs, d = self._subproblem.sweep.inputs, self.problem.model.d
         start, target = inputs["x"][:d, 0], inputs["xr"][:, -1]
         return self._norm(rollout.z[-1] - target) / max(self._norm(start - target), np.finfo(float).tiny)
@@ -161,7 +161,7 @@ class BackupPlanner:
         return float(np.sqrt(x @ self.problem.model.P @ x))
 
     def _best(self, rows: Rows, v: np.ndarray, steps: int) -> Rollout | None:
-        """The best of what the steps from v, (N, m), pass; None when its numbers are unusable."""
+        """Return the best iterate of `steps` steps from v, (N, m); None if its numbers are not finite."""
         best, least = None, np.inf
         subproblem, v = self._subproblem, rows.clip(v)
         for step in range(steps + 1):
@@ -188,7 +188,7 @@ class BackupPlanner:
 
 
 def _rows(problem: Problem, margin: float) -> Rows:
-    """The rows of the learned states inside (1 - margin) X."""
+    """Return the rows that keep the learned states inside (1 - margin) X."""
     plain = state_set(problem.model)
     inside = margin * row_ranges(plain.F, problem.model.plant.x_scale)
     shares = np.minimum(np.arange(1, problem.horizon + 1) / RAMP, 1.0)
@@ -197,7 +197,7 @@ def _rows(problem: Problem, margin: float) -> Rows:
 
 
 def _between(plain: Rows, kept: Rows, share: float) -> Rows:
-    """The rows with this share of the margin, in (0, 1)."""
+    """Return the rows with this share of the margin, in (0, 1)."""
     rows = kept.fresh()
     both = (plain.lower, kept.lower), (plain.upper, kept.upper)
     rows.lower, rows.upper = ((1.0 - share) * without + share * with_it for without, with_it in both)
@@ -205,21 +205,21 @@ def _between(plain: Rows, kept: Rows, share: float) -> Rows:
 
 
 def _price(rows: Rows, rollout: Rollout) -> float:
-    """The cost, and the penalty for what is outside these rows."""
+    """Return the cost plus the penalty for violating these rows."""
     return rollout.cost + rows.price(rows.values(rollout.v.T, rollout.z.T))
 
 
 def _touches(rows: Rows, rollout: Rollout) -> bool:
-    """Whether a state comes to its bounds anywhere."""
+    """Return whether any state comes close to its bounds."""
     values, near = rows.values(rollout.v.T, rollout.z.T), TOUCHES * rows.penalty.scale
     near_one = (values < rows.lower + near) | (values > rows.upper - near)
     return bool(near_one[rows.count_inputs :].any())
 
 
 def tracking_gain(model: Model) -> np.ndarray:
-    """K, (m, d), that holds the plant on a trajectory: an LQR with Bryson's weights, in units of the half-widths.
+    """Return K, (m, d), which holds the plant on a trajectory: an LQR with Bryson's weights in half-widths.
 
-    The model's own K where the Riccati equation has no solution for these weights.
+    If the Riccati equation has no solution for these weights, the result is the model's own K.
     """
     plant = model.plant
     weights = np.full(model.d, 1e-6)

@@ -1,9 +1,9 @@
-"""A plant that answers to an input `dead_time` seconds after it was written, dx/dt = f(x(t), u(t - dead_time)).
+"""The dead time of a plant, dx/dt = f(x(t), u(t - dead_time)).
 
-What a sample says acted is what was *written*. The line below remembers what was, over a period and the dead time
-before the last sample. Its older end is what really acted until that sample: labels and the estimator see that. The
-rest is on its way, and no command changes it any more: along it the state is predicted to when a new command acts.
-The same prediction goes over the delay from a sample to its command, with or without a dead time.
+A sample reports the inputs that were *written*. The line below remembers them over a period plus the dead time before
+the last sample. Its older end is the input that actually acted until that sample; labels and the estimator use it. The
+rest is still on its way and cannot be changed. The state is predicted along it to the time at which a new command acts.
+The same prediction covers the delay from a sample to its command, with or without a dead time.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ from lbmpc.plants.linear_motion import Pieces
 LineState = dict[str, np.ndarray]
 
 A_PERIOD = 4
-"""Inputs that are remembered of a period; of more, the older become their mean. A late command makes two."""
+"""Inputs remembered per period. If there are more, their mean replaces the older ones. A late command adds one."""
 SAME = 1e-9
-"""Of a period: two moments that are so near are one."""
+"""Share of a period. Two times that differ by less are equal."""
 REPORTED = 1e-3
-"""Of a period: what is missing of it at most where a sample tells of all of it."""
+"""Share of a period. A sample that reports all but this share of the period counts as complete."""
 
 
 class _Written(NamedTuple):
     seconds: float
     u: np.ndarray
     known: bool
-    """Whether a sample said so; else it was commanded, or is a guess."""
+    """True if a sample reported it; False for a command that is not confirmed, or a guess."""
 
 
 @dataclass(frozen=True, eq=False)
 class Acted:
-    """A tick as the plant sees it behind its dead time."""
+    """A tick as the plant sees it after its dead time."""
 
     seen: Observation
-    """The observation with what really acted in the place of what was written."""
+    """The observation with the inputs that acted instead of those that were written."""
     known: bool
-    """Whether all of that is known."""
+    """Whether all of these inputs are known."""
     ahead: Pieces
-    """What acts next, for the dead time; nothing without one."""
+    """Inputs that act next, over the dead time; empty without one."""
 
 
 class InputLine:
-    """What was written and has not acted yet. Pure; its memory is a dictionary of arrays, empty without a dead time.
+    """The inputs that were written and have not acted yet.
+
+    The class is pure. Its memory is a dictionary of arrays, which is empty without a dead time.
 
     Args:
-        plant: its dead time, and what it applies before anybody commands it.
+        plant: gives the dead time and the input before the first command.
         period: seconds.
     """
 
@@ -66,23 +68,23 @@ class InputLine:
         self._rows = A_PERIOD * (math.ceil(self._span / period - SAME) + 1)
 
     def initial_state(self) -> LineState:
-        """The memory before the first sample."""
+        """Return the memory before the first sample."""
         if self.dead_time == 0.0:
             return {}
         m = self._plant.m
         return {
-            # Seconds, whether it is known, and the input, one a row, the newest last; a row of no seconds is free.
+            # One row per input, newest last: seconds, 1 if known, and the input. A row of zero seconds is free.
             "written": np.zeros((self._rows, 2 + m)),
             "commanded": np.zeros(m),
             "sample": np.array([0, -1], dtype=np.int64),
         }
 
     def advance(self, line: LineState, seen: Observation, delay: float) -> tuple[LineState, Acted]:
-        """The memory one tick later, and that tick behind the dead time.
+        """Return the memory one tick later, and that tick as the plant sees it after the dead time.
 
         Args:
             line: the memory.
-            seen: what the gateway wrote; without a sample another period has passed under what was commanded.
+            seen: the observation of the written inputs. Without a sample, one more period of the command is assumed.
             delay: seconds from a sample to its command.
         """
         if self.dead_time == 0.0:
@@ -97,12 +99,12 @@ class InputLine:
         else:
             periods = seen.sequence - sequence
             most = self._span / self._period
-            # One that comes so late that nothing from before it is remembered begins anew.
+            # A sample so late that the memory has nothing from before it starts a new line.
             if sequence < 0 or seen.source != source or not 1.0 - most + REPORTED < periods <= most:
                 written = [_Written(self._span, self._before(seen), False)]
                 written += self._reported(seen, written)
             else:
-                # A sample that comes late is of a period that was counted already.
+                # A late sample belongs to a period that was counted already.
                 late = max(1 - periods, 0) * self._period
                 written = _split(written, _seconds(written) - late, self._hair)[0]
                 for _ in range(periods - 1):
@@ -119,22 +121,21 @@ class InputLine:
         return after, Acted(_as_acted(seen, _pieces(acted)), all(one.known for one in acted), _pieces(ahead))
 
     def commanded(self, line: LineState, u: np.ndarray) -> LineState:
-        """The memory once an input, (m,), is on its way to the gateway."""
+        """Return the memory after an input, (m,), was sent to the gateway."""
         return line if self.dead_time == 0.0 else {**line, "commanded": u}
 
     def _before(self, seen: Observation) -> np.ndarray:
-        """What is taken to have been written before the first sample: what acts now, or else the safe input,
-        without its gain."""
+        """Return the input assumed before the first sample: the present one, or the safe input without its gain."""
         u = acting(seen)
         return self._plant.safe_input - self._plant.u_e if u is None else u
 
     def _guessed(self, acting: np.ndarray, commanded: np.ndarray, delay: float) -> list[_Written]:
-        """A period of which no sample tells: the command took over after the delay."""
+        """Return a period without a sample, in which the command takes over after the delay."""
         both = [_Written(delay, acting, False), _Written(self._period - delay, commanded, False)]
         return [one for one in both if one.seconds > 0.0]
 
     def _reported(self, seen: Observation, guess: list[_Written]) -> list[_Written]:
-        """The period before a sample; what it does not tell, at the beginning of the period, is as `guess` has it."""
+        """Return the period before a sample. The start of the period, if not reported, is taken from `guess`."""
         pieces = seen.pieces
         if not pieces and seen.applied is not None:
             pieces = ((self._period, seen.applied),)
@@ -146,7 +147,7 @@ class InputLine:
         return [_mean(older), *newer] if older else newer
 
     def _last(self, written: list[_Written], seconds: float, pad: bool = True) -> list[_Written]:
-        """The last so many seconds; where there are fewer, its first input acted before."""
+        """Return the last `seconds` seconds; a shorter list is extended backwards with its first input."""
         kept, left = [], seconds
         for one in reversed(written):
             if left < self._hair:
@@ -160,17 +161,17 @@ class InputLine:
 
 
 def acting(seen: Observation) -> np.ndarray | None:
-    """The input that the plant has when it is seen, (m,)."""
+    """Return the input that acts at the time of the observation, (m,)."""
     return seen.pieces[-1][1] if seen.pieces else seen.applied
 
 
 def predicted(
     model: Model, oracle: Oracle, state: OracleState, x: np.ndarray, inputs: Pieces
 ) -> tuple[np.ndarray, OracleState]:
-    """Where `inputs` lead from x, (d,): the linear motion and h_hat, first a broken period and then whole ones.
+    """Predict the state from x, (d,), under `inputs` by the linear model and h_hat: a partial period, then whole ones.
 
     Returns:
-        The state, (d,), and the oracle's state with the pairs of these whole periods in its past.
+        The state, (d,), and the oracle's state with the pairs of the whole periods in its past.
     """
     period, hair = model.period, SAME * model.period
     left = [_Written(seconds, u, True) for seconds, u in inputs]
@@ -196,7 +197,7 @@ def _as_acted(seen: Observation, pieces: Pieces) -> Observation:
     if seen.x is None:
         return replace(seen, pieces=pieces)
     if seen.applied is None:
-        # After a jump, or where it was not measured in time: only what acts now counts.
+        # After a jump, or without timing, only the present input is used.
         return replace(seen, pieces=pieces[-1:])
     mean = _mean([_Written(seconds, u, True) for seconds, u in pieces]).u
     return replace(seen, applied=mean, pieces=pieces if len(pieces) > 1 else ())
@@ -218,7 +219,7 @@ def _seconds(written: list[_Written]) -> float:
 
 
 def _split(written: list[_Written], seconds: float, hair: float) -> tuple[list[_Written], list[_Written]]:
-    """The first so many seconds, and the rest; a cut within a hair of a switch is at the switch."""
+    """Return the first `seconds` seconds and the rest. A cut within `hair` of a switch is moved to the switch."""
     left = seconds
     for i, one in enumerate(written):
         if left < hair:
@@ -231,7 +232,7 @@ def _split(written: list[_Written], seconds: float, hair: float) -> tuple[list[_
 
 
 def _joined(written: list[_Written]) -> list[_Written]:
-    """One for equal neighbours."""
+    """Merge equal neighbours."""
     found: list[_Written] = []
     for _key, same in groupby(written, key=lambda one: (one.known, one.u.tolist())):
         first, *others = same

@@ -1,4 +1,4 @@
-"""What goes into a control step and what comes out of it, in deviation coordinates."""
+"""The inputs and results of a control step, in deviation coordinates."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ Mode = Literal["solver", "shifted_plan", "feedback"]
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a step may depend on. x (d,) and applied (m,) are deviations; None where there was none."""
+    """The input of a step. x (d,) and applied (m,) are deviations; None if they are missing."""
 
     x: np.ndarray | None
     applied: np.ndarray | None
     """Mean input over the period that ended with x."""
     source: int
-    """Which incarnation of the plant sent x; labels never span two."""
+    """Identifies one incarnation of the plant. A label never spans two of them."""
     sequence: int
-    """Its sample number; a label needs two consecutive ones."""
+    """Number of the sample. A label needs two consecutive ones."""
     hidden: HiddenSet | None
     pieces: Pieces = ()
-    """The inputs of that period where there were several, deviations. Without `applied` only the last counts: it acts
-    now."""
+    """The inputs of that period if there were several, in deviations. Without `applied` only the last one is used, as
+    the input that acts now."""
     truth: Mapping[str, float] = field(default_factory=dict)
-    """Parameters of the true plant that are others from now on, by name; for the oracle that knows the truth."""
+    """Changed parameters of the true plant, by name, for the oracle `perfect`."""
     reference: Change | None = None
-    """Where the outputs should be from now on; None: as before."""
+    """A change of the reference from now on; None if there is none."""
     skipped: int = 0
     """Periods without a step since the last one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Label:
-    """One labelled sample: x_t, the input applied until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
+    """A labelled sample: x_t, the input until t + 1, and h(x_t, u_t) = x_{t+1} - A x_t - B u_t."""
 
     x: np.ndarray
     u: np.ndarray
@@ -51,39 +51,39 @@ class Label:
     h_hat: np.ndarray
     """The oracle's estimate before it learned this sample."""
     past: np.ndarray
-    """The k - 1 pairs (x, u) before this one as the oracle saw them, (k - 1, d + m), oldest first."""
+    """The k - 1 pairs (x, u) before this one as the oracle used them, (k - 1, d + m), oldest first."""
     variance: np.ndarray
-    """Of h, (d,); zeros where a sample is the state."""
+    """Variance of h, (d,); zeros if a sample is the state."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """What a step decided and found, in deviation coordinates. plan is (N, m) with plan[0] the input for now."""
+    """The result of a step, in deviation coordinates. plan is (N, m); plan[0] is the input for now."""
 
     plan: np.ndarray
     mode: Mode
     solution: Solution | None
     label: Label | None
     verdict: Verdict
-    """About the hidden layers on offer."""
+    """The decision on the offered hidden layers."""
     rolled_back: str
-    """Why the hidden weights and K from before came back; empty where they did not."""
+    """The reason for a rollback of the hidden weights and K; empty without one."""
     delay: float
-    """Seconds for which the sample was predicted ahead, to when the command acts."""
+    """Seconds over which the sample was predicted, to the time when the command acts."""
     first: FirstInputs | None
-    """What is certified of v_0; None where there are no certified sets, or no state."""
+    """The certified bounds of v_0; None without certified sets or without a state."""
     target: SteadyState | None
-    """Where the plan aims; None without a reference: at the equilibrium."""
+    """The target of the plan; None without a reference, when the target is the equilibrium."""
     weights: np.ndarray
-    """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; (0, d) where nothing weighs it."""
+    """Weight of each part of h_hat in the prediction, (parts, d), 0 to 1; (0, d) for an oracle without weights."""
     deviation: np.ndarray
-    """Standard deviation of the state that is known, (d,); (0,) where a sample is the state."""
+    """Standard deviation of the estimated state, (d,); (0,) if a sample is the state."""
     sensor_faults: dict[str, str]
-    """Which sensors are not believed, by the names of their states, and in words what is wrong."""
+    """Distrusted sensors: state name to a description of the fault."""
     noise: np.ndarray
-    """Standard deviation of what is measured as the estimator found it, (d,); (0,) where it had not to."""
+    """Standard deviation of the measurement noise found by the estimator, (d,); (0,) if it was configured."""
 
     @property
     def new_network(self) -> bool:
-        """Whether other hidden layers are in use from now on."""
+        """Whether the hidden layers in use change with this step."""
         return self.verdict.outcome == "adopted" or bool(self.rolled_back)

@@ -1,4 +1,4 @@
-"""The memory of a controller, as data."""
+"""The memory of a controller as data."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from lbmpc.references import Reference
 
 @dataclass(frozen=True, eq=False)
 class ControllerState:
-    """All of the controller's memory. Flat, so that it can be frozen into a keyframe and thawed."""
+    """The complete memory of the controller. It is flat, so that a keyframe can store and restore it."""
 
     plan: Plan
-    """Shifted solution: warm start of the next solve and fallback."""
+    """Shifted solution: warm start of the next solve, and fallback."""
     pending_x: np.ndarray
-    """x_t, as it was estimated, whose label is still to come, (d,)."""
+    """The estimated x_t whose label is still missing, (d,)."""
     pending: tuple[int, int]
-    """Its (source, sequence); sequence -1 when none is pending."""
+    """Its (source, sequence); sequence is -1 if no label is pending."""
     predicted: np.ndarray
-    """The learned model's prediction of the next state, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
+    """The next state as predicted by the learned model, with the past pairs of `lbmpc.oracles.base` behind it, (D,)."""
     delay: float
-    """Seconds from a sample until the command that answers it acts: smoothed, or as configured until there is one."""
+    """Smoothed seconds from a sample until its command acts; the configured value before the first measurement."""
     oracle: OracleState
     target: np.ndarray
-    """x and u of the last target, (d + m,), where the next search begins; (0,) without a reference."""
+    """x and u of the last target, (d + m,), as start of the next search; (0,) without a reference."""
     estimator: EstimatorState
     commanded: np.ndarray
-    """The last input that was commanded, (m,), or the safe one; (0,) where no plan depends on it."""
+    """The last commanded input, (m,), or the safe one; (0,) if no plan depends on it."""
     line: LineState = field(default_factory=dict)
-    """What was written and has not acted yet, `lbmpc.controller.dead_time`; empty without a dead time."""
+    """Inputs that were written and have not acted yet, see `lbmpc.controller.dead_time`; empty without a dead time."""
     reference: Reference | None = None
-    """The one that was given, as of the next tick; None: the configured one."""
+    """The given reference as of the next tick; None means the configured one."""
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         return {
@@ -60,7 +60,12 @@ class ControllerState:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ControllerState:
-        """Raises KeyError when an array is missing, ValueError where those of a reference are none."""
+        """Restore a state.
+
+        Raises:
+            KeyError: an array is missing.
+            ValueError: the arrays of the reference are not valid.
+        """
         source, sequence = (int(value) for value in arrays["pending"])
         oracle, estimator, line, reference = (
             {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -1,8 +1,8 @@
-"""One control step, pure: the same function live, in lock-step simulation and in replay.
+"""One control step as a pure function, used live, in lock-step simulation and in replay.
 
-Within a step the order is what makes a swap of hidden weights correct: first the label of the previous input is
-learned with the features it was applied under, phi_j, then hidden weights that disappoint may go and new ones may come
-in, then the problem is solved.
+The order within a step makes a swap of hidden weights correct. First the label of the previous input is learned with
+the features phi_j under which that input was applied. Then bad hidden weights may be rolled back and new ones adopted.
+Then the problem is solved.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from lbmpc.solver.solution import Solution
 from lbmpc.targets import TargetSelector
 
 DELAY_GAIN = 0.2
-"""Share of a newly seen delay that enters the average; a few ticks even out the scheduler's noise."""
+"""Share of a newly measured delay in the average. Averaging over a few ticks evens out the scheduler's noise."""
 
 
 class Solves(Protocol):
-    """The seam to the solver: `lbmpc.solver.gauss_newton.Solver`, or whatever stands in its place."""
+    """The solver's interface, implemented by `lbmpc.solver.gauss_newton.Solver` and its replacements."""
 
     def solve(
         self,
@@ -63,8 +63,8 @@ class Solves(Protocol):
 
 
 ABSURD = 1e6
-"""Half-widths from the equilibrium: a number that is no measurement, and no input that acts, whatever a gateway means
-by it. Finite alone is not enough: what is learned from 1e307 is not, nor where it leads within a delay."""
+"""Half-widths from the equilibrium. A larger number is neither a measurement nor an input. A test for finite numbers is
+not enough, because learning from 1e307 and predicting from it do not give finite results."""
 
 
 class Controller:
@@ -72,12 +72,12 @@ class Controller:
 
     Args:
         problem: the optimisation problem.
-        solver: solves it.
-        real_time: one prepared Gauss-Newton step a tick instead of solving to convergence.
-        input_delay: seconds from a sample until the command that answers it acts, until the plant has shown one.
-        targets: finds where plans aim; None: at the equilibrium, whatever is asked for.
-        reference: the configured one, until another is given; None: the equilibrium.
-        estimator: the state from what is measured; None: a sample is the state.
+        solver: its solver.
+        real_time: True for one prepared Gauss-Newton step per tick instead of solving to convergence.
+        input_delay: seconds from a sample until its command acts, used until the plant reports one.
+        targets: finds the targets of plans. With None every plan leads to the equilibrium.
+        reference: the configured reference, until another is given; None means the equilibrium.
+        estimator: computes the state from measurements; None if a sample is the state.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Controller:
         self._absurd = ABSURD * plant.x_scale, ABSURD * plant.u_scale
 
     def initial_state(self, seed: int) -> ControllerState:
-        """Nothing known, nothing planned; the oracle's random start from the seed."""
+        """Return the state before the first tick, with the oracle's random initial weights from the seed."""
         oracle = self.oracle.initial_state(np.random.default_rng(seed))
         plan = empty_plan(self.problem.horizon, self.model.m)
         nothing = np.zeros(self.model.d)
@@ -119,10 +119,10 @@ class Controller:
         )
 
     def prepare(self, state: ControllerState) -> None:
-        """Do now what the next step from this state would do first: linearise about the predicted state.
+        """Linearise about the predicted state, which is the first part of the next step from this state.
 
-        For the time between two samples. Never needed for the result: a step that finds nothing prepared prepares
-        by itself, with the same numbers.
+        Call it between two samples to save time. It does not change the result: a step without preparation prepares
+        itself, with the same numbers.
         """
         if self._prepares(state) and self._prepared_for is not state:
             theta = self.oracle.theta(state.oracle)
@@ -133,9 +133,10 @@ class Controller:
             self._prepared_for = state
 
     def backup(self, planner: BackupPlanner, state: ControllerState) -> Policy | None:
-        """What to follow from the next period on if nothing else comes; None when this step followed no solution.
+        """Return the policy to follow from the next period on if no command arrives.
 
-        None with a dead time too: fed back so late, a stiff K may be unstable. The plan is what is followed there.
+        The result is None if this step followed no solution. It is also None with a dead time, because a stiff K can be
+        unstable when its feedback is late. The plan is followed instead.
         """
         if state.plan.left == 0 or self.line.dead_time:
             return None
@@ -145,7 +146,7 @@ class Controller:
         return planner.policy(state.predicted, theta, state.plan.u, *aim.references, previous=previous)
 
     def step(self, state: ControllerState, seen: Observation) -> tuple[ControllerState, StepResult]:
-        """One tick: learn, adopt, solve, plan. Never raises for numbers, whatever they are."""
+        """Run one tick: learn, adopt, solve, plan. It never raises because of its numbers."""
         written = self._without_absurd(seen)
         line, acted = self.line.advance(state.line, written, state.delay)
         estimator, seen, estimate = self._estimate(state, acted)
@@ -162,7 +163,7 @@ class Controller:
         start, there = self._when_it_acts(oracle, seen.x, acted, acting(written), delay)
         guard = self.problem.guard
         first = None if guard is None or start is None else guard.first_inputs(start)
-        # A prepared step goes on from what was known when it was prepared.
+        # A prepared step uses what was known when it was prepared.
         theta = None if self._prepares(state) else self.oracle.theta(oracle)
         x = state.predicted[: self.model.d] if seen.x is None else seen.x
         reference = self.aims.latched(state.reference, seen.reference, seen.skipped, x, state.target)
@@ -224,12 +225,12 @@ class Controller:
     def _estimate(
         self, state: ControllerState, acted: Acted
     ) -> tuple[EstimatorState, Observation, Estimate | None]:
-        """The estimator's memory, what was seen with the estimate in the place of x, and what else is known of it."""
+        """Return the estimator's memory, the observation with the estimate as x, and the estimate."""
         seen = acted.seen
         if seen.x is None:
             memory, delay = state.estimator, state.delay
             if seen.pieces:
-                # Behind the dead time other inputs acted than those that were commanded last.
+                # With a dead time, the inputs that acted are not those that were commanded last.
                 (seconds, first), (_, then) = seen.pieces[0], seen.pieces[-1]
                 delay = seconds if len(seen.pieces) > 1 else 0.0
                 memory = self.estimator.commanded(self.estimator.commanded(memory, first), then)
@@ -246,7 +247,7 @@ class Controller:
         if seen.x is None or estimate is None:
             return None, state.oracle
         if seen.applied is None or not follows or not known:
-            # What came before x is not known, at the start and after a gap.
+            # The past of x is not known at the start and after a gap.
             acts = acting(seen)
             u = np.zeros(self.model.m) if acts is None else acts
             return None, self.oracle.begin(state.oracle, seen.x, u)
@@ -257,7 +258,7 @@ class Controller:
         return label, self.oracle.learn(state.oracle, x, u, h, variance)
 
     def _delay(self, delay: float, seen: Observation) -> float:
-        """The plant reports when the last command took over from the one before; its average, at most half a period."""
+        """Average the delay from sample to command that the plant reports; at most half a period."""
         if seen.applied is None or len(seen.pieces) < 2:
             return delay
         measured = sum(seconds for seconds, _u in seen.pieces[:-1])
@@ -274,13 +275,12 @@ class Controller:
         acts: np.ndarray | None,
         delay: float,
     ) -> tuple[np.ndarray | None, OracleState]:
-        """The state, (d,), at which the command that is being computed will begin to act, and the oracle's there; None:
-        it is not known.
+        """Return the state, (d,), at which the computed command begins to act, and the oracle's state there.
 
-        Until then the plant goes on under what is on its way to it, and then under the input that the gateway has,
-        which the model knows; without this every millisecond between sample and command would be a disturbance. With
-        certified sets it is no oracle that says where, `lbmpc.sets.motion`: its error would be one of the state that
-        the sets are asked about, and they hold for any oracle.
+        The state is None if it is not known. Until then the plant follows the inputs on their way to it and the
+        present input of the gateway. The prediction uses them; otherwise every millisecond between sample and command
+        would count as a disturbance. With certified sets `lbmpc.sets.motion` predicts without the oracle. The sets are
+        evaluated at this state and hold for any oracle, so an oracle's error must not enter it.
         """
         inputs = acted.ahead if acts is None or delay == 0.0 else (*acted.ahead, (delay, acts))
         if x is None or not inputs:
@@ -291,7 +291,7 @@ class Controller:
                 return there, oracle
         with np.errstate(all="ignore"):
             there, after = predicted(self.model, self.oracle, oracle, x, inputs)
-        # Where an oracle has no numbers, nobody knows where the plant will be.
+        # The state is unknown if the oracle's prediction is not finite.
         return (there, after) if np.isfinite(there).all() else (None, oracle)
 
     def _aim(
@@ -302,11 +302,11 @@ class Controller:
         delay: float,
         new: bool = True,
     ) -> Aim:
-        """Where a plan leads that begins to act after the delay and the plant's dead time."""
+        """Return the aim of a plan that begins to act after the delay and the plant's dead time."""
         return self.aims.find(reference, theta, state.target, delay + self.line.dead_time, new)
 
     def _prepares(self, state: ControllerState) -> bool:
-        """Whether the next step completes a prepared one; without a plan to start from, one is not enough."""
+        """Whether the next step completes a prepared one. This needs a plan to start from."""
         return self.real_time and state.plan.left > 0
 
     def _plan(
@@ -344,14 +344,14 @@ class Controller:
         return self._solver.feedback(s, first, previous)
 
     def _previous(self, state: ControllerState, written: Observation) -> np.ndarray | None:
-        """What was written before v_0, (m,), in U: as the plant says, or as commanded; None: nothing depends on it."""
+        """Return the input before v_0, (m,), in U, as reported or as commanded; None if nothing depends on it."""
         if not self.problem.looks_back:
             return None
         acts = acting(written)
         return state.commanded if acts is None else self.model.plant.within_about(acts)
 
     def _with_past(self, oracle: OracleState, x: np.ndarray) -> np.ndarray:
-        """s of `lbmpc.oracles.base`, (D,): x itself where the oracle does not look back."""
+        """Return s of `lbmpc.oracles.base`, (D,); it is x itself if the oracle has no window."""
         return x if self.oracle.pairs == 1 else np.concatenate([x, self.oracle.past(oracle).ravel()])
 
 

@@ -1,1 +1,1 @@
-"""The state from what is measured, and the labels that go with it."""
+"""State estimation from measurements, and the labels that belong to it."""

@@ -1,6 +1,6 @@
-"""The contract of an estimator, and the one that believes every sample.
+"""The interface of an estimator, and the estimator that takes every sample as the state.
 
-An estimator is pure. All of its memory is a flat dictionary of arrays, as an oracle's is, ready for a keyframe.
+An estimator is pure. Its memory is a flat dictionary of arrays, as an oracle's is, so that a keyframe can store it.
 """
 
 from __future__ import annotations
@@ -15,80 +15,82 @@ from lbmpc.plants.linear_motion import Pieces
 EstimatorState = dict[str, np.ndarray]
 
 LAST = 2**63 - 1
-"""Number of a sample, as 64 bits with a sign hold it."""
+"""Largest number of a sample: a signed 64-bit integer."""
 
 
 class Measured(NamedTuple):
-    """One sample as it came, in deviation coordinates."""
+    """One sample as received, in deviation coordinates."""
 
     y: np.ndarray
-    """(d,); entries of states that are not measured count nothing."""
+    """Measurements, (d,). Entries of states that are not measured are ignored."""
     source: int
     sequence: int
-    """Its number among those of its source."""
+    """Number of the sample within its source."""
     applied: np.ndarray | None
-    """Mean input of the period that ended with it, (m,); None where that is not known."""
+    """Mean input of the period that ended with the sample, (m,); None if it is not known."""
     pieces: Pieces
-    """The inputs of that period where there were several."""
+    """The inputs of that period if there were several."""
 
 
 class Estimate(NamedTuple):
-    """What is known once a sample is there, in deviation coordinates."""
+    """The estimate after a sample, in deviation coordinates."""
 
     x: np.ndarray
     """The state at the sample, (d,)."""
     reached: np.ndarray
-    """The state, (d,), whose distance from A x + B u, x the estimate before, is that one's label."""
+    """The state, (d,), whose distance from A x + B u is the label of the period, with x the estimate before."""
     variance: np.ndarray
-    """Of that label, (d,), units of h squared; zeros where a sample is the state."""
+    """Variance of that label, (d,), units of h squared; zeros if a sample is the state."""
     innovation: np.ndarray
-    """What was measured less what was predicted, (d,); NaN where either is missing."""
+    """Measurement minus prediction, (d,); NaN if either is missing."""
     innovation_variance: np.ndarray
-    """What the innovation's would be if all is as the estimator takes it, (d,); NaN likewise."""
+    """Variance of the innovation under the estimator's assumptions, (d,); NaN likewise."""
 
 
 class Estimator(ABC):
-    """The state from what is measured."""
+    """Computes the state from measurements."""
 
     sees_all: bool
     """Whether every state is measured."""
 
     @abstractmethod
     def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
-        """The memory and the estimate after one more sample."""
+        """Return the memory and the estimate after one more sample."""
 
     def initial_state(self) -> EstimatorState:
-        """The memory before the first sample."""
+        """Return the memory before the first sample."""
         return {}
 
     def found_noise(self, state: EstimatorState) -> np.ndarray:
-        """Standard deviation of what is measured, (d,), in units of the states, 0 of others; (0,) where nobody had to
-        find it."""
+        """Return the estimated standard deviation of the measurement noise, (d,), in units of the states.
+
+        Entries of states that are not measured are 0. The result is (0,) for an estimator that does not estimate it.
+        """
         return np.zeros(0)
 
     def tells(self, y: np.ndarray) -> bool:
-        """Whether a sample, (d,), NaN where there is no number, says anything."""
+        """Return whether a sample, (d,), with NaN for missing numbers, contains information."""
         return bool(np.isfinite(y).all())
 
     def faults(self, state: EstimatorState) -> dict[str, str]:
-        """Which sensors are not believed, by the names of their states, and in words what is wrong."""
+        """Return the distrusted sensors: state name to a description of the fault."""
         return {}
 
     def deviation(self, state: EstimatorState) -> np.ndarray:
-        """Standard deviation of the state that is known, (d,), in its units; (0,) where a sample is the state."""
+        """Return the standard deviation of the estimated state, (d,), in its units; (0,) if a sample is the state."""
         return np.zeros(0)
 
     def missed(self, state: EstimatorState, delay: float) -> EstimatorState:
-        """The memory after a period without a sample, with so many seconds from one to its command."""
+        """Return the memory after a period without a sample; `delay` is the seconds from a sample to its command."""
         return state
 
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
-        """The memory once an input, (m,), is on its way: a sample that is missing says nothing of what acted."""
+        """Return the memory after an input, (m,), was sent. It is needed because a missing sample reports no input."""
         return state
 
 
 class Samples(Estimator):
-    """A sample is the state. It remembers nothing."""
+    """An estimator without memory that takes every sample as the state."""
 
     sees_all = True
 

@@ -1,19 +1,19 @@
-"""A Kalman filter of the nominal model with a disturbance of each state.
+"""A Kalman filter for the nominal model with a disturbance of each state.
 
     x_{t+1} = A x_t + B u_t + delta_t,    delta_{t+1} = rho delta_t + w_t,    y_t = C x_t + v_t
 
-delta stands for h along the motion: a process of its own standard deviation, the natural scale of W, that becomes
-another in so many seconds. Without it the filter would trust a model that is wrong by h, and its estimates would be
-off by what h adds up to in the filter's memory. Nothing learned is in here: what the oracle learns from these estimates
-does not come back as a label.
+delta models h along the motion. It has the natural scale of W as standard deviation and a configured correlation
+time. Without delta the filter would trust a model that is wrong by h, and its estimates would carry the sum of h
+over the filter's memory. The filter uses nothing that was learned. A label therefore never contains the oracle's own
+estimate.
 
-The covariance is a memory, not the stationary one: at the start, and after lost samples, less is known.
+The covariance is time-varying, not the stationary one, because less is known at the start and after lost samples.
 
-**Labels.** Of a measured state i, h_i(xhat_t, u_t) is y_{t+1} - A xhat_t - B u_t with xhat_t the estimate *before* that
-measurement. Its error is v_{t+1} + A (x_t - xhat_t), of variance R_i + (A P_t A')_i: the filter's innovation, which is
-white as far as the process above describes h, less the error of delta. No delta is in the label, so it is not pulled
-towards what was believed. Of a state that nobody measures only delta is known; its variance counts as often as
-neighbouring labels say the same.
+**Labels.** For a measured state i, h_i(xhat_t, u_t) is y_{t+1} - A xhat_t - B u_t, where xhat_t is the estimate
+*before* that measurement. Its error is v_{t+1} + A (x_t - xhat_t), with variance R_i + (A P_t A')_i. This is the
+filter's innovation without the error of delta; it is white as far as the process above describes h. The label does not
+contain delta, so it is not biased towards the prior. For a state that is not measured only delta is known. Its variance
+is multiplied by the number of neighbouring labels that carry the same information.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ from lbmpc.model import Model
 from lbmpc.plants.linear_motion import Pieces, balanced
 
 LEAST = 1e-6
-"""Half-widths: a standard deviation below this counts as this."""
+"""Half-widths. Smaller standard deviations are raised to this value."""
 UNKNOWN = 3.0**-0.5
-"""Half-widths: standard deviation of a state that nobody measures, before the first sample: it may be anywhere in X."""
+"""Half-widths. Initial standard deviation of a state that is not measured: it may be anywhere in X."""
 GUESS = 0.01
-"""Half-widths: standard deviation of what is measured, where nobody told and the innovations do not say yet."""
+"""Half-widths. Assumed noise where none is configured and the innovations have not been evaluated yet."""
 LONGEST_GAP = 100
-"""Periods, from one sample to the next, after which nothing is known any more."""
+"""Periods from one sample to the next. After a longer gap the filter starts again."""
 LOST = 1e3
-"""Half-widths: nothing is known either where a prediction has this standard deviation. Of a plant that runs away it has
-no digits left soon after, and no end."""
+"""Half-widths. The filter starts again when a prediction has this standard deviation. On an unstable plant the
+prediction would soon lose all digits."""
 RANK, PART = 1e-9, 1e-6
-"""What counts as nothing: of the largest singular value, and of a mode."""
+"""Numerical zero, relative to the largest singular value and to a mode."""
 LASTS = 1.0 - 1e-6
-"""|eigenvalue| from which on a mode does not fade."""
+"""A mode with |eigenvalue| from this value on does not decay."""
 
 
 class Expected(NamedTuple):
-    """What is known of a sample before it counts."""
+    """The knowledge about a sample before its measurements are used."""
 
     state: EstimatorState
-    """The memory, predicted to the sample's time."""
+    """The memory, predicted to the time of the sample."""
     period: tuple[np.ndarray, np.ndarray] | None
-    """Where the nominal model led in the period before it, (d,), and the covariance of x where that began, (d, d);
-    None: there is no label of that period."""
+    """Prediction of the nominal model over the period before the sample, (d,), and the covariance of x at its start,
+    (d, d); None if that period has no label."""
     innovation: np.ndarray
-    """As that of an `Estimate`, and so the next."""
+    """As in `Estimate`; likewise the next field."""
     innovation_variance: np.ndarray
     begins: bool = False
-    """Whether nothing is known: what is measured is then where the state begins."""
+    """True if nothing is known, so that the state begins at the measurements."""
 
 
 class KalmanEstimator(Estimator):
-    """Of the state and of a disturbance.
+    """Estimates the state and a disturbance.
 
     Args:
         model: the nominal model.
-        measured: indices of the states that are measured.
-        noise: standard deviation of what is measured, (d,), in units of the states; None: it is found from innovations.
-        process: that of h, (d,).
-        correlation: seconds in which h becomes another, by a factor of e.
+        measured: indices of the measured states.
+        noise: standard deviation of the measurements, (d,), in units of the states; None to find it from innovations.
+        process: standard deviation of h, (d,).
+        correlation: seconds after which the correlation of h has dropped by a factor of e.
     """
 
     def __init__(
@@ -85,8 +85,8 @@ class KalmanEstimator(Estimator):
         units = self._units = balanced(model.plant)[:d]
         least = self._least = LEAST * model.plant.x_scale
         told = GUESS * model.plant.x_scale if noise is None else noise
-        self._told = np.zeros(d)
-        self._told[measured] = np.maximum(told, least)[measured]
+        self._noise = np.zeros(d)
+        self._noise[measured] = np.maximum(told, least)[measured]
         sigma = np.maximum(process, least * model.period) / units
         rho = self._kept = float(np.exp(-model.period / correlation))
         self._F = np.block(
@@ -99,16 +99,16 @@ class KalmanEstimator(Estimator):
         inputs = model.B * model.plant.u_scale / units[:, None]
         self._any_input = np.zeros((2 * d, 2 * d))
         self._any_input[:d, :d] = inputs @ inputs.T
-        # Of an unmeasured state: how many labels in a row say the same.
+        # For an unmeasured state: number of consecutive labels that carry the same information.
         self._repeats = (1.0 + rho) / (1.0 - rho)
-        guess = (self._told / units)[measured] ** 2
+        guess = (self._noise / units)[measured] ** 2
         self._finder = (
             NoiseFinder(self._F, self._Q, self._unknown, guess, measured) if noise is None else None
         )
 
     def initial_state(self) -> EstimatorState:
         d = self._model.d
-        finder = {} if self._finder is None else {"noise": self._told, **self._finder.initial_state()}
+        finder = {} if self._finder is None else {"noise": self._noise, **self._finder.initial_state()}
         return {
             **finder,
             "x": np.zeros(d),
@@ -119,8 +119,8 @@ class KalmanEstimator(Estimator):
         }
 
     def noise(self, state: EstimatorState) -> np.ndarray:
-        """Standard deviation of what is measured, told or found, (d,), in units of the states; 0 of others."""
-        return state.get("noise", self._told)
+        """Return the configured or estimated standard deviation of the measurements, (d,); 0 for unmeasured states."""
+        return state.get("noise", self._noise)
 
     def found_noise(self, state: EstimatorState) -> np.ndarray:
         return state.get("noise", super().found_noise(state))
@@ -128,20 +128,20 @@ class KalmanEstimator(Estimator):
     def update(
         self, state: EstimatorState, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
-        """As an `Estimator`; trusted: as for `corrected`."""
+        """Update as an `Estimator` does; `trusted` is that of `corrected`."""
         return self.corrected(self.expected(state, seen), seen, trusted)
 
     def expected(self, state: EstimatorState, seen: Measured) -> Expected:
-        """What is known before the sample counts."""
+        """Return what is known before the measurements of the sample are used."""
         source, sequence = state["sample"].tolist()
         periods, u = seen.sequence - sequence, seen.applied
         if u is None or sequence < 0 or seen.source != source or periods > LONGEST_GAP:
             return self._begun(state)
         if periods <= 0:
-            # The period was counted as missed, and its sample comes late.
+            # The period was counted as missed already; its sample arrives late.
             return Expected(state, None, *self._innovation(state, seen.y))
         for _ in range(periods - 1):
-            # What acted then is not known.
+            # The inputs of the missing periods are not known.
             state = self._predicted(state, self._nominal(state["x"], u, ()))
             state = {**state, "covariance": state["covariance"] + self._any_input}
             if self._is_lost(state):
@@ -156,9 +156,9 @@ class KalmanEstimator(Estimator):
     def corrected(
         self, expected: Expected, seen: Measured, trusted: np.ndarray | None = None
     ) -> tuple[EstimatorState, Estimate]:
-        """The memory and the estimate once the sample counts.
+        """Return the memory and the estimate after the measurements of the sample.
 
-        trusted: of which states, (d,) of booleans, the measurement counts, of those that are measured; None: of all.
+        trusted: (d,) of booleans, the measured states whose measurement is used; None for all.
         """
         d, prior = self._model.d, expected.state
         measured = self._measured if trusted is None else self._measured[trusted[self._measured]]
@@ -186,7 +186,7 @@ class KalmanEstimator(Estimator):
     def _with_noise(
         self, finder: NoiseFinder, after: EstimatorState, seen: Measured, u: np.ndarray | None
     ) -> EstimatorState:
-        """What a sample says of the noise; u: None: it is not the next one, or not all that is measured counts."""
+        """Update the noise estimate. `u` is None if the sample is not the next one, or a sensor is distrusted."""
         d, measured, units = self._model.d, self._measured, self._units
         if u is None:
             return finder.begun(after, self._scaled(after))
@@ -209,7 +209,7 @@ class KalmanEstimator(Estimator):
         pieces = ((delay, first), (self._model.period - delay, then)) if delay > 0.0 else ()
         after = self._predicted(state, self._nominal(state["x"], then, pieces))
         if self._is_lost(after):
-            return {**self._afresh(state), "sample": self.initial_state()["sample"]}
+            return {**self._reset(state), "sample": self.initial_state()["sample"]}
         if self._finder is not None:
             after = self._finder.begun(after, self._scaled(after))
         return {**after, "sample": np.array([source, min(sequence + 1, LAST)], dtype=np.int64)}
@@ -217,21 +217,21 @@ class KalmanEstimator(Estimator):
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}
 
-    def _afresh(self, state: EstimatorState) -> EstimatorState:
-        """Nothing known of the state: of inputs on their way, and of sensors, all as it was."""
+    def _reset(self, state: EstimatorState) -> EstimatorState:
+        """Return the memory with an unknown state. Commanded inputs and noise estimates are kept."""
         nothing = np.zeros(self._model.d)
         return {**state, "x": nothing, "disturbance": nothing.copy(), "covariance": self._unknown}
 
     def _begun(self, state: EstimatorState) -> Expected:
-        """Of a sample of which nothing is known that came before."""
+        """Return what is known about a sample without a usable past."""
         nothing = np.full(self._model.d, np.nan)
-        return Expected(self._afresh(state), None, nothing, nothing, begins=True)
+        return Expected(self._reset(state), None, nothing, nothing, begins=True)
 
     def _is_lost(self, state: EstimatorState) -> bool:
         return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()
 
     def _innovation(self, predicted: EstimatorState, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of every measured state, trusted or not, and the variance that it would have, (d,) each."""
+        """Return the innovation of every measured state, trusted or not, and its expected variance, (d,) each."""
         d, measured = self._model.d, self._measured
         innovation, variance = np.full(d, np.nan), np.full(d, np.nan)
         innovation[measured] = y[measured] - predicted["x"][measured]
@@ -240,15 +240,15 @@ class KalmanEstimator(Estimator):
         return innovation, variance
 
     def _scaled(self, state: EstimatorState) -> np.ndarray:
-        """State and disturbance, (2d,), in the filter's units."""
+        """Return state and disturbance, (2d,), in the filter's units."""
         return np.concatenate([state["x"] / self._units, state["disturbance"] / self._units])
 
     def _R(self, state: EstimatorState) -> np.ndarray:
-        """Variance of what is measured, (d,), in the filter's units."""
+        """Return the variance of the measurements, (d,), in the filter's units."""
         return (self.noise(state) / self._units) ** 2
 
     def _nominal(self, x: np.ndarray, u: np.ndarray, pieces: Pieces) -> np.ndarray:
-        """Where the nominal model leads within a period, (d,)."""
+        """Return the prediction of the nominal model over one period, (d,)."""
         return self._model.A.dot(x) + (self._model.within.answer(pieces) if pieces else self._model.B.dot(u))
 
     def _predicted(self, state: EstimatorState, nominal: np.ndarray) -> EstimatorState:
@@ -265,7 +265,7 @@ class KalmanEstimator(Estimator):
         S = P[np.ix_(measured, measured)] + np.diag(R)
         gain = np.linalg.solve(S, P[measured]).T
         moved = gain @ ((y - state["x"])[measured] / self._units[measured])
-        # Joseph's form: rounding cannot make it indefinite.
+        # Joseph's form keeps the covariance positive semidefinite under rounding.
         left = np.eye(2 * d)
         left[:, measured] -= gain
         P = left @ P @ left.T + (gain * R) @ gain.T
@@ -278,12 +278,12 @@ class KalmanEstimator(Estimator):
 
 
 def unobservable(model: Model, measured: np.ndarray) -> list[int]:
-    """Indices of the states of which no sample ever tells all, and which do not come to rest by themselves either.
+    """Return the indices of the states that the samples do not determine and that do not decay either.
 
-    They have a part in a mode of A that does not fade and that what is `measured` does not see.
+    These states have a part in a mode of A that is neither stable nor visible in the `measured` states.
     """
     d, units = model.d, balanced(model.plant)[: model.d]
-    # A and (A - I) / T have the same unseen modes, and at a short period this has more digits.
+    # A and (A - I) / T have the same unobservable modes. The latter has more digits at a short period.
     slope = (model.A * units / units[:, None] - np.eye(d)) / model.period
     slope = slope / max(np.abs(slope).sum(axis=1).max(), 1e-300)
     rows = [np.eye(d)[measured]]
@@ -294,6 +294,6 @@ def unobservable(model: Model, measured: np.ndarray) -> list[int]:
     if not unseen.size:
         return []
     inner = unseen.T @ (model.A * units / units[:, None]) @ unseen
-    # Of an invariant subspace, not of eigenvectors: two integrators in a row have one of those.
+    # Use the invariant subspace, because a chain of integrators has a single eigenvector.
     _form, vectors, count = schur(inner, sort=lambda re, im: np.hypot(re, im) >= LASTS)
     return np.flatnonzero((np.abs(unseen @ vectors[:, :count]) > PART).any(axis=1)).tolist()

@@ -1,18 +1,19 @@
-"""Which measurements count: sensors that are stuck, dead or off, found by their readings and their innovations.
+"""Sensor supervision: finds stuck, dead and offset sensors from their readings and innovations, and ignores them.
 
-**Stuck.** A reading with noise in it does not repeat. One that does says nothing new, and is not used: the filter then
-predicts the state from the others. The sensor is named once the prediction has left it by three deviations of the
-noise. A sensor may be quantised, which the steps between its readings tell, and then repeats honestly: its repeated
-readings count where the prediction knows less than they do, and it is named only where the filter is sure as well.
+**Stuck.** A reading that contains noise does not repeat. A repeated reading carries no information and is not used: the
+filter then predicts the state from the other sensors. The sensor is reported as stuck once the prediction is three
+standard deviations of the noise away from the reading. A quantised sensor can repeat without a fault; the steps between
+its readings show the quantisation. Its repeated readings are used while the prediction is less certain than they are,
+and the sensor is reported only if the filter is certain too.
 
-**Dead.** No number comes of it, or one that stands still: 0 is a stuck reading like another.
+**Dead.** The sensor delivers no number. A reading of 0 that does not change counts as stuck.
 
-**Off.** A bias that comes at once is an innovation out of all proportion that stays what it is, in one sensor alone. A
-disturbance of the plant goes on growing, and what really jumped shows in the other sensors soon: then the reading is
-right. What counts as out of proportion follows the innovations of the last 20 samples, so that a model that is wrong,
-or noise that was told too small, is no fault. A bias that grows slowly is a disturbance to everybody.
+**Off.** A sudden bias gives a large innovation that stays constant, in one sensor alone. A disturbance of the plant
+keeps growing, and a real jump of the state soon shows in other sensors; in both cases the reading is correct. The limit
+for a large innovation follows the innovations of the last 20 samples, so that a wrong model or an underestimated noise
+does not count as a fault. A slowly growing bias cannot be told from a disturbance.
 
-A sensor that is not believed has an innovation all the same, and is believed again when that was small for a second.
+The innovation of a distrusted sensor is still computed. The sensor is trusted again after it was small for a second.
 """
 
 from __future__ import annotations
@@ -29,45 +30,45 @@ WORDS = ("", "stuck", "dead", "off")
 NONE, STUCK, DEAD, OFF = range(4)
 
 REPEATS = 4
-"""Readings after the first that are all the same, before a sensor may be named stuck."""
+"""Number of equal readings after the first one before a sensor can be reported as stuck."""
 ABSENT = 3
-"""Samples in a row without a number of it, before a sensor is named dead."""
+"""Consecutive samples without a number from a sensor before it is reported as dead."""
 MOVED = 3.0
-"""Deviations: of the noise, by which the state must have moved; of an innovation, for a quantised sensor."""
+"""Standard deviations: of the noise, for the distance from a stuck reading; of an innovation, if quantised."""
 SAME_INPUT = 1e-6
-"""Half-widths, by which the inputs of a plant that rests may differ."""
+"""Half-widths. Two inputs that differ by less are equal, so that the plant may be at rest."""
 FINE = 0.25
-"""Of the deviation of the noise: a sensor with a smaller step does not repeat honestly."""
+"""Share of the noise's standard deviation. A sensor with a smaller step does not repeat a reading without a fault."""
 ROUNDING, TINY = 1e-6, 1e-300
-"""Of the noise's deviation: what is no step. And what is no divisor."""
+"""Smallest step of a sensor, relative to the noise's standard deviation; and smallest divisor."""
 KNOWS_LESS = 9.0
-"""Variance of a prediction, in that of the noise, from which on an honestly repeated reading says more."""
+"""Ratio of the variances of prediction and noise from which on a quantised sensor's repeated reading is used."""
 LEAP = 8.0
-"""Deviations of the innovations as they were lately: one that is larger is not used at once."""
+"""Recent standard deviations of the innovations. A reading with a larger innovation is not used at once."""
 LATELY = 20
-"""Samples that `LEAP` looks back."""
+"""Samples over which these standard deviations are averaged."""
 STAYS = 4.0
-"""Deviations of the difference of two readings: an innovation that changes by more is no bias, but a motion."""
+"""Standard deviations of the difference of two readings. An innovation that changes by more comes from a motion."""
 LASTS = 10
-"""Samples for which a leap stays what it is, before a sensor is named off."""
+"""Samples for which a large innovation must stay constant before the sensor is reported as off."""
 AGREES = 4.0
-"""Deviations of an innovation, at most, of a sensor that may be believed again."""
+"""Standard deviations. Larger innovations keep a distrusted sensor from being trusted again."""
 WELL, WELL_SAMPLES = 1.0, 8
-"""Seconds, and samples at least, for which it must agree."""
+"""Seconds, and the minimum number of samples, for which the sensor must agree."""
 ALIVE = 5
-"""So many times as long, and one that was stuck or dead is believed if it only moves: the estimate may be wrong."""
+"""After this multiple of that time a stuck or dead sensor is trusted if it moves, as the estimate may be wrong."""
 
 # Rows of the counts in the memory.
 REPEATED, GONE, LEAPT, AGREED, MOVING, FAULT = range(6)
 
 
 class SupervisedEstimator(Estimator):
-    """An estimator that is told which measurements count.
+    """An estimator that passes only trusted measurements to a Kalman filter.
 
     Args:
-        inner: what estimates.
+        inner: the Kalman filter.
         model: the nominal model.
-        measured: indices of the states that are measured.
+        measured: indices of the measured states.
     """
 
     def __init__(self, inner: KalmanEstimator, model: Model, measured: np.ndarray):
@@ -75,7 +76,7 @@ class SupervisedEstimator(Estimator):
         self._measured = np.zeros(model.d, dtype=bool)
         self._measured[measured] = True
         self._well = max(WELL_SAMPLES, round(WELL / model.period))
-        self._unseen = cache(self._words_of_unseen)
+        self._unseen = cache(self._describe_unobservable)
 
     def initial_state(self) -> EstimatorState:
         nothing = np.zeros(self._model.d)
@@ -113,11 +114,11 @@ class SupervisedEstimator(Estimator):
     def update(self, state: EstimatorState, seen: Measured) -> tuple[EstimatorState, Estimate]:
         counts, numbers = state["counts"], np.isfinite(seen.y) & self._measured
         noise = self._inner.noise(state)
-        # Of a plant that was held, or started again, nobody knows that it moved.
+        # Without a known input (a hold or a restart) the plant may not have moved.
         same = numbers & (seen.y == state["reading"]) & (seen.applied is not None)
         step, fine = self._steps(state["reading"], state["step"], seen.y, numbers & ~same, noise)
         if (same == numbers).all() and self._rests(state):
-            # A plant that rests: a repetition alone proves nothing.
+            # A plant at rest may repeat its readings without a fault.
             fine[:] = False
         usable = numbers & (counts[FAULT] == 0)
 
@@ -144,7 +145,7 @@ class SupervisedEstimator(Estimator):
         )
         before, share = state["lately"], away**2 / variance
         lately = before + np.where(used, np.minimum(share, LEAP**2 * before) - before, 0.0) / LATELY
-        # What leapt and is believed now is followed, however long that takes.
+        # After a jump that is now accepted, the average takes the new size at once.
         lately = np.where(used & (counts[LEAPT] > 0), np.maximum(lately, share), lately)
         return {
             **memory,
@@ -156,7 +157,7 @@ class SupervisedEstimator(Estimator):
         }, estimate
 
     def _judged(self, counts: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        """The counts with what is wrong by now; moved: whose states have left their readings, (d,)."""
+        """Return the counts with updated faults; `moved` (d,) marks states that have left their readings."""
         before = counts[FAULT]
         well = counts[AGREED] >= self._well
         well |= (before != OFF) & (counts[MOVING] >= ALIVE * self._well)
@@ -171,16 +172,16 @@ class SupervisedEstimator(Estimator):
         return judged
 
     def _rests(self, state: EstimatorState) -> bool:
-        """Whether the last two inputs that were commanded are the same."""
+        """Whether the last two commanded inputs are equal."""
         before, last = state["inputs"]
         return bool((np.abs(last - before) <= SAME_INPUT * self._model.plant.u_scale).all())
 
     def _steps(
         self, reading: np.ndarray, step: np.ndarray, y: np.ndarray, changed: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The step of each sensor, (d,), 0 before the first, and whether it is a fine one.
+        """Return the step of each sensor, (d,), 0 before the first, and whether the step is fine.
 
-        It is what all changes so far are multiples of, by one division of Euclid's with each.
+        The step is the common divisor of all changes so far, found by one division of Euclid's algorithm per change.
         """
         change = np.abs(y - reading)
         left = np.where(step > 0.0, np.abs(change - np.rint(change / np.maximum(step, TINY)) * step), change)
@@ -196,21 +197,21 @@ class SupervisedEstimator(Estimator):
         variance: np.ndarray,
         usable: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which readings are not to be used for what they leapt, (d,), and from what innovation on, (d,)."""
+        """Return the readings to ignore because of a jump, (d,), and the innovations at which the jumps began, (d,)."""
         leaps, lately = state["counts"][LEAPT], state["lately"]
         leapt = usable & (away > np.where(leaps > 0, AGREES, LEAP) * np.sqrt(variance * lately))
         change = np.abs(innovation - state["leap"])
         leapt &= (leaps == 0) | (change <= STAYS * self._inner.noise(state) * np.sqrt(2.0 * lately))
         if leapt.sum() > 1:
-            # Of two at once neither is a sensor's. In the first sample nobody knows whether they go on.
+            # Jumps in two sensors at once come from the plant. The first sample is ignored until the next confirms it.
             leapt &= leaps == 0
         return leapt, np.where(leapt & (leaps == 0), innovation, state["leap"])
 
-    def _words_of_unseen(self, believed: tuple[int, ...]) -> str:
-        """What becomes of the states whose sensors are not among those, in words."""
-        if not believed:
+    def _describe_unobservable(self, trusted: tuple[int, ...]) -> str:
+        """Describe the effect on the states whose sensors are not among the trusted ones."""
+        if not trusted:
             return "nothing is measured any more"
-        unseen = unobservable(self._model, np.array(believed))
+        unseen = unobservable(self._model, np.array(trusted))
         if not unseen:
             return "what it measures is estimated from the others"
         names = ", ".join(self._model.plant.states[i] for i in unseen)

@@ -1,4 +1,4 @@
-"""Estimates of the unknown h behind one contract; their parameters are data."""
+"""Oracles: estimates of the unknown h behind one interface. Their parameters are data."""
 
 from lbmpc.oracles.base import HiddenSet, Oracle, OracleState, Verdict
 from lbmpc.oracles.constant import ConstantOracle

@@ -1,18 +1,18 @@
-"""The contract of an oracle.
+"""The interface of an oracle.
 
-An oracle is three things that the controller keeps apart:
+An oracle has three parts that the controller keeps separate:
 
-* expressions: h_hat(x, u; theta) and its Jacobian, built once, with the parameters theta as an input, so that new
-  weights or new samples never rebuild or recompile anything;
-* a state: a flat dictionary of arrays, all of its memory, ready for a keyframe;
-* a learning rule: what one more sample (x, u, h) does to that state.
+* expressions: h_hat(x, u; theta) and its Jacobian. They are built once with the parameters theta as an input, so new
+  weights or samples never rebuild or recompile anything.
+* a state: a flat dictionary of arrays, which is its complete memory and can be stored in a keyframe.
+* a learning rule: the effect of one more sample (x, u, h) on that state.
 
-An oracle may look back: h_hat then depends on the last k pairs (x, u), the present one included. The solver makes
-the k - 1 pairs before the present one part of the state that it predicts,
+An oracle may use a window: h_hat then depends on the last k pairs (x, u), including the present one. The solver adds
+the k - 1 earlier pairs to the state that it predicts,
 
     s = (x, p_{-(k-1)}, ..., p_{-1}),    s+ = (x+, p_{-(k-2)}, ..., p_{-1}, (x, u)),
 
-a shift register, so that the prediction is Markov again. Without a look back s is x.
+a shift register, which makes the prediction Markov again. Without a window s is x.
 """
 
 from __future__ import annotations
@@ -29,51 +29,51 @@ from network_model.description import NetworkDescription
 
 OracleState = dict[str, np.ndarray]
 Variance = np.ndarray | float
-"""Of a label, (d,), or one for all states; 0 where it is exact."""
+"""Variance of a label, (d,), or one number for all states; 0 for an exact label."""
 Realise = Callable[[ca.Function], ca.Function]
-"""Turns a CasADi function into the one that is called, a compiler for instance."""
+"""Turns a CasADi function into the function that is called, for example by compiling it."""
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenSet:
-    """A trained set of hidden layers on offer."""
+    """An offered set of trained hidden layers."""
 
     version: int
     layers: list[np.ndarray]
     sha256: str
-    """Of the layers."""
+    """SHA-256 of the layers."""
     network_sha256: str
-    """Of the description that they were trained for."""
+    """SHA-256 of the description that they were trained for."""
     later: int | None = None
-    """Samples, at most, since the newest that had a part in the training; None: nobody says."""
+    """Upper bound on the number of samples after the newest training sample; None if it is not known."""
 
 
 class Verdict(NamedTuple):
-    """What became of the hidden layers on offer."""
+    """The decision on offered hidden layers."""
 
     outcome: Literal["none", "adopted", "refused"]
-    """none: there were none."""
+    """`none` means that no layers were offered."""
     reason: str = ""
-    """Why they were refused."""
+    """Reason for a refusal."""
 
 
 class LearnedNetwork(NamedTuple):
-    """The network that an oracle's state stands for."""
+    """The network that an oracle's state represents."""
 
     hidden: list[np.ndarray]
     """W_1..W_{L-1}, the bias of each as its first row."""
     K: np.ndarray
     """Output weights, (1 + n_L, d), scaled."""
     version: int
-    """Of the hidden layers in use."""
+    """Version of the hidden layers in use."""
     newest: int
-    """The highest version that was ever adopted."""
+    """The highest version adopted so far."""
 
 
 class Oracle(ABC):
     """h_hat(s, u; theta) for d states and m inputs, in deviation coordinates.
 
-    The defaults below are those of an oracle that sees the present pair alone and has no hidden layers.
+    The defaults below fit an oracle that uses only the present pair and has no hidden layers.
     """
 
     name: str
@@ -82,100 +82,99 @@ class Oracle(ABC):
     parameters: int
     """Length of theta."""
     pairs: int = 1
-    """k, the pairs (x, u) that it sees, 1 when only the present one; s has d + (k - 1) (d + m) entries, here D."""
+    """k, the number of pairs (x, u) in the window; s has D = d + (k - 1) (d + m) entries."""
     description: NetworkDescription | None = None
-    """The network whose hidden layers a trainer may send; None: it has none."""
+    """The network whose hidden layers a trainer may send; None for an oracle without one."""
 
     # -- expressions ---------------------------------------------------------------------------------------------
 
     @abstractmethod
     def split(self, theta: ca.MX) -> list[ca.MX]:
-        """theta as the matrices that the expressions use, so that a rollout unpacks it once and not at every stage."""
+        """Return theta as the matrices of the expressions, so that a rollout unpacks it once instead of per stage."""
 
     @abstractmethod
     def value(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        """h_hat for n points (s, u) at once: (D + m, n) -> (d, n)."""
+        """Return h_hat for n points (s, u) at once: (D + m, n) -> (d, n)."""
 
     @abstractmethod
     def jacobians(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        """d h_hat / d(s, u) for n points (s, u) at once, (D + m, n): one matrix (d, D + m) for each point."""
+        """Return d h_hat / d(s, u) for n points (s, u) at once, (D + m, n): one matrix (d, D + m) per point."""
 
     # -- state and learning --------------------------------------------------------------------------------------
 
     def initial_state(self, rng: np.random.Generator) -> OracleState:
-        """The memory before the first sample."""
+        """Return the memory before the first sample."""
         return {}
 
     def begin(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
-        """The state when what came before x is not known: as if the plant had stood at x under the input u."""
+        """Return the state for an unknown past: the plant is assumed to have been at x under the input u."""
         return state
 
     def past(self, state: OracleState) -> np.ndarray:
-        """The k - 1 pairs before the present one, (k - 1, d + m), oldest first."""
+        """Return the k - 1 pairs before the present one, (k - 1, d + m), oldest first."""
         return np.zeros((0, self.d + self.m))
 
     def theta(self, state: OracleState) -> np.ndarray:
-        """The parameters that this state stands for, (parameters,)."""
+        """Return the parameters of this state, (parameters,)."""
         return np.zeros(0)
 
     @abstractmethod
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """h_hat(x, u) of this state, with the past that it remembers, (d,)."""
+        """Return h_hat(x, u) of this state with its past, (d,)."""
 
     def learn(
         self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
     ) -> OracleState:
-        """The state after one labelled sample, (x, u) now in its past; the state given is left as it was.
+        """Return the state after one labelled sample, with (x, u) in its past; `state` is not modified.
 
-        variance: of h.
+        variance: variance of h.
         """
         return state
 
     def weights(self, state: OracleState) -> np.ndarray:
-        """What of each part of h_hat counts in the prediction, (parts, d), 0 to 1; of no part where labels say nothing
-        of it."""
+        """Return the weight of each part of h_hat in the prediction, (parts, d), 0 to 1; no rows without weights."""
         return np.zeros((0, self.d))
 
     def passed(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> OracleState:
-        """The state with (x, u) as the last pair of its past, of which nothing is learned."""
+        """Return the state with (x, u) as the last pair of its past, without learning."""
         return state
 
     def told(self, state: OracleState, truth: Mapping[str, float]) -> OracleState:
-        """The state once an experiment has said what the true plant's parameters are from now on, by name.
+        """Return the state after an experiment changed the true plant's parameters, given by name.
 
-        Only `perfect` listens: whoever learns is told nothing.
+        Only the oracle `perfect` uses this.
         """
         return state
 
     # -- hidden layers of a trainer ------------------------------------------------------------------------------
 
     def compile(self, realise: Realise) -> None:  # noqa: B027  (a default that does nothing)
-        """Let `realise` turn what every tick calls into something faster."""
+        """Replace the functions that every tick calls by `realise` of them, for example compiled ones."""
 
     def adopt(self, state: OracleState, offered: HiddenSet) -> tuple[OracleState, Verdict]:
-        """Swap in a set of hidden layers, or refuse it; a refusal leaves the network as it was."""
+        """Adopt a set of hidden layers or refuse it. A refusal leaves the network unchanged."""
         return state, Verdict("refused", f"the oracle {self.name} has no hidden layers")
 
     def confirm(self, state: OracleState) -> tuple[OracleState, str]:
-        """After a sample was learned: whether the set that was adopted last holds what it promised.
+        """Check after a new sample whether the last adopted set is as good as its trial predicted.
 
         Returns:
-            The state and "", or the state with the network from before, and a text that says why.
+            The state and "", or the state with the previous network and the reason.
         """
         return state, ""
 
     def network(self, state: OracleState) -> LearnedNetwork | None:
-        """The network of this state; None without one."""
+        """Return the network of this state; None without one."""
         return None
 
 
 def remembered(oracle: Oracle) -> int:
-    """Entries of s behind x, (k - 1) (d + m)."""
+    """Return the number of entries of s behind x, (k - 1) (d + m)."""
     return (oracle.pairs - 1) * (oracle.d + oracle.m)
 
 
 def follow(s: np.ndarray, u: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """s+ (D,) from s (D,), the input u (m,) and x+ = `after` (d,)."""
+    """Return s+ (D,) from s (D,), the input u (m,) and x+ = `after` (d,)."""
     d = len(after)
     if len(s) == d:
         return after
@@ -183,7 +182,7 @@ def follow(s: np.ndarray, u: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def follow_symbols(s: ca.MX, u: ca.MX, after: ca.MX) -> ca.MX:
-    """`follow` for CasADi."""
+    """Do the same as `follow` with CasADi expressions."""
     d, m = after.shape[0], u.shape[0]
     if s.shape[0] == d:
         return after
@@ -191,5 +190,5 @@ def follow_symbols(s: ca.MX, u: ca.MX, after: ca.MX) -> ca.MX:
 
 
 def by_point(slopes: list[ca.MX]) -> list[ca.MX]:
-    """From the slopes of n points along each variable, (d, n) each, to the Jacobian of each point."""
+    """Convert the slopes of n points along each variable, (d, n) each, to one Jacobian per point."""
     return [ca.horzcat(*columns) for columns in zip(*(ca.horzsplit(slope) for slope in slopes), strict=True)]

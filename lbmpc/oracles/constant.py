@@ -1,10 +1,10 @@
-"""The oracle that learns one number a state: classical offset-free MPC.
+"""An oracle that learns one number per state, as classical offset-free MPC does.
 
     h_hat_{t+1} = h_hat_t + gain (h(x_t, u_t) - h_hat_t),    h_hat_0 = 0
 
-h_hat is the same all over X x U, and at rest it equals the disturbance there: nothing is left of it in the prediction
-error (Pannocchia and Rawlings 2003). With a reference (`lbmpc.targets`) no offset is left. It is the baseline of all
-that learns a function.
+h_hat is constant over X x U. At rest it equals the disturbance, so the prediction error vanishes (Pannocchia and
+Rawlings 2003). With a reference (`lbmpc.targets`) there is no offset. The oracle is the baseline for those that learn a
+function.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from lbmpc.oracles.base import Oracle, OracleState, Variance, by_point
 
 
 class ConstantOracle(Oracle):
-    """h_hat is the filtered label.
+    """An oracle whose h_hat is the filtered label.
 
     Args:
-        d, m: states and inputs.
-        gain: share of a new label, above 0 and at most 1; 1: h_hat is the last label.
+        d, m: numbers of states and inputs.
+        gain: share of a new label, above 0 and at most 1. With 1, h_hat is the last label.
     """
 
     name = "constant"
@@ -50,5 +50,5 @@ class ConstantOracle(Oracle):
     def learn(
         self, state: OracleState, x: np.ndarray, u: np.ndarray, h: np.ndarray, variance: Variance = 0.0
     ) -> OracleState:
-        # Written so that it is h itself for a gain of 1, without rounding.
+        # This form gives h exactly for a gain of 1.
         return {"h_hat": (1.0 - self.gain) * state["h_hat"] + self.gain * h}

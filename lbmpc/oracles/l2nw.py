@@ -2,8 +2,8 @@
 
     h_hat(xi) = sum_i k_i h_i / (lambda + sum_i k_i),    k_i = valid_i exp(-|xi - xi_i|^2 / (2 b^2))
 
-over a window of the newest samples. The window has a fixed size, so that it is a parameter; a validity mask takes
-the slots not used yet out of both sums, or they would pull the estimate towards zero.
+over a window of the newest samples. The window has a fixed size, so it can be a parameter. A validity mask removes
+unused slots from both sums; otherwise they would bias the estimate towards zero.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from lbmpc.oracles.base import Oracle, OracleState, Variance, by_point
 
 
 class L2nwOracle(Oracle):
-    """Kernel regression on some of the states and inputs.
+    """Kernel regression on a subset of states and inputs.
 
     Args:
-        d, m: states and inputs.
-        variables: indices into (x, u) that the kernel sees.
-        window: samples kept.
-        bandwidth: b of each of those variables, (n,), in its units; a number counts for every one.
+        d, m: numbers of states and inputs.
+        variables: indices into (x, u) that are arguments of the kernel.
+        window: number of stored samples.
+        bandwidth: b of each variable, (n,), in its units, or one number for all.
         regularisation: lambda.
     """
 
@@ -63,7 +63,7 @@ class L2nwOracle(Oracle):
         offsets = []
         squared = ca.MX.zeros(self.window, xu.shape[1])
         for row, k in enumerate(self.variables):
-            # (window, points): every sample against every point.
+            # (window, points): each sample against each point.
             offset = ca.repmat(xu[k, :], self.window, 1) - ca.repmat(points[:, row], 1, xu.shape[1])
             offset /= self.bandwidth[row]
             offsets.append(offset)

@@ -1,4 +1,4 @@
-"""The oracle that learns nothing: plain linear MPC."""
+"""The oracle of plain linear MPC, which does not learn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lbmpc.oracles.base import Oracle, OracleState, by_point
 
 
 class LinearOracle(Oracle):
-    """h_hat = 0: plain linear MPC. `pairs` > 1 stands in for an oracle with a past, which it disregards."""
+    """h_hat = 0: plain linear MPC. With `pairs` > 1 it replaces an oracle with a window, and ignores the window."""
 
     name = "linear"
     parameters = 0

@@ -1,10 +1,10 @@
-"""The oracle that knows h: what learning could reach at best. For experiments, as a floor under the regret.
+"""The oracle that knows h, for experiments. It is the best case of learning and a lower bound of the regret.
 
     h(x, u) = Phi_T(x_e + x, u_e + u) - x_e - A x - B u
 
-Phi_T is the true plant's motion over one period under a constant input, by so many steps of the order-8 method that
-integrates the truth; A and B are the nominal model's, however wrong that is. The true plant's parameters are theta, so
-that a plant that changes is followed without building anything again.
+Phi_T is the true plant's motion over one period under a constant input, computed by steps of the order-8 method that
+also integrates the truth. A and B are those of the nominal model, even if it is wrong. The true plant's parameters are
+theta, so a plant that changes is followed without rebuilding.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from lbmpc.plants.equations import Plant
 from lbmpc.plants.truth import dop853
 
 STEP_NORM = 0.4
-"""At most so much of |a| dt, a the linearisation, in one integration step: h is then right to 1e-9."""
+"""Upper limit of |a| dt per integration step, with a the linearisation. The error of h is then 1e-9."""
 MOST_STEPS = 400
-"""Of integration in a period. More are a plant far too fast for its period, and would fill the memory."""
+"""Upper limit of integration steps per period. A faster plant would need too much memory."""
 LEAST = 2e-3
-"""Of their half-width: states that must stay positive are not let below this in the expression, or a wild plan would
-make it NaN."""
+"""Share of the half-width. The expression keeps positive states above it, so that a bad plan does not give NaN."""
 
 
 class PerfectOracle(Oracle):
-    """h_hat = h, with nothing to learn.
+    """An oracle with h_hat = h that has nothing to learn.
 
     Args:
-        model: the nominal model, whose A and B h is the rest of.
-        truth: the true plant; None: the equations that the model is linearised from.
+        model: the nominal model, with the A and B in the definition of h.
+        truth: the true plant; None for the equations that the model is linearised from.
 
     Raises:
-        ModelError: there is no truth, and the model is made of numbers alone.
-        PlantError: the true plant is too fast to be followed over a period.
+        ModelError: `truth` is None and the model is given by numbers alone.
+        PlantError: the true plant is too fast to be predicted over a period.
     """
 
     name = "perfect"
@@ -76,7 +75,7 @@ class PerfectOracle(Oracle):
 
 
 def _functions(model: Model, truth: Plant) -> tuple[ca.Function, ca.Function]:
-    """(x, u), (d + m,), deviations, and the parameters -> h (d,) and its Jacobian (d, d + m)."""
+    """Build (x, u), (d + m,), in deviations, and the parameters -> h (d,) and its Jacobian (d, d + m)."""
     plant, d = model.plant, model.d
     xu, parameters = ca.SX.sym("xu", d + model.m), ca.SX.sym("parameters", len(truth.parameters))
     low = np.full(d, -np.inf)
@@ -95,11 +94,11 @@ def _functions(model: Model, truth: Plant) -> tuple[ca.Function, ca.Function]:
 
 
 def _steps(truth: Plant, period: float) -> int:
-    """Of integration in a period."""
+    """Return the number of integration steps per period."""
     slopes = truth.linearised()[1]
     turns = float(np.abs(np.linalg.eigvals(slopes)).max()) * period if np.isfinite(slopes).all() else math.inf
     if not turns <= MOST_STEPS * STEP_NORM:
         raise PlantError(
-            f"{truth.name}: its true motion is too fast, or too wild, to be predicted over a period of {period:g} s"
+            f"{truth.name}: its true motion is too fast to be predicted over a period of {period:g} s"
         )
     return max(1, math.ceil(turns / STEP_NORM))

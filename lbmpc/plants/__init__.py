@@ -1,4 +1,4 @@
-"""Plants by name. Add yours: one file, one line here."""
+"""Plants by name. To add one, write a file and add it to the list below."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ __all__ = [
 def get_plant(
     which: str | Known | Plant, change: Callable[[Known | Plant], Known | Plant] | None = None
 ) -> Known | Plant:
-    """A plant, looked at.
+    """Return a plant after checking it.
 
     Args:
-        which: its name, or somebody's own.
-        change: what is to be otherwise; the plant is looked at as it is then. It has a form before, `has_form`.
+        which: its name, or a plant of your own.
+        change: a change that is applied before the check, if the plant's form is valid (`has_form`).
 
     Raises:
-        LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with what is wrong with it.
+        LookupError: `KeyError` with the nearest known name, or `PlantDefinitionError` with the faults of the plant.
     """
     plant = _named(which)
     if change is not None and has_form(plant):
@@ -51,7 +51,7 @@ def get_plant(
 
 
 def get_truth(which: str | Known | Plant) -> Known | Plant:
-    """The same for what only moves: it may rest nowhere, and nothing else of it is looked at. Raises as `get_plant`."""
+    """Return a plant that is only simulated, after checking its names and equations. Raises as `get_plant` does."""
     plant = _named(which)
     require_equations(plant)
     return plant

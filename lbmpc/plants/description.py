@@ -1,4 +1,4 @@
-"""What everybody knows of a plant: names, units, constraints, where it rests, what is safe. No motion yet."""
+"""The description of a plant without its motion: names, units, constraints, equilibrium and safe input."""
 
 from __future__ import annotations
 
@@ -15,67 +15,67 @@ from lbmpc.plants.rows import LinearRows, Row, no_rows, rows_of, together
 STATE_VECTORS = ("x_e", "x_min", "x_max", "W", "x0")
 INPUT_VECTORS = ("u_e", "u_min", "u_max", "safe_input")
 HAIR = 1e-9
-"""Of a period: two moments that are so near are one."""
+"""Share of a period. Two times that differ by less are equal."""
 TUPLES = ("states", "inputs", "performance", "kernel", "poles")
 EVERY: Any = None
-"""What nobody chose."""
+"""Marks a field that was not set."""
 
 
 class PlantError(ArithmeticError):
-    """The plant's true motion cannot be followed any further; the text says why and where."""
+    """The plant's true motion cannot be computed any further. The text says why and where."""
 
 
 class PlantDefinitionError(LookupError):
-    """A plant is there and cannot be used; the text names every fault, its field and the remedy."""
+    """The plant cannot be used. The text names every fault, its field and the remedy."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Description:
-    """A plant in its own units, with constraints, about a point at which it rests.
+    """A plant in its own units with its constraints and the equilibrium of its model.
 
     Shapes: d states, m inputs; `x_*` are (d,), `u_*` are (m,), `W` is (d,). Lists are accepted for arrays and tuples.
-    Nothing is checked here: `lbmpc.plants.get_plant` and `lbmpc.model.build_model` refuse a plant that cannot be used.
+    The constructor checks nothing. `lbmpc.plants.get_plant` and `lbmpc.model.build_model` check the plant.
     """
 
     name: str
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     units: Mapping[str, str]
-    """Unit of every state, input and of time, by name."""
+    """Units by the names of states, inputs and time ("t")."""
     x_e: np.ndarray
-    """Equilibrium about which the model is linear."""
+    """Equilibrium of the model."""
     u_e: np.ndarray
     x_min: np.ndarray
-    """Bounds of X; infinite where there is none, and then `scale` has this state. As for `u_min` and `u_max`."""
+    """Bounds of X. An infinite bound is allowed if `scale` has this state. Likewise `u_min` and `u_max`."""
     x_max: np.ndarray
     u_min: np.ndarray
     u_max: np.ndarray
     W: np.ndarray
-    """Half-widths of the disturbance box used for tightening by default, per second of sampling period."""
+    """Half-widths of the disturbance box for constraint tightening, per second of sampling period."""
     x0: np.ndarray
     safe_input: np.ndarray
-    """What the plant's own hardware applies when nobody commands it, at x_e where there is a `safe_gain`."""
+    """Input that the plant's own hardware applies without commands; with a `safe_gain`, its value at x_e."""
     performance: tuple[int, ...] = EVERY
-    """States that make up the reported cost; the first is the one whose overshoot is reported. All by default."""
+    """States in the reported cost. The overshoot of the first one is reported. All states by default."""
     kernel: tuple[str, ...] = EVERY
-    """States and inputs that the L2NW kernel sees. All by default."""
+    """States and inputs that are arguments of the L2NW kernel. All by default."""
     safe_gain: np.ndarray | None = None
-    """(m, d): then that is safe_input + safe_gain (x - x_e), renewed every period; for a plant that no constant input
-    holds at x_e. None: safe_input."""
+    """Gain, (m, d), of the safe input safe_input + safe_gain (x - x_e), updated every period, for a plant that no
+    constant input holds at x_e. With None the safe input is constant."""
     poles: tuple[complex, ...] | None = None
-    """Continuous-time closed-loop poles for K; None: LQR with the controller's Q and R."""
+    """Continuous-time closed-loop poles for K; None for the LQR gain with the controller's Q and R."""
     scale: Mapping[str, float] = field(default_factory=dict)
-    """By name, for a state or input that is not bounded on both sides: the half-width that counts as 1, in its unit."""
+    """Half-width that counts as 1, by name and in its unit, for a state or input without both bounds."""
     names: Mapping[str, str] = field(default_factory=dict)
-    """What states and inputs are called in a person's words, by name."""
+    """Descriptive names of states and inputs, by name."""
     dead_time: float = 0.0
-    """Seconds from when an input is written until the plant begins to answer: transport, a pipe, a bus behind the
-    gateway. Of all inputs."""
+    """Seconds between writing an input and the plant's response, the same for all inputs: transport, a pipe, or a bus
+    behind the gateway."""
     u_rate_max: np.ndarray | None = None
-    """How fast an input may change, (m,), per second, infinite where it may step; None: every input may."""
+    """Rate limits of the inputs, (m,), per second; infinite for an input without one. None for no limits."""
     rows: Mapping[str, Row] = field(default_factory=dict)
-    """Constraints beside these boxes, by name, as {"surge": {"z": 1.0, "y": -0.5, "max": 0.3, "priority": 1}}: of
-    states, or of inputs. X and U are then what keeps boxes and rows."""
+    """Constraints in addition to the boxes, by name, of states or of inputs, such as
+    {"surge": {"z": 1.0, "y": -0.5, "max": 0.3, "priority": 1}}. X and U are the intersections of boxes and rows."""
 
     def __post_init__(self) -> None:
         for name in (*STATE_VECTORS, *INPUT_VECTORS, "safe_gain", "u_rate_max"):
@@ -97,17 +97,19 @@ class Description:
         input_rate_max: Mapping[str, float] | None = None,
         rows: Mapping[str, Row] | None = None,
     ) -> Self:
-        """With other bounds, or about another point.
+        """Return the plant with other bounds, another equilibrium or other limits.
 
         Args:
-            bounds: lower and upper by the name of a state or input, None where there is none; others stay.
-            x_e, u_e: (d,) and (m,), where equations are linearised.
-            dead_time: seconds; None: its own.
-            input_rate_max: how fast an input may change, per second, by its name; others stay.
-            rows: beside the boxes, by name; others stay.
+            bounds: lower and upper bound by the name of a state or input; None for no bound.
+            x_e, u_e: the equilibrium, (d,) and (m,), at which equations are linearised.
+            dead_time: seconds; None keeps the plant's own.
+            input_rate_max: rate limits per second by the name of the input.
+            rows: constraints in addition to the boxes, by name.
+
+        Entries that are not given stay as they are.
 
         Raises:
-            KeyError: a bound of what is no state or input, a rate of what is no input.
+            KeyError: a bound's name is no state or input, or a rate's name is no input.
         """
         for name in bounds:
             if name not in (*self.states, *self.inputs):
@@ -119,7 +121,7 @@ class Description:
         }
         for axis, names in (("x", self.states), ("u", self.inputs)):
             low, high = np.array(getattr(self, f"{axis}_min")), np.array(getattr(self, f"{axis}_max"))
-            # What has another shape is for whoever looks at the plant to name.
+            # An array with a wrong shape is reported when the plant is checked.
             if bounds and low.shape == high.shape == (len(names),):
                 for name, (lower, upper) in bounds.items():
                     if name in names:
@@ -138,7 +140,7 @@ class Description:
         return replace(self, **new) if new else self
 
     def safe_input_at(self, x: np.ndarray) -> np.ndarray:
-        """What the plant's own hardware applies at x, (d,), when nobody commands it, (m,); inside U."""
+        """Return the input that the plant's own hardware applies at x, (d,), without commands, (m,); in U."""
         u = self.safe_input
         if self.safe_gain is not None:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -147,18 +149,19 @@ class Description:
         return self.within(u)
 
     def within(self, u: Sequence[float] | np.ndarray) -> np.ndarray:
-        """An input of U near u, (m,): each in its bounds, and then as far to u_e as the rows need; u itself in U."""
+        """Return an input in U near u, (m,): clipped to its bounds, then moved towards u_e until the rows hold."""
         return self.input_rows.pulled(np.minimum(np.maximum(u, self.u_min), self.u_max), self.u_e)
 
     def within_about(self, v: np.ndarray) -> np.ndarray:
-        """As `within`, in deviations from u_e, (m,)."""
+        """Do the same as `within` in deviations from u_e, (m,)."""
         low, high, rows = self._inputs_about
         return rows.pulled(np.minimum(np.maximum(v, low), high), 0.0)
 
     def reachable(self, u: np.ndarray, previous: np.ndarray, period: float) -> np.ndarray:
-        """The input nearest to u, (m,), that rate limits allow one period after `previous`, (m,); deviations or not.
+        """Return the input nearest to u, (m,), within the rate limits one period after `previous`, (m,).
 
-        Where U has rows beside its box, that on the straight way from there, which keeps them.
+        Both are deviations or both are not. If U has rows besides its box, the result is on the line from `previous` to
+        u, so that it satisfies them.
         """
         step = self.input_rates * period
         if self.input_rows.names:
@@ -166,32 +169,32 @@ class Description:
         return np.minimum(np.maximum(u, previous - step), previous + step)
 
     def dead_periods(self, period: float) -> int:
-        """The dead time in whole periods, the last one begun."""
+        """Return the dead time in whole periods, rounded up."""
         return math.ceil(self.dead_time / period - HAIR)
 
     def beyond_x(self, x: np.ndarray) -> np.ndarray:
-        """How far x is beyond each bound of X, in half-widths, negative inside: (..., d) -> (..., d + rows)."""
+        """Return the violation of each bound of X in half-widths, negative inside: (..., d) -> (..., d + rows)."""
         boxes, rows = np.maximum(self.x_min - x, x - self.x_max) / self.x_scale, self.state_rows
         return np.concatenate([boxes, rows.beyond(x)], axis=-1) if rows.names else boxes
 
     @cached_property
     def x_names(self) -> tuple[str, ...]:
-        """Of the bounds of X, (d + rows,): states, then rows."""
+        """Names of the bounds of X, (d + rows,): states, then rows."""
         return (*self.states, *self.state_rows.names)
 
     @cached_property
     def state_rows(self) -> LinearRows:
-        """Of X, beside its box."""
+        """Rows of X in addition to its box."""
         return rows_of(self.rows, self.states, self.x_scale) if self.rows else no_rows(self.d)
 
     @cached_property
     def input_rows(self) -> LinearRows:
-        """Of U, beside its box."""
+        """Rows of U in addition to its box."""
         return rows_of(self.rows, self.inputs, self.u_scale) if self.rows else no_rows(self.m)
 
     @cached_property
     def _inputs_about(self) -> tuple[np.ndarray, np.ndarray, LinearRows]:
-        """U about u_e: its box, and the rows beside it."""
+        """U in deviations from u_e: its box and its rows."""
         return self.u_min - self.u_e, self.u_max - self.u_e, self.input_rows.about(self.u_e)
 
     @property
@@ -204,17 +207,17 @@ class Description:
 
     @cached_property
     def input_rates(self) -> np.ndarray:
-        """`u_rate_max`, (m,), infinite where there is no limit."""
+        """`u_rate_max`, (m,), with infinity for no limit."""
         return np.full(self.m, np.inf) if self.u_rate_max is None else self.u_rate_max
 
     @cached_property
     def x_scale(self) -> np.ndarray:
-        """What counts as 1 in each state, (d,): X's half-width where it is finite, else what `scale` says."""
+        """Unit of each state, (d,): the half-width of X if it is finite, otherwise the entry of `scale`."""
         return self._half_widths(self.states, self.x_min, self.x_max)
 
     @cached_property
     def u_scale(self) -> np.ndarray:
-        """What counts as 1 in each input, (m,), as for `x_scale`."""
+        """Unit of each input, (m,), as for `x_scale`."""
         return self._half_widths(self.inputs, self.u_min, self.u_max)
 
     def _half_widths(self, names: tuple[str, ...], low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -226,7 +229,7 @@ class Description:
 
 
 def as_array(value: Any) -> Any:
-    """Numbers as an array; what are none stays as it is, for whoever looks at the plant to name."""
+    """Return numbers as an array. Other values are returned unchanged, and reported when the plant is checked."""
     try:
         return None if value is None else np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -234,5 +237,5 @@ def as_array(value: Any) -> Any:
 
 
 def as_tuple(value: Any) -> Any:
-    """A list as a tuple; all else stays as it is."""
+    """Return a list as a tuple and any other value unchanged."""
     return tuple(value) if isinstance(value, list) else value

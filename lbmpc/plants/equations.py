@@ -1,6 +1,6 @@
-"""A plant by its equations, dx/dt = f(x, u): what simulates it, and what its numbers are taken from.
+"""A plant given by its equations dx/dt = f(x, u), for simulation and as the source of the model's numbers.
 
-Bring your own plant as one file: give `rhs` in CasADi operations and fill in a `Plant`.
+To add your own plant, write one file with `rhs` in CasADi operations and a `Plant`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from lbmpc.plants.rows import Row
 
 Rhs = Callable[[Any, Any], list[Any]]
 ROUNDS, STILL = 50, 1e-11
-"""Of Newton's method towards a rest; it ends with a step of so many half-widths."""
+"""Iterations of Newton's method for a rest, and the step in half-widths at which it stops."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """A state that must stay positive for the equations to mean anything."""
+    """A state that must stay positive for the equations to be valid."""
 
     state: int
     name: str
@@ -49,9 +49,9 @@ class Plant(Description):
     """f(x, u) written with CasADi operations; x and u are indexable."""
     positive: tuple[Domain, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
-    """What the equations are built with, by name; empty where they cannot be varied."""
+    """Parameters of the equations, by name; empty if they cannot be varied."""
     equations: Callable[..., Rhs] | None = None
-    """`rhs` from `parameters`, given by name: numbers, or CasADi symbols."""
+    """Builds `rhs` from `parameters`, given by name as numbers or CasADi symbols."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,7 +66,7 @@ class Plant(Description):
         input_rate_max: Mapping[str, float] | None = None,
         rows: Mapping[str, Row] | None = None,
     ) -> Plant:
-        """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no input holds it."""
+        """Do the same as `Description.changed`; u_e is found for x_e. Raises `PlantDefinitionError` without a rest."""
         there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max, rows)
         if x_e is None or u_e is not None:
             return there
@@ -75,17 +75,17 @@ class Plant(Description):
         return rest
 
     def known(self) -> Known:
-        """Its numbers: the equations linearised at (x_e, u_e), and all that it has as a description."""
+        """Return the numbers of the plant: the linearisation at (x_e, u_e) and the fields of its description."""
         shared = {one.name: getattr(self, one.name) for one in fields(Description)}
         _rest, a, b = self.linearised()
         return Known(**shared, A=a, B=b)
 
     def varied(self, **changes: float) -> Plant:
-        """This plant with other parameters in its equations; all else, x_e and the bounds too, stays as it is.
+        """Return this plant with other parameters in its equations; x_e, bounds and other fields stay unchanged.
 
         Raises:
-            KeyError: there is no such parameter; names the nearest, or those there are.
-            PlantError: with these parameters dx/dt is not finite at (x_e, u_e).
+            KeyError: there is no such parameter. The text names the nearest one or lists them.
+            PlantError: dx/dt is not finite at (x_e, u_e) with these parameters.
         """
         for name in changes:
             if self.equations is None or name not in self.parameters:
@@ -103,12 +103,12 @@ class Plant(Description):
         return varied
 
     def function(self) -> ca.Function:
-        """f as a CasADi function (x, u) -> dx/dt."""
+        """Return f as a CasADi function (x, u) -> dx/dt."""
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
         return ca.Function("f", [x, u], [ca.vertcat(*self.rhs(x, u))], ["x", "u"], ["dx"])
 
     def function_of_parameters(self) -> ca.Function:
-        """f as a CasADi function (x, u, p) -> dx/dt; p are the `parameters` in their order, (0,) where it has none."""
+        """Return f as a CasADi function (x, u, p) -> dx/dt; p is `parameters` in order, (0,) without parameters."""
         x, u = ca.SX.sym("x", self.d), ca.SX.sym("u", self.m)
         p = ca.SX.sym("p", len(self.parameters))
         rhs = self.rhs
@@ -117,16 +117,16 @@ class Plant(Description):
         return ca.Function("f", [x, u, p], [ca.vertcat(*rhs(x, u))], ["x", "u", "p"], ["dx"])
 
     def linearised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """dx/dt at (x_e, u_e), (d,), and its Jacobians there in x, (d, d), and in u, (d, m)."""
+        """Return dx/dt at (x_e, u_e), (d,), and its Jacobians in x, (d, d), and in u, (d, m)."""
         return _values(self._slopes(), self.x_e, self.u_e)
 
     def resting_near(self, x_e: Any = None, u_e: Any = None) -> Plant:
-        """The same equations about the rest nearest to (x_e, u_e), by default its own, as of `nearest_rest`.
+        """Return the plant at the rest nearest to (x_e, u_e), by default its own; see `nearest_rest`.
 
-        For a plant that something known moves, wind or weight: x_e is then where it should be, and u_e a guess.
+        Use it for a plant under a known load, such as wind or weight: x_e is the desired state and u_e is a guess.
 
         Raises:
-            PlantDefinitionError: there is none nearby, or it is outside of X or U.
+            PlantDefinitionError: there is no rest nearby, or it lies outside X or U.
         """
         refuse(
             self.name,

@@ -1,4 +1,4 @@
-"""What is wrong with the description of a plant, in a person's words: names, numbers, bounds, poles, choices."""
+"""Checks of a plant's description with messages for a person: names, numbers, bounds, poles and choices."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from lbmpc.plants.description import INPUT_VECTORS, STATE_VECTORS, Description, 
 from lbmpc.plants.rows import PRIORITY, WORDS, coefficients
 
 TIME = "t"
-"""The name of time in a plant's units."""
+"""Name of time in a plant's units."""
 SAME = 1e-5
-"""Half-widths: a rest that is so near to what was asked for is that."""
+"""Half-widths. A rest this close to the requested one counts as equal."""
 LEVELS = 10
-"""Priorities of rows: each may cost a QP."""
+"""Number of priorities of rows. Each can cost a QP."""
 INSIDE = 1e-6
-"""Of a row's range: how far inside a row of inputs u_e must be, since what breaks it is drawn to u_e."""
+"""Share of a row's range. u_e lies inside rows of inputs by this much, because inputs are pulled to it."""
 W_IS = (
-    "W is missing: give the half-widths of what the model does not know, per second, one for each of {names}. "
+    "W is missing: give the half-widths of the model error, per second, one for each of {names}. "
     "`tandem identify` finds them from a log; zeros claim that the model is exact"
 )
 
@@ -32,13 +32,13 @@ def refuse(name: str, found: Sequence[str], where: str = "") -> None:
 
 
 def unusable(name: str, *found: str, where: str = "") -> PlantDefinitionError:
-    """What says that the plant of that name has these faults, at least one; `where` it is written."""
+    """Return the error for a plant with these faults, at least one; `where` says where it is written."""
     listed = f" {found[0]}" if len(found) == 1 else "".join(f"\n  - {fault}" for fault in found)
     return PlantDefinitionError(f"the plant {name!r} cannot be used{where}:{listed}")
 
 
 def require_held(asked: Description, rest: Description, input_too: bool) -> None:
-    """Raise `unusable` unless the nearest rest is where it was asked for: in x_e, and in u_e where that was given."""
+    """Raise `unusable` unless the nearest rest is the requested one: in x_e, and in u_e if that was given."""
     off = np.abs(rest.x_e - asked.x_e) / asked.x_scale
     if input_too:
         off = np.concatenate([off, np.abs(rest.u_e - asked.u_e) / asked.u_scale])
@@ -49,7 +49,7 @@ def require_held(asked: Description, rest: Description, input_too: bool) -> None
 
 
 def point(plant: Description) -> str:
-    """Its x_e and u_e as they can be written, to twelve digits."""
+    """Return x_e and u_e as text with twelve digits."""
     x_e, u_e = ([float(f"{value:.12g}") for value in axis.tolist()] for axis in (plant.x_e, plant.u_e))
     return f"x_e = {x_e}, u_e = {u_e}"
 
@@ -77,7 +77,7 @@ def name_faults(plant: Description) -> tuple[str, ...]:
 
 
 def number_faults(plant: Description) -> Iterator[str]:
-    """Shapes, and what must be finite."""
+    """Check shapes and finite numbers."""
     for fields, names in ((STATE_VECTORS, plant.states), (INPUT_VECTORS, plant.inputs)):
         for field in fields:
             yield from _vector(field, getattr(plant, field), names)
@@ -85,33 +85,33 @@ def number_faults(plant: Description) -> Iterator[str]:
     if gain is not None and not (numeric(gain) and gain.shape == shape and np.isfinite(gain).all()):
         yield f"safe_gain is {shown(gain)}: it needs finite numbers, a row for each input and a column for each state"
     if not (isinstance(plant.dead_time, int | float) and 0.0 <= plant.dead_time < np.inf):
-        yield f"dead_time is {plant.dead_time!r}: give seconds, 0 where the plant answers at once"
+        yield f"dead_time is {plant.dead_time!r}: give seconds, or 0 for a plant that responds at once"
     rates = plant.u_rate_max
     if rates is not None and not (numeric(rates) and rates.shape == (plant.m,) and (rates > 0.0).all()):
         yield (
-            f"u_rate_max is {shown(rates)}: give how fast each of {', '.join(plant.inputs)} may change, per second, "
-            "a positive number or inf"
+            f"u_rate_max is {shown(rates)}: give the largest rate of each of {', '.join(plant.inputs)}, per second, "
+            "as a positive number or inf"
         )
     yield from _rows(plant)
 
 
 def _rows(plant: Description) -> Iterator[str]:
-    """What is wrong with rows by themselves."""
+    """Check each row by itself."""
     rows: Any = plant.rows
     known = (*plant.states, *plant.inputs)
     if not isinstance(rows, Mapping):
         yield f"rows is {rows!r}: give rows by name, as in {{'sum': {{{known[0]!r}: 1.0, 'max': 1.0}}}}"
         return
     if rows and (words := [name for name in known if name in WORDS]):
-        yield f"a state or input is called {words[0]!r}, which is a word of rows: call it something else"
+        yield f"a state or input is called {words[0]!r}, which is a keyword of rows: use another name"
         return
     for key, row in rows.items():
         if not (isinstance(key, str) and key) or key in known:
-            yield f"a row is called {key!r}: give it a name that no state or input has"
+            yield f"a row is called {key!r}: give it a name that differs from all states and inputs"
         elif not isinstance(row, Mapping) or not all(
             isinstance(value, int | float) and np.isfinite(value) for value in row.values()
         ):
-            yield f"row {key} is {row!r}: give finite numbers by name, and leave out a bound that it has not"
+            yield f"row {key} is {row!r}: give finite numbers by name, and leave out a bound that does not exist"
         else:
             yield from (f"row {key} {fault}" for fault in _one_row(plant, dict(row)))
 
@@ -128,7 +128,7 @@ def _one_row(plant: Description, row: dict[str, float]) -> Iterator[str]:
     if of_inputs and len(of_inputs) < len(parts):
         yield "has states and inputs: give one row for states, and one for inputs"
     if of_inputs and PRIORITY in row:
-        yield "is of inputs and has a priority: an input is never outside of U, whatever it costs"
+        yield "is of inputs and has a priority: remove it, because inputs never leave U"
     if "min" not in row and "max" not in row:
         yield "has no bound: give min, max or both"
     elif not row.get("min", -np.inf) < row.get("max", np.inf):
@@ -147,7 +147,7 @@ def _vector(field: str, value: Any, names: Sequence[str]) -> Iterator[str]:
     elif value.shape != (len(names),):
         yield f"{field} is {shown(value)}: it needs {len(names)} entries, one for each of {', '.join(names)}"
     else:
-        # A bound may be infinite.
+        # Bounds may be infinite.
         unusable = np.isnan(value) if field.endswith(("_min", "_max")) else ~np.isfinite(value)
         for i in np.flatnonzero(unusable).tolist():
             yield f"{field} of {names[i]} is {value[i]:g}: give a finite number"
@@ -174,8 +174,8 @@ def bound_faults(plant: Description) -> Iterator[str]:
                 yield f"{axis}_e of {name} is {rest[i]:g}, but {between}: the equilibrium must lie between its bounds"
             elif name not in scale and not np.isfinite(high[i] - low[i]):
                 yield (
-                    f"{between}: give both bounds, or scale={{{name!r}: ...}}, the half-width that counts as 1 where "
-                    "there is no bound"
+                    f"{between}: give both bounds, or scale={{{name!r}: ...}}, the half-width that counts as 1 without "
+                    "bounds"
                 )
     for i in np.flatnonzero(plant.W < 0.0).tolist():
         yield f"W of {plant.states[i]} is {plant.W[i]:g}: a half-width is at least 0"
@@ -190,11 +190,11 @@ def bound_faults(plant: Description) -> Iterator[str]:
 
 
 def _row_bounds(plant: Description) -> Iterator[str]:
-    """Whether the equilibrium keeps all rows, and with it no polytope is empty; all widths are known."""
+    """Check that the equilibrium satisfies all rows, so that no polytope is empty. All widths are known here."""
     try:
         states, inputs = plant.state_rows, plant.input_rows
     except KeyError:
-        # A half-width that is missing is named above.
+        # A missing half-width was reported above.
         return
     for rows, y, name, room in (
         (states, plant.x_e, "x_e", 0.0),
@@ -203,7 +203,7 @@ def _row_bounds(plant: Description) -> Iterator[str]:
     ):
         for i in np.flatnonzero(rows.beyond(y) > -room).tolist():
             low, high, value = rows.lower[i], rows.upper[i], float(rows.F[i] @ y)
-            must = "must lie between them" if not room else "must lie inside, off its edges"
+            must = "must lie between them" if not room else "must lie strictly between them"
             yield f"row {rows.names[i]} is {value:g} at {name}, with min {low:g} and max {high:g}: {name} {must}"
 
 
@@ -223,7 +223,7 @@ def pole_faults(plant: Description) -> Iterator[str]:
 
 
 def choice_faults(plant: Description) -> Iterator[str]:
-    """What refers to states and inputs by index or by name."""
+    """Check the fields that refer to states and inputs by index or name."""
     known = (*plant.states, *plant.inputs)
     performance: Any = plant.performance
     if not isinstance(performance, tuple) or not performance:
@@ -252,7 +252,7 @@ def choice_faults(plant: Description) -> Iterator[str]:
     units: Any = plant.units if isinstance(plant.units, Mapping) else {}
     without = [name for name in (*known, TIME) if not isinstance(units.get(name), str)]
     if without:
-        yield f"units has none for {', '.join(without)}: give each one, '1' where it has no unit"
+        yield f"units has none for {', '.join(without)}: give one for each, '1' for a number without unit"
 
 
 def numeric(value: Any) -> bool:

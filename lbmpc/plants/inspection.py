@@ -1,4 +1,4 @@
-"""Whether a plant can be used, numbers or equations. Every command looks before it begins."""
+"""Checks whether a plant, given by numbers or equations, can be used. Every command checks its plant first."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from lbmpc.plants.known import Known, form_faults, known_faults
 from lbmpc.plants.matrices import mode_faults
 
 REST = 1e-5
-"""How far x_e and u_e may be from rest, as a share of the half-widths of X and U."""
+"""Largest distance of x_e and u_e from rest, as a share of the half-widths of X and U."""
 FLAT = 1e-9
-"""Half-widths a second that rounding may leave where the equations have no slope at rest."""
+"""Rounding error in half-widths per second that is allowed where the equations have no slope at rest."""
 WRITE_IT = "Write the equations with CasADi's operations: ca.sin, not math.sin, and ca.if_else, not if"
 
 
@@ -40,7 +40,7 @@ def require_sound(plant: Known | Plant) -> None:
 
 
 def has_form(plant: Known | Plant) -> bool:
-    """Whether names, shapes and numbers are right, and equations can be written down: whether it can be changed."""
+    """Return whether names, shapes, numbers and equations are valid, so that the plant can be changed."""
     if name_faults(plant):
         return False
     found = form_faults(plant) if isinstance(plant, Known) else [*number_faults(plant), *_equations(plant)]
@@ -48,7 +48,7 @@ def has_form(plant: Known | Plant) -> bool:
 
 
 def require_equations(plant: Known | Plant) -> None:
-    """Raise `PlantDefinitionError` where the names or the equations cannot be used; it may rest nowhere."""
+    """Raise `PlantDefinitionError` if names or equations are not usable. An equilibrium is not required."""
     found = name_faults(plant) or (
         tuple(_equations(plant)) if isinstance(plant, Plant) else known_faults(plant)
     )
@@ -56,13 +56,13 @@ def require_equations(plant: Known | Plant) -> None:
 
 
 def require_model(plant: Known | Plant) -> None:
-    """Raise `PlantDefinitionError` with the faults of what a model is made of: names, numbers, bounds and equations."""
+    """Raise `PlantDefinitionError` with the faults in names, numbers, bounds and equations of the model."""
     refuse(plant.name, name_faults(plant) or _faults_of_model(plant), _where(plant))
 
 
 def faults(plant: Known | Plant) -> tuple[str, ...]:
-    """Every fault of the description, one sentence each; empty where the plant can be used."""
-    # Lengths and indices mean nothing without states and inputs.
+    """Return every fault of the description as a sentence; empty if the plant can be used."""
+    # Without valid names of states and inputs, lengths and indices have no meaning.
     return name_faults(plant) or (*_faults_of_model(plant), *choice_faults(plant))
 
 
@@ -73,7 +73,7 @@ def _where(plant: Known | Plant) -> str:
 
 @lru_cache(maxsize=16)
 def _faults_of_model(plant: Known | Plant) -> tuple[str, ...]:
-    """Remembered: a plant never changes, it is looked at wherever it is looked up, and derivatives take a while."""
+    """The result is cached: a plant does not change, it is checked at every look-up, and derivatives take time."""
     if isinstance(plant, Known):
         return known_faults(plant)
     numbers = list(number_faults(plant))
@@ -96,11 +96,11 @@ def _domains(plant: Plant) -> Iterator[str]:
 
 
 def _equations(plant: Plant) -> Iterator[str]:
-    """Whether rhs can be written down in symbols, and has a finite value where it must."""
+    """Check that rhs can be written in symbols and has finite values where required."""
     x, u = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m)
     try:
         slopes: Any = plant.rhs(x, u)
-    except Exception as error:  # noqa: BLE001 - the equations are somebody else's code
+    except Exception as error:  # noqa: BLE001 - the equations are the user's code
         yield f"rhs fails{_at(plant, error)}: {type(error).__name__}: {_said(error)}. {WRITE_IT}"
         return
     if not isinstance(slopes, list | tuple | np.ndarray):
@@ -108,9 +108,9 @@ def _equations(plant: Plant) -> Iterator[str]:
         return
     try:
         f = plant.function()
-    except Exception as error:  # noqa: BLE001 - CasADi raises what it likes for what it is given
+    except Exception as error:  # noqa: BLE001 - CasADi raises various exceptions for bad arguments
         yield (
-            f"rhs returns what CasADi cannot take: {_said(error)}. It must return one CasADi expression or number for "
+            f"CasADi cannot use the result of rhs: {_said(error)}. It must return one CasADi expression or number for "
             "each state, made of x and u alone"
         )
         return
@@ -122,7 +122,7 @@ def _equations(plant: Plant) -> Iterator[str]:
 
 
 def _rest(plant: Plant) -> Iterator[str]:
-    """Whether x_e is an equilibrium under u_e, and dx/dt a number there and at x0; all shapes are right."""
+    """Check that x_e is an equilibrium under u_e and that dx/dt is finite there and at x0. Shapes are valid here."""
     residual, a, b = plant.linearised()
     start = np.array(plant.function()(plant.x0, plant.u_e))[:, 0]
     for where, values in (("(x_e, u_e)", residual), ("x0", start)):
@@ -133,38 +133,38 @@ def _rest(plant: Plant) -> Iterator[str]:
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         yield (
             f"the slopes of dx/dt are not finite at (x_e, u_e): {a.tolist()} in x, {b.tolist()} in u. The model "
-            "is made of them: take an equilibrium with a slope"
+            "consists of them: use an equilibrium with finite slopes"
         )
         return
-    # What moving x_e and u_e by this share of the half-widths would do.
+    # Effect of moving x_e and u_e by this share of the half-widths.
     allowed = REST * (np.abs(a) @ plant.x_scale + np.abs(b) @ plant.u_scale) + FLAT * plant.x_scale
     moving = [
-        f"d{plant.states[i]}/dt is {residual[i]:.3g} (of rounding, at most {allowed[i]:.1g})"
+        f"d{plant.states[i]}/dt is {residual[i]:.3g} (at most {allowed[i]:.1g} is rounding)"
         for i in np.flatnonzero(np.abs(residual) > allowed)
     ]
     if moving:
         yield (
             f"(x_e, u_e) is not an equilibrium: {', '.join(moving)}. Give x_e and u_e at which the plant rests, with "
-            f"more digits if need be{_nearest(plant)}"
+            f"more digits if necessary{_nearest(plant)}"
         )
         return
     yield from mode_faults(a, b, None, plant)
 
 
 def _nearest(plant: Plant) -> str:
-    """Where it does rest, to be copied, or to be found by the plant itself."""
+    """Return a hint with the nearest rest, and with the method that finds it."""
     try:
         rest = plant.resting_near()
     except PlantDefinitionError:
         return ""
     return (
-        f". The nearest rest is {point(rest)}. Where something known moves it, "
-        "wind or weight, let it be found: Plant(...).resting_near()"
+        f". The nearest rest is {point(rest)}. If a known load moves the plant, "
+        "such as wind or weight, find it with Plant(...).resting_near()"
     )
 
 
 def _parameters(plant: Plant) -> Iterator[str]:
-    """Whether the equations can be varied as the plant says; `rhs` itself is sound."""
+    """Check that the equations can be varied as described. `rhs` itself is valid here."""
     parameters: Any = plant.parameters
     if not isinstance(parameters, Mapping) or not all(
         isinstance(v, int | float) for v in parameters.values()
@@ -177,7 +177,7 @@ def _parameters(plant: Plant) -> Iterator[str]:
         return
     try:
         f, varied = plant.function(), plant.function_of_parameters()
-    except Exception as error:  # noqa: BLE001 - the equations are somebody else's code
+    except Exception as error:  # noqa: BLE001 - the equations are the user's code
         failed = f"{type(error).__name__}: {_said(error)}"
         yield f"equations fails with symbols for {', '.join(parameters)}: {failed}. {WRITE_IT}"
         return
@@ -187,7 +187,7 @@ def _parameters(plant: Plant) -> Iterator[str]:
 
 
 def _at(plant: Plant, error: Exception) -> str:
-    """The line of the plant's own file at which it failed."""
+    """Return the line of the plant's own file at which the error was raised."""
     code = getattr(plant.rhs, "__code__", None)
     frames = traceback.extract_tb(error.__traceback__)
     lines = [frame.lineno for frame in frames if code is not None and frame.filename == code.co_filename]
@@ -195,6 +195,6 @@ def _at(plant: Plant, error: Exception) -> str:
 
 
 def _said(error: Exception) -> str:
-    """Its last line, without the place in CasADi's own source."""
+    """Return the last line of the error without the position in CasADi's source."""
     lines = str(error).strip().splitlines() or [""]
     return re.sub(r"^\S+\.[ch]pp:\d+: ", "", lines[-1].strip()).rstrip(".")

@@ -1,4 +1,4 @@
-"""What a controller knows of a plant: numbers, and no equations. They fit in a log, and a replay needs nothing else."""
+"""A plant as the controller knows it: numbers without equations. They fit into a log, and a replay needs no more."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from lbmpc.plants.rows import Row
 from lbmpc.plants.written import read, written
 
 ROUNDING = 1e-12
-"""In half-widths: what is this near to a rest stays there, to the bit."""
+"""Half-widths. A point this close to a rest is not moved at all."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Known(Description):
-    """A linear model about (x_e, u_e), at which the plant rests, in deviations from there.
+    """A linear model in deviations from (x_e, u_e), at which the plant rests.
 
-    In continuous time dx/dt = A x + B u; in discrete time x+ = A x + B u after every `period`, with u constant.
+    In continuous time dx/dt = A x + B u. In discrete time x+ = A x + B u after every `period`, with u constant.
     """
 
     A: np.ndarray
@@ -40,7 +40,7 @@ class Known(Description):
     B: np.ndarray
     """(d, m)"""
     period: float | None = None
-    """Seconds between two states of a discrete-time model; None: continuous time."""
+    """Seconds between two states of a discrete-time model; None for continuous time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,18 +48,18 @@ class Known(Description):
             object.__setattr__(self, name, as_array(getattr(self, name)))
 
     def varied(self, **changes: float) -> Known:
-        """Itself: it has no parameters. Raises `KeyError` where one is to change."""
+        """Return the plant itself, because it has no parameters. Raises `KeyError` if a change is requested."""
         if changes:
             raise KeyError(
-                f"{self.name} has no parameter {min(changes)!r}: it is numbers alone, without equations"
+                f"{self.name} has no parameter {min(changes)!r}: it is given by numbers, without equations"
             )
         return self
 
     def resting_near(self, x_e: Any = None, u_e: Any = None) -> Known:
-        """The same model about the rest nearest to (x_e, u_e), by default its own.
+        """Return the model at the rest nearest to (x_e, u_e), by default its own.
 
         Raises:
-            PlantDefinitionError: the model rests nowhere, or outside of X or U.
+            PlantDefinitionError: the model has no rest, or only one outside X or U.
         """
         x_e = self.x_e if x_e is None else np.asarray(x_e, dtype=float)
         u_e = self.u_e if u_e is None else np.asarray(u_e, dtype=float)
@@ -74,7 +74,7 @@ class Known(Description):
         input_rate_max: Mapping[str, float] | None = None,
         rows: Mapping[str, Row] | None = None,
     ) -> Known:
-        """As that of a description; of x_e alone u_e is found. Raises `PlantDefinitionError` too: no rest."""
+        """Do the same as `Description.changed`; u_e is found for x_e. Raises `PlantDefinitionError` without a rest."""
         there = super().changed(bounds, x_e, u_e, dead_time, input_rate_max, rows)
         if x_e is None and u_e is None:
             return there
@@ -84,19 +84,19 @@ class Known(Description):
         return there if u_e is not None else rest
 
     def to_builtins(self) -> dict[str, Any]:
-        """What JSON can hold, and `from_builtins` makes the same plant of, bit for bit; infinities are words."""
+        """Return JSON-compatible data from which `from_builtins` restores the plant exactly; infinities are text."""
         return written({one.name: getattr(self, one.name) for one in fields(self)})
 
     @classmethod
     def from_builtins(cls, data: object) -> Known:
-        """Raises `PlantDefinitionError`: it is something else, or a plant that cannot be used."""
+        """Restore a plant. Raises `PlantDefinitionError` for other data or an unusable plant."""
         known = cls(**read(data))
         refuse(known.name, all_faults(known))
         return known
 
     @property
     def slope_x(self) -> np.ndarray:
-        """Of what moves it in x, (d, d): A of dx/dt, A - I of x+ - x."""
+        """Derivative of the motion in x, (d, d): A for dx/dt, A - I for x+ - x."""
         return self.A if self.period is None else self.A - np.eye(self.d)
 
     @classmethod
@@ -130,26 +130,27 @@ class Known(Description):
         dead_time: float = 0.0,
         rows: Mapping[str, Row] | None = None,
     ) -> Known:
-        """A plant of which a pair of matrices is known.
+        """Return a plant given by a pair of matrices.
 
         Args:
             A, B: (d, d) and (d, m): dx/dt = A x + B u in deviations from (x_e, u_e); with a period, x+ = A x + B u.
-            period: T in seconds of a model in discrete time, which is then used at 1 / T only; None: continuous time.
-            W: half-widths of what they do not know, per second, (d,). It has no default.
-            offset: dx/dt, or x+ - x, at (x_e, u_e), (d,): a known bias. (x_e, u_e) then moves to the nearest rest.
-            name: of the plant.
+            period: T in seconds of a discrete-time model, which can be used at the rate 1 / T only; None for continuous
+                time.
+            W: half-widths of the model error, per second, (d,). It has no default.
+            offset: dx/dt, or x+ - x, at (x_e, u_e), (d,): a known bias. (x_e, u_e) is then moved to the nearest rest.
+            name: name of the plant.
             states, inputs: their names; x1, x2, .. and u1, u2, .. by default.
-            units: by name; '1' by default, and 's' for time.
-            x_e, u_e: zeros by default.
-            x_min, x_max, u_min, u_max: no bounds by default; then `scale` says what counts as 1.
-            x0: where a simulation begins; x_e by default.
-            safe_input: u_e by default.
+            units: units by name; '1' by default, and 's' for time.
+            x_e, u_e: the equilibrium; zeros by default.
+            x_min, x_max, u_min, u_max: the bounds; none by default. `scale` is then required.
+            x0: initial state of a simulation; x_e by default.
+            safe_input: the safe input; u_e by default.
             performance: all states by default.
             kernel: all states and inputs by default.
-            safe_gain, poles, scale, names, dead_time, u_rate_max, rows: as the fields of these names.
+            safe_gain, poles, scale, names, dead_time, u_rate_max, rows: see the fields of these names.
 
         Raises:
-            PlantDefinitionError: it cannot be used; the text names every fault.
+            PlantDefinitionError: the plant cannot be used. The text names every fault.
         """
         A, B = as_array(A), as_array(B)
         refuse(name, pair_faults(A, B))
@@ -196,19 +197,19 @@ class Known(Description):
 
 
 def all_faults(known: Known) -> tuple[str, ...]:
-    """Every fault, one sentence each; empty where the plant can be used."""
-    # Lengths and indices mean nothing without states and inputs.
+    """Return every fault as a sentence; empty if the plant can be used."""
+    # Without valid names of states and inputs, lengths and indices have no meaning.
     return name_faults(known) or (*known_faults(known), *choice_faults(known))
 
 
 def known_faults(known: Known) -> tuple[str, ...]:
-    """What is wrong with the numbers of which a model is made; names are right."""
+    """Return the faults in the numbers of the model. Names are valid here."""
     found = form_faults(known) or [*bound_faults(known), *pole_faults(known)]
     return tuple(found or mode_faults(known.A, known.B, known.period, known))
 
 
 def form_faults(known: Known) -> list[str]:
-    """What is wrong with shapes, and with numbers that are none."""
+    """Return the faults in shapes and in values that are not numbers."""
     matrices = matrix_faults(known.A, known.B, known.period, known.states, known.inputs)
     return [*number_faults(known), *matrices]
 
@@ -223,7 +224,7 @@ def _offset(known: Known, offset: Any) -> np.ndarray:
 
 
 def _at_rest(known: Known, x_e: np.ndarray, u_e: np.ndarray, drift: np.ndarray) -> Known:
-    """The model about the rest nearest to (x_e, u_e), at which it drifts."""
+    """Return the model at the rest nearest to (x_e, u_e), at which it has the given drift."""
     rounding = ROUNDING * (np.abs(known.slope_x) @ known.x_scale + np.abs(known.B) @ known.u_scale)
     if (np.abs(drift) > rounding).any():
         moved = nearest_rest(known.slope_x, known.B, drift, known.x_scale, known.u_scale, known.performance)

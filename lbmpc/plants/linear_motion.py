@@ -1,9 +1,9 @@
-"""How a linear model moves within a period: x(t + s) from x(t) under a constant input, in deviations.
+"""The motion of a linear model within a period: x(t + s) from x(t) under a constant input, in deviations.
 
-In continuous time dx/dt = a x + b u, and exp([[a, b], [0, 0]] s) says it. A discrete-time model x+ = A x + B u has
-such an a and b too, where [[A, B], [0, I]] has a real logarithm: that is zero-order hold backwards. It has none where A
-has an eigenvalue that is negative, or zero as a dead time has. Then nothing is known between two states of the model,
-and a straight line stands for it.
+In continuous time, dx/dt = a x + b u, it is given by exp([[a, b], [0, 0]] s). A discrete-time model x+ = A x + B u has
+such an a and b if [[A, B], [0, I]] has a real logarithm, which inverts the zero-order hold. There is none if A has a
+negative eigenvalue, or a zero one as with a dead time. The motion between two states is then unknown and is replaced
+by a straight line.
 """
 
 from __future__ import annotations
@@ -22,41 +22,41 @@ from lbmpc.plants.description import Description
 from lbmpc.plants.known import Known
 
 Pieces = tuple[tuple[float, np.ndarray], ...]
-"""Stretches of time under one input each: (seconds, u (m,))."""
+"""Intervals with one input each: (seconds, u (m,))."""
 
-# Up to two periods the argument of the series has a norm of at most 2 * SERIES_NORM = 1, so what is left out is
+# Up to two periods the argument of the series has a norm of at most 2 * SERIES_NORM = 1, so the truncation error is
 # below 1 / 19! = 8e-18.
 SERIES_NORM = 0.5
 TERMS = 19
 
 BACK = 1e-9
-"""How exactly exp(log M) must be M, as a share of its largest entry, for the logarithm to be believed."""
+"""Largest error of exp(log M) relative to the largest entry of M for an acceptable logarithm."""
 EXCURSION = 10.0
-"""How much larger M^(1/2) may be than M and the identity. A logarithm of rounding, near an eigenvalue of zero, leaves
-both by far."""
+"""Largest ratio of M^(1/2) to M and the identity. A logarithm that consists of rounding errors, near an eigenvalue of
+zero, exceeds it by far."""
 
 
 class LinearMotion(Protocol):
-    """The state, (d,), within a period, and the answer to what acted in it."""
+    """The motion within a period, and the response to several inputs."""
 
     def after(self, x: np.ndarray, u: np.ndarray, seconds: float) -> np.ndarray:
-        """The state, (d,), `seconds` after x, (d,), under the input u, (m,)."""
+        """Return the state, (d,), `seconds` after x, (d,), under the input u, (m,)."""
         ...
 
     def answer(self, pieces: Pieces) -> np.ndarray:
-        """The state, (d,), a period after the equilibrium, under the inputs of `pieces` in turn."""
+        """Return the state, (d,), one period after the equilibrium, under the inputs of `pieces` in turn."""
         ...
 
 
 class Continuous:
-    """dx/dt = a x + b u; `after` is for use in every tick.
+    """The motion dx/dt = a x + b u. `after` is fast enough for every tick.
 
-    Up to two periods by a series: `discretise` to rounding, in a tenth of the time.
+    Up to two periods it uses a series, which equals `discretise` to rounding and takes a tenth of the time.
 
     Args:
         a, b: (d, d) and (d, m).
         period: T in seconds.
-        units: of (x, u), (d + m,), as of `balanced`.
+        units: units of (x, u), (d + m,), as returned by `balanced`.
     """
 
     def __init__(self, a: np.ndarray, b: np.ndarray, period: float, units: np.ndarray):
@@ -80,10 +80,10 @@ class Continuous:
 
     @cached_property
     def _held(self) -> Bound:
-        """(x, u, share) -> the state after this share of a period.
+        """Function (x, u, share) -> the state after this share of a period.
 
-        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings), in balanced units, is a polynomial in the share;
-        squaring does the rest.
+        Each entry of exp([[a, b], [0, 0]] seconds / 2^squarings), in balanced units, is a polynomial in the share.
+        Repeated squaring gives the result.
         """
         d, m = self.b.shape
         units = self.units
@@ -107,9 +107,9 @@ class Continuous:
 
 
 class StraightLine:
-    """From one state of x+ = A x + B u to the next in a straight line, where no more is known.
+    """A straight line from one state of x+ = A x + B u to the next, for a model without a usable logarithm.
 
-    Of several inputs within a period their mean counts.
+    If several inputs act within a period, their mean is used.
     """
 
     def __init__(self, A: np.ndarray, B: np.ndarray, period: float):
@@ -126,7 +126,7 @@ class StraightLine:
 
 
 def within_period(known: Known, period: float) -> LinearMotion:
-    """How this model moves; `period` in seconds, its own where it is one in discrete time."""
+    """Return the motion of this model; `period` is in seconds, and equals the model's own in discrete time."""
     units = balanced(known)
     if known.period is None:
         return Continuous(known.A, known.B, period, units)
@@ -138,13 +138,13 @@ def within_period(known: Known, period: float) -> LinearMotion:
 
 
 def _logarithm(A: np.ndarray, B: np.ndarray, units: np.ndarray) -> np.ndarray | None:
-    """[[a, b], [0, 0]] T, real, of which [[A, B], [0, I]] is the exponential; None where there is none to believe."""
+    """Return the real [[a, b], [0, 0]] T whose exponential is [[A, B], [0, I]]; None if there is no accurate one."""
     d, m = B.shape
     whole = np.vstack([np.hstack([A, B]), np.hstack([np.zeros((m, d)), np.eye(m)])]) * units / units[:, None]
     if not (np.abs(np.linalg.eigvals(A)) > np.finfo(float).tiny).all():
         return None
     with warnings.catch_warnings():
-        # Whether it is accurate is looked at below.
+        # The accuracy is checked below.
         warnings.simplefilter("ignore", RuntimeWarning)
         block = logm(whole)
     if not np.isfinite(block).all() or np.abs(block.imag).max() > BACK:
@@ -152,15 +152,16 @@ def _logarithm(A: np.ndarray, B: np.ndarray, units: np.ndarray) -> np.ndarray | 
     block = block.real
     block[d:] = 0.0
     size = np.abs(whole).max()
-    believed = np.abs(expm(block) - whole).max() <= BACK * size
+    accurate = np.abs(expm(block) - whole).max() <= BACK * size
     half = np.abs(expm(0.5 * block)).max()
-    return block * units[:, None] / units if believed and half <= EXCURSION * max(size, 1.0) else None
+    return block * units[:, None] / units if accurate and half <= EXCURSION * max(size, 1.0) else None
 
 
 def balanced(plant: Description) -> np.ndarray:
-    """Units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
+    """Return units of (x, u), (d + m,), near the half-widths, in which matrix equations are solved.
 
-    A state in pascals beside one in metres would otherwise cost digits. Powers of two: going there and back is exact.
+    Without them a state in pascals beside one in metres would cost digits. The units are powers of two, so that the
+    conversion is exact.
     """
     return np.exp2(np.rint(np.log2(np.concatenate([plant.x_scale, plant.u_scale]))))
 
@@ -168,7 +169,7 @@ def balanced(plant: Description) -> np.ndarray:
 def discretise(
     a: np.ndarray, b: np.ndarray, period: float, units: np.ndarray | float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Exact zero-order hold: exp([[a, b], [0, 0]] T), computed in these units of (x, u), (d + m,)."""
+    """Return the exact zero-order hold exp([[a, b], [0, 0]] T), computed in the given units of (x, u), (d + m,)."""
     d, m = b.shape
     units = np.broadcast_to(units, d + m)
     exponential = expm(_block(a, b) * period * units / units[:, None]) * units[:, None] / units
@@ -176,5 +177,5 @@ def discretise(
 
 
 def _block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[[a, b], [0, 0]]."""
+    """Return [[a, b], [0, 0]]."""
     return np.vstack([np.hstack([a, b]), np.zeros((b.shape[1], sum(b.shape)))])

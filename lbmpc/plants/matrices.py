@@ -1,4 +1,4 @@
-"""What is wrong with a pair of matrices, in a person's words: their shapes, their numbers, and what no input moves."""
+"""Checks of a pair of matrices with messages for a person: shapes, numbers, and modes that no input moves."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from lbmpc.plants.description import Description
 from lbmpc.plants.faults import numeric, shown
 
 UNMOVED = 1e-9
-"""Of the largest singular value of (A B), in half-widths: a mode that is moved by less is moved by nothing."""
+"""Share of the largest singular value of (A B), in half-widths, below which a mode counts as not moved by inputs."""
 MARGINAL = 1e-9
-"""Of the largest eigenvalue: how far inside of stability a mode must be to count as stable."""
+"""Share of the largest eigenvalue. A mode counts as stable if it is stable by this margin."""
 LARGEST = 1e100
-"""In half-widths: its square is still a number."""
+"""Largest number in half-widths, so that its square is finite."""
 PART = 0.1
-"""Of its largest state: what a state must have of a mode to be named."""
+"""Share of the largest component of a mode. A state with a smaller one is not named."""
 
 
 def matrix_faults(A: Any, B: Any, period: Any, states: Sequence[str], inputs: Sequence[str]) -> Iterator[str]:
-    """Shapes and numbers of dx/dt = A x + B u, or of x+ = A x + B u every `period` seconds."""
+    """Check shapes and numbers of dx/dt = A x + B u, or of x+ = A x + B u every `period` seconds."""
     rows = {len(matrix) if numeric(matrix) and matrix.ndim == 2 else len(states) for matrix in (A, B)}
     if len(rows) == 1 and rows != {len(states)}:
         named = f"{len(states)} states are named ({', '.join(states)})"
-        yield f"{named}, and A and B have {min(rows)} rows: name each state, once"
+        yield f"{named}, but A and B have {min(rows)} rows: name each state once"
         return
     for name, matrix, columns in (("A", A, states), ("B", B, inputs)):
         shape = (len(states), len(columns))
@@ -42,19 +42,19 @@ def matrix_faults(A: Any, B: Any, period: Any, states: Sequence[str], inputs: Se
                 yield f"{name} is {matrix[i, j]:g} from {columns[j]} to {states[i]}: give a finite number"
     if period is not None and not (isinstance(period, int | float) and 0.0 < period < math.inf):
         yield (
-            f"period is {period!r}: give the seconds from x to x+ = A x + B u, or None where dx/dt = A x + B u"
+            f"period is {period!r}: give the seconds from x to x+ = A x + B u, or None for dx/dt = A x + B u"
         )
 
 
 def pair_faults(A: Any, B: Any) -> tuple[str, ...]:
-    """Whether they tell how many states and inputs there are."""
+    """Check that A and B determine the numbers of states and inputs."""
     found = []
     if not (numeric(A) and A.ndim == 2 and 0 < A.shape[0] == A.shape[1]):
         found.append(f"A is {shown(A)}: give a square matrix of numbers, a row and a column for each state")
     if not (numeric(B) and B.ndim == 2 and B.size):
         found.append(
-            f"B is {shown(B)}: give a matrix of numbers, a row for each state and a column for each input; of a single "
-            "input it is [[0.0], [1.0]], say"
+            f"B is {shown(B)}: give a matrix of numbers, a row for each state and a column for each input; for one "
+            "input, for example, [[0.0], [1.0]]"
         )
     return tuple(found)
 
@@ -64,11 +64,11 @@ class Mode(NamedTuple):
 
     eigenvalue: complex
     states: tuple[int, ...]
-    """Those that w'x is made of, in half-widths."""
+    """Indices of the states in w'x, in half-widths."""
 
 
 def unmoved_modes(A: np.ndarray, B: np.ndarray, x_scale: np.ndarray, u_scale: np.ndarray) -> list[Mode]:
-    """All modes that no input moves (Hautus), of a pair of complex ones the upper."""
+    """Return all modes that no input moves (Hautus test); of a complex pair only the upper one."""
     a, b = A * x_scale / x_scale[:, None], B * u_scale / x_scale[:, None]
     size = max(np.linalg.norm(np.hstack([a, b]), 2), np.finfo(float).tiny)
     found: list[Mode] = []
@@ -86,18 +86,18 @@ def unmoved_modes(A: np.ndarray, B: np.ndarray, x_scale: np.ndarray, u_scale: np
 
 
 def mode_faults(A: np.ndarray, B: np.ndarray, period: float | None, plant: Description) -> Iterator[str]:
-    """What grows, or stays, and no input moves: no controller can hold such a plant."""
+    """Report modes that do not decay and that no input moves, because no controller can stabilise them."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         rows = 1.0 / plant.x_scale[:, None]
         sizes = np.abs([*(A * plant.x_scale * rows).ravel(), *(B * plant.u_scale * rows).ravel(), *A.ravel()])
     if not sizes.max() < LARGEST:
-        yield f"A and B have numbers beyond {LARGEST:g} in half-widths: give the states other units, or other bounds"
+        yield f"A and B have numbers above {LARGEST:g} in half-widths: use other units or bounds for the states"
         return
     largest = max(np.abs(np.linalg.eigvals(A)).max(), np.finfo(float).tiny)
     fastest = largest if period is None else 1.0 / period
     for mode in unmoved_modes(A, B, plant.x_scale, plant.u_scale):
         value = mode.eigenvalue
-        # Per second, as the logarithm of one in discrete time.
+        # Growth per second; the logarithm gives it for discrete time.
         growth = value.real if period is None else math.log(max(abs(value), 1e-300)) / period
         if growth < -MARGINAL * fastest:
             continue

@@ -4,8 +4,8 @@
     dy/dt = (z + 1 - r sqrt(y)) / beta^2          pressure rise y
     d2r/dt2 = omega_n^2 (u - r) - 2 zeta omega_n dr/dt
 
-(e:Moore-Greitzer-model) of the paper prints sqrt(z) in the pressure equation; the throttle acts on pressure, and
-only sqrt(y) makes (0.5, 1.6875, 1.1547, 0) an equilibrium.
+In the paper, (e:Moore-Greitzer-model) has sqrt(z) in the pressure equation. The throttle acts on pressure, and only
+sqrt(y) makes (0.5, 1.6875, 1.1547, 0) an equilibrium.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from lbmpc.plants.equations import Domain, Plant, Rhs
 
 ZETA, OMEGA_N = 1 / np.sqrt(2.0), 10 * np.sqrt(10.0)
 PARAMETERS = {"beta": 1.0, "z_c": 0.0, "slope": 1.5}
-"""beta, z_c, and the slope 3/2 of the compressor's characteristic."""
+"""beta, z_c, and the slope 3/2 of the compressor characteristic."""
 
 
 def equations(beta: float, z_c: float, slope: float) -> Rhs:
-    """dx/dt of a compressor with these parameters."""
+    """Return dx/dt of a compressor with these parameters."""
 
     def rhs(x: Any, u: Any) -> list[Any]:
         z, y, r, rdot = x[0], x[1], x[2], x[3]
@@ -37,7 +37,7 @@ def equations(beta: float, z_c: float, slope: float) -> Rhs:
     return rhs
 
 
-# The exact equilibrium throttle at z = 0.5, y = 1.6875; 1.1547 to the paper's four digits.
+# The exact equilibrium throttle at z = 0.5, y = 1.6875. The paper has 1.1547, rounded to four digits.
 R_E = 1.5 / np.sqrt(1.6875)
 
 # Aswani et al. (2013) place the poles of A + BK at T = 0.01 s; these are their continuous-time counterparts.
@@ -58,11 +58,11 @@ MOORE_GREITZER = Plant(
     x_max=np.array([1.0, 2.1875, 2.1547, 20.0]),
     u_min=np.array([0.1547]),
     u_max=np.array([2.1547]),
-    # At T = 0.05 s: (0.003, 0.0005, 1e-5, 1.1e-4), the largest margin from which all controllers survive x0.
+    # At T = 0.05 s: (0.003, 0.0005, 1e-5, 1.1e-4), the largest margin with which all controllers keep X from x0.
     W=np.array([0.06, 0.01, 2e-4, 2.2e-3]),
     x0=np.array([0.15, 1.2875, 1.1547, 0.0]),
     safe_input=np.array([R_E]),
-    # x_e is unstable under a constant throttle. Flow and pressure alone; stable from 10 to 1000 Hz.
+    # x_e is unstable under a constant throttle. The gain uses flow and pressure only; it is stable from 10 to 1000 Hz.
     safe_gain=np.array([[-2.8, 1.9, 0.0, 0.0]]),
     performance=(0, 1),
     kernel=("z", "y", "u"),

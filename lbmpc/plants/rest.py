@@ -1,10 +1,10 @@
-"""Where a linear model rests that does not rest at (x_e, u_e): the nearest such point.
+"""The rest nearest to (x_e, u_e), for a linear model that does not rest there.
 
     a dx + b du + drift = 0
 
-A stabilisable model has a solution for every drift: (a b) has full row rank. Of all solutions the performance states
-move least, then the other states, then the inputs, each in half-widths: x_e says where the plant is wanted, and an
-actuator's state, or an angle that leans into the wind, holds it there.
+A stabilisable model has a solution for every drift, because (a b) has full row rank. Among all solutions the
+performance states move least, then the other states, then the inputs, each in half-widths. x_e is the desired state,
+and other states, such as an actuator's or a tilt into the wind, balance the drift.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 
 HELD = 1e-9
-"""Of the drift, in half-widths a second, what may be left for rounding."""
+"""Residual drift that counts as rounding, relative to the drift, in half-widths per second."""
 RANK = 1e-10
-"""Of the largest singular value: below, nothing is moved."""
+"""Share of the largest singular value that counts as zero."""
 
 
 def nearest_rest(
@@ -27,16 +27,16 @@ def nearest_rest(
     u_scale: np.ndarray,
     performance: Sequence[int],
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """(dx, du), (d,) and (m,), from the point at which the model drifts.
+    """Return the displacement (dx, du), (d,) and (m,), from the point with the given drift.
 
     Args:
-        a, b: slopes of the drift in x and u, (d, d) and (d, m); of a model in discrete time A - I and B.
+        a, b: derivatives of the drift in x and u, (d, d) and (d, m); A - I and B for a discrete-time model.
         drift: dx/dt, or x+ - x, (d,).
         x_scale, u_scale: half-widths, (d,) and (m,).
-        performance: the states that move least.
+        performance: indices of the states that move least.
 
     Returns:
-        None where no input and no state balances it.
+        The displacement; None if no input and no state balances the drift.
     """
     d, scale = len(drift), np.concatenate([x_scale, u_scale])
     slopes, start = np.hstack([a, b]) * scale / x_scale[:, None], drift / x_scale
@@ -44,7 +44,7 @@ def nearest_rest(
     groups = [np.asarray(performance, dtype=int), others, np.arange(d, len(scale))]
     moved, left = np.zeros(len(scale)), start
     for k, group in enumerate(groups):
-        # What those behind cannot balance, these must.
+        # This group must balance the part that the later groups cannot balance.
         rest = _out_of_reach(slopes[:, np.concatenate([others[:0], *groups[k + 1 :]])])
         moved[group] = -np.linalg.pinv(rest @ slopes[:, group], rcond=RANK) @ (rest @ left)
         left = left + slopes[:, group] @ moved[group]
@@ -55,7 +55,7 @@ def nearest_rest(
 
 
 def _out_of_reach(columns: np.ndarray) -> np.ndarray:
-    """Rows, (k, d), of all directions that these columns, (d, n), do not reach."""
+    """Return rows, (k, d), that span all directions outside the range of these columns, (d, n)."""
     if not columns.size:
         return np.eye(len(columns))
     left, values, _ = np.linalg.svd(columns)

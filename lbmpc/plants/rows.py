@@ -1,4 +1,4 @@
-"""Constraints beside the boxes: named rows, min <= sum of coefficients times values <= max, in plant units."""
+"""Constraints in addition to the boxes: named rows, min <= sum of coefficients times values <= max, in plant units."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 Row = Mapping[str, float]
-"""Coefficients by the name of states, or of inputs; "min", "max" or both; of states "priority", 0 where it is not said.
-The boxes have priority 0. Of what contradicts each other the higher number gives way first."""
+"""A row: coefficients by the names of states or of inputs; "min", "max" or both; for states also "priority" (default
+0). The boxes have priority 0. If constraints conflict, the one with the higher number is violated first."""
 PRIORITY = "priority"
 WORDS = ("min", "max", PRIORITY)
-"""What is no coefficient in a row."""
+"""Keys of a row that are not coefficients."""
 HAIR = 1e-12
-"""Share of the way to a row that rounding may need."""
+"""Share of the distance to a row that is reserved for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearRows:
-    """{y : lower <= F y <= upper}; F (rows, n), bounds (rows,), infinite where there is none."""
+    """The set {y : lower <= F y <= upper}; F (rows, n), bounds (rows,), infinite if there is none."""
 
     names: tuple[str, ...]
     F: np.ndarray
@@ -27,10 +27,10 @@ class LinearRows:
     upper: np.ndarray
     priorities: tuple[int, ...]
     ranges: np.ndarray
-    """|F| times the half-widths, (rows,): what counts as 1 in each row."""
+    """|F| times the half-widths, (rows,): the unit of each row."""
 
     def about(self, y: np.ndarray) -> LinearRows:
-        """The same rows of deviations from y, (n,)."""
+        """Return the same rows for deviations from y, (n,)."""
         if not self.names:
             return self
         there = self.F @ y
@@ -38,12 +38,12 @@ class LinearRows:
         return LinearRows(self.names, self.F, lower, upper, self.priorities, self.ranges)
 
     def beyond(self, y: np.ndarray) -> np.ndarray:
-        """How far each row is beyond its bounds, as a share of its range, negative inside: (..., n) -> (..., rows)."""
+        """Return the violation of each row as a share of its range, negative inside: (..., n) -> (..., rows)."""
         values = y @ self.F.T
         return np.asarray(np.maximum(self.lower - values, values - self.upper) / self.ranges)
 
     def pulled(self, y: np.ndarray, centre: np.ndarray | float) -> np.ndarray:
-        """y, (..., n), drawn straight to a point inside, (n,), by the least that keeps all rows; y where it does."""
+        """Move y, (..., n), towards an interior point, (n,), just far enough to satisfy all rows."""
         if not self.names:
             return y
         at, there = self.F @ (centre + np.zeros(self.F.shape[1])), y @ self.F.T
@@ -55,7 +55,7 @@ class LinearRows:
 
 
 def rows_of(rows: Mapping[str, Row], names: Sequence[str], scale: np.ndarray) -> LinearRows:
-    """Those of `rows`, which are sound, whose coefficients are of `names`; scale (n,): what counts as 1 in each."""
+    """Return the valid `rows` with coefficients of `names`; scale (n,) is the unit of each variable."""
     own = {key: row for key, row in rows.items() if any(name in names for name in coefficients(row))}
     F = np.array([[row.get(name, 0.0) for name in names] for row in own.values()], dtype=float)
     F = F.reshape(len(own), len(names))
@@ -70,21 +70,20 @@ def rows_of(rows: Mapping[str, Row], names: Sequence[str], scale: np.ndarray) ->
 
 
 def no_rows(n: int) -> LinearRows:
-    """Of n variables, whose half-widths need not be known."""
+    """Return an empty set of rows for n variables; their half-widths need not be known."""
     none = np.zeros(0)
     return LinearRows((), np.zeros((0, n)), none, none, (), none)
 
 
 def coefficients(row: Row) -> dict[str, float]:
-    """By the name of a state or input."""
+    """Return the coefficients by the name of a state or input."""
     return {name: value for name, value in row.items() if name not in WORDS}
 
 
 def together(u: np.ndarray, before: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """As far from `before` on the straight way to u, (m,), as low and high let.
+    """Return the point on the line from `before` to u, (m,), that is as far as `low` and `high` allow.
 
-    All inputs move by the same share: what lies between two inputs of a convex U is in U. Input by input, each as far
-    as it may, it need not be.
+    All inputs move by the same share, so the result stays in a convex U. Clipping input by input could leave U.
     """
     way = u - before
     with np.errstate(all="ignore"):

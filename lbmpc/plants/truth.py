@@ -1,4 +1,4 @@
-"""The true motion of a plant: what `TrueMotion` is, and the one of equations."""
+"""The true motion of a plant: the interface `TrueMotion` and its implementations."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ INTEGRATION_TOLERANCE = 1e-12
 
 
 class TrueMotion(Protocol):
-    """What the plant really does. The same numbers in, the same numbers out: nothing is kept between calls."""
+    """The real motion of a plant. It is deterministic and keeps nothing between calls."""
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """x(t + dt) from x(t) = x, (d,), under the constant input u, (m,); plant units, dt in seconds.
+        """Return x(t + dt) from x(t) = x, (d,), under the constant input u, (m,); plant units, dt in seconds.
 
         Raises:
-            PlantError: the motion cannot be followed.
+            PlantError: the motion cannot be computed.
         """
         ...
 
 
 def true_motion(plant: Known | Plant | TrueMotion) -> TrueMotion:
-    """How this plant moves where nothing else is said to be true; of somebody's own motion that."""
+    """Return the motion of this plant if no other truth is configured. A user's motion is returned checked."""
     if isinstance(plant, Known):
         return LinearTruth(plant)
     return Truth(plant) if isinstance(plant, Plant) else Own(plant)
 
 
 class LinearTruth:
-    """The true motion of numbers: the linear model is the truth, and h is zero."""
+    """The true motion of a plant given by numbers: the linear model is exact and h is zero."""
 
     def __init__(self, known: Known):
         self._known = known
         units = balanced(known)
         self._within = None if known.period is None else within_period(known, known.period)
-        # Few lengths of time come back again and again.
+        # Only few lengths of time occur.
         self._over = lru_cache(maxsize=64)(lambda dt: discretise(known.A, known.B, dt, units))
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """As `TrueMotion` says. Raises `PlantError`: the numbers are not finite."""
+        """Step as `TrueMotion` does. Raises `PlantError` if the numbers are not finite."""
         known = self._known
         dx, du = x - known.x_e, u - known.u_e
         if self._within is None:
@@ -63,27 +63,27 @@ class LinearTruth:
         return np.asarray(known.x_e + after)
 
     def _require_motion(self, dt: float) -> None:
-        """A straight line does for a prediction. As a truth, two halves of it would not make a period."""
+        """Raise `PlantError` if dt is no whole period of a straight line: two half steps would not equal one step."""
         within = self._within
         if not isinstance(within, StraightLine):
             return
         if not isclose(remainder(dt, within.period), 0.0, abs_tol=1e-6 * dt):
             raise PlantError(
-                f"{self._known.name}: its A and B are in discrete time and have no motion between two samples, so that "
-                "they cannot simulate an input that changes there, as any does that comes with a delay. Name something "
-                "that moves: plant.truth"
+                f"{self._known.name}: its A and B are in discrete time and give no motion between two samples. They "
+                "cannot simulate an input that changes between samples, as it does with any delay. Set plant.truth to "
+                "a plant with a motion in continuous time"
             )
 
 
 class Own:
-    """Somebody's own motion: what it raises, or returns that is no state, ends the run with the cause."""
+    """A user's motion. An exception from it, or a wrong result, ends the run with the cause."""
 
     def __init__(self, motion: TrueMotion):
         self._motion = motion
         self._name = type(motion).__name__
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """As `TrueMotion.step`."""
+        """Step as `TrueMotion.step` does."""
         if dt <= 0.0:
             return np.array(x, dtype=float)
         try:
@@ -92,7 +92,7 @@ class Own:
             raise PlantError(f"{self._name}.step: {type(error).__name__}: {error}") from error
         if after.shape != np.shape(x):
             raise PlantError(
-                f"{self._name}.step: it returned {after.shape} numbers, the state has {np.shape(x)}"
+                f"{self._name}.step: it returned an array of shape {after.shape}, but the state has {np.shape(x)}"
             )
         if not isfinite(sum(after.tolist())):
             raise PlantError(f"{self._name}.step: the state is not finite: {after.tolist()}")
@@ -100,10 +100,10 @@ class Own:
 
 
 class Truth:
-    """The true motion of equations, integrated to a local error below 1e-9 half-widths over a sampling period.
+    """The true motion of a plant given by equations.
 
-    DOP853 (order 8, scipy) at rtol = 1e-12 and atol = 1e-12 half-widths. Deterministic: the same numbers in, the same
-    numbers out.
+    The local error is below 1e-9 half-widths over a sampling period. The method is DOP853 (order 8, scipy) with rtol =
+    1e-12 and atol = 1e-12 half-widths. It is deterministic.
     """
 
     def __init__(self, plant: Plant):
@@ -112,7 +112,7 @@ class Truth:
         self._whole = Bound(_whole_step(plant))
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """x(t + dt) from x(t) = x, (d,), under the constant input u, (m,).
+        """Return x(t + dt) from x(t) = x, (d,), under the constant input u, (m,).
 
         Raises:
             PlantError: a state that must stay positive does not, or the numbers are not finite.
@@ -127,14 +127,14 @@ class Truth:
         return after
 
     def _in_one(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray | None:
-        """One step of DOP853 over all of dt, where its own error estimate allows that; else None.
+        """Take one step of DOP853 over dt; None if its error estimate is too large.
 
-        At short periods it always does, and then this takes a twentieth of the time.
+        At short periods one step is always enough, and takes a twentieth of the time of scipy's loop.
         """
         whole = self._whole
         whole.inputs["x"][:, 0], whole.inputs["u"][:, 0], whole.inputs["dt"][0, 0] = x, u, dt
         whole()
-        # A stage outside the domain makes this NaN, which no comparison accepts.
+        # A stage outside the domain gives NaN, for which every comparison is false.
         return whole.outputs["after"][:, 0].copy() if whole.outputs["error"][0, 0] < 1.0 else None
 
     def _in_many(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
@@ -159,7 +159,7 @@ class Truth:
         inside = self._f.inputs["x"][:, 0]
         inside[:] = x
         for domain in self.plant.positive:
-            # A trial stage may leave the domain where the true motion does not; what is accepted is checked.
+            # A trial stage may leave the domain even if the true motion does not. The accepted result is checked.
             inside[domain.state] = max(
                 inside[domain.state], INTEGRATION_TOLERANCE * self.plant.x_scale[domain.state]
             )
@@ -177,29 +177,29 @@ class Truth:
             if not value > 0.0:
                 raise PlantError(
                     f"{self.plant.name}: {domain.name} is {value:.6g} {domain.unit}; its equations hold for positive "
-                    f"values only. The plant has left every state from which it can be controlled."
+                    f"values only. The plant cannot be controlled from this state."
                 )
-        # Numbers that are all finite have a finite sum.
+        # The sum of finite numbers is finite.
         if not isfinite(sum(values)):
             raise PlantError(f"{self.plant.name}: the state is not finite: {values}")
 
 
 def _method() -> Any:
-    """DOP853. Imported where it is used: that takes half a second, and a controller that died integrates nothing."""
+    """Return DOP853. The import takes half a second, which a restarted controller does not need."""
     from scipy.integrate import DOP853
 
     return DOP853
 
 
 class Stepped(NamedTuple):
-    """One step of DOP853: x(dt) and the slopes at its stages."""
+    """One step of DOP853: x(dt) and the derivatives at its stages."""
 
     after: ca.SX
     slopes: list[ca.SX]
 
 
 def dop853(f: Callable[[ca.SX, ca.SX], ca.SX], x: ca.SX, u: ca.SX, dt: ca.SX | float) -> Stepped:
-    """A single step of DOP853 along dx/dt = f(x, u), as one expression."""
+    """Return a single step of DOP853 along dx/dt = f(x, u) as one expression."""
     method, slopes = _method(), [f(x, u)]
     for weights in method.A[1 : method.n_stages]:
         slopes.append(f(x + dt * _weighted(weights, slopes), u))
@@ -207,9 +207,9 @@ def dop853(f: Callable[[ca.SX, ca.SX], ca.SX], x: ca.SX, u: ca.SX, dt: ca.SX | f
 
 
 def _whole_step(plant: Plant) -> ca.Function:
-    """(x, u, dt) -> (x(dt) by a single step of DOP853, its error in units of what is tolerated).
+    """Build (x, u, dt) -> (x(dt) by a single step of DOP853, its error in units of the tolerance).
 
-    The same stages and the same estimate as scipy's, as one expression instead of hundreds of small numpy calls.
+    Stages and error estimate equal scipy's, in one expression instead of hundreds of small numpy calls.
     """
     f, method = plant.function(), _method()
     x, u, dt = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m), ca.SX.sym("dt")
@@ -218,7 +218,7 @@ def _whole_step(plant: Plant) -> ca.Function:
     scale = INTEGRATION_TOLERANCE * (plant.x_scale + ca.fmax(ca.fabs(x), ca.fabs(after)))
     fifth, third = (ca.sumsqr(_weighted(weights, slopes) / scale) for weights in (method.E5, method.E3))
     bound = plant.d * (fifth + 0.01 * third)
-    # Both estimates are exactly zero where nothing moves.
+    # Both estimates are exactly zero if nothing moves.
     error = ca.if_else(bound > 0, dt * fifth / ca.sqrt(bound), bound)
     return ca.Function("whole_step", [x, u, dt], [after, error], ["x", "u", "dt"], ["after", "error"])
 

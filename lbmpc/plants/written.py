@@ -1,4 +1,4 @@
-"""The known part of a plant as it is written in JSON: plain numbers and words, which come back bit for bit."""
+"""The JSON form of the known part of a plant: plain numbers and text that are read back exactly."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from lbmpc.plants.description import PlantDefinitionError
 
 Number = float | Literal["inf", "-inf"]
-"""JSON has no infinity."""
+"""A number, or text for infinity, which JSON does not have."""
 
 
 class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """Field by field as in `Known`; complex numbers are pairs of their real and imaginary parts."""
+    """The fields of `Known`; complex numbers are pairs of real and imaginary part."""
 
     name: str
     states: list[str]
@@ -41,7 +41,7 @@ class Written(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     kernel: list[str]
     poles: list[float | tuple[float, float]] | None
     dead_time: float = 0.0
-    """Left out where there is none, as in what was written before there was such a field; so are the next."""
+    """Omitted if zero, as in data from before this field existed; so are the next fields."""
     u_rate_max: list[Number] | None = None
     rows: dict[str, dict[str, float]] = {}
 
@@ -50,20 +50,20 @@ FIELDS = Written.__struct_fields__
 
 
 def written(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a `Known`, by name, in what JSON has; the same whether a number was written 1 or 1.0.
+    """Return the fields of a `Known` as JSON-compatible data; 1 and 1.0 give the same result.
 
     Raises:
-        PlantDefinitionError: a field has what JSON, or `read`, would not take.
+        PlantDefinitionError: a field has a value that JSON or `read` does not accept.
     """
     given = {name: _plain(fields[name]) for name in FIELDS}
     if given["dead_time"] == 0.0:
-        # Only the default itself is left out, not what equals it.
+        # Only a value equal to the default is omitted.
         del given["dead_time"]
     return msgspec.to_builtins(_typed(given))
 
 
 def read(data: object) -> dict[str, Any]:
-    """The fields of a `Known` from what JSON gave. Raises `PlantDefinitionError`: it is something else."""
+    """Return the fields of a `Known` from JSON data. Raises `PlantDefinitionError` for other data."""
     found = _typed(data)
     fields = msgspec.structs.asdict(found)
     for name in ("x_min", "x_max", "u_min", "u_max", "u_rate_max"):

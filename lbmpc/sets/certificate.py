@@ -1,12 +1,12 @@
-"""What is claimed of a family of sets, as data: written by the construction, read by the checker and the controller.
+"""Certificates: the claim about a family of sets as data. The construction writes it; checker and controller read it.
 
-The claim: every piece lies in X; in every piece, for every state x there is an input u, allowed there, such that for
-every w in the piece's W
+The claim: every piece lies in X. In every piece, for every state x there is an allowed input u such that for every w in
+the piece's W
 
-    (A + slope_x) x + (B + slope_u) u + w   lies in the piece's target,
+    (A + slope_x) x + (B + slope_u) u + w   lies in the piece's target.
 
-and in every piece, for every u allowed there, h(x, u) - slope_x x - slope_u u lies in its W. So from every piece the
-true plant can be kept in the family, hence in X, for ever.
+In every piece and for every allowed u, h(x, u) - slope_x x - slope_u u lies in its W. The true plant can therefore be
+kept in the family, and so in X, for all time.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from lbmpc.sets.geometry.polytope import SetError
 Kind = Literal["box", "hull", "regions", "given", "extension"]
 FORMAT = 1
 ROUNDING = 1e-12
-"""Another processor may compute A and B with another last digit; every certified margin is far above it."""
+"""Relative tolerance for A and B, whose last digit depends on the processor. Certified margins are far larger."""
 
 
 LARGEST = 1e60
-"""Of any number in a certificate: a product of five of them is finite."""
+"""Largest number in a certificate, such that a product of five is finite."""
 
 
 class CertificateError(SetError):
-    """A certificate cannot be used here; the text says what differs."""
+    """A certificate cannot be used here. The text says why."""
 
 
 class Piece(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One set of the family, with what is known of h inside it. Deviation coordinates throughout."""
+    """One set of the family and the bound of h inside it, in deviation coordinates."""
 
     name: str
     G: list[list[float]]
     g: list[float]
     """{x : G x <= g}; (r, d) and (r,)."""
     target: int
-    """Which piece the next state is to be in."""
+    """Index of the piece that contains the next state."""
     slope_x: list[list[float]]
     """(d, d)"""
     slope_u: list[list[float]]
@@ -53,11 +53,11 @@ class Piece(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     x_upper: list[float]
     u_lower: list[float]
     u_upper: list[float]
-    """Where W holds: a box of states around the piece, (d,), and the inputs allowed in it, (m,)."""
+    """Validity of W: a box of states around the piece, (d,), and the allowed inputs, (m,)."""
 
 
 class ModelOf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The model that the claim is about."""
+    """The model that the claim refers to."""
 
     plant: str
     period: float
@@ -66,28 +66,28 @@ class ModelOf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     x_e: list[float]
     u_e: list[float]
     X: tuple[list[float], list[float]]
-    """Lower and upper bounds in deviation coordinates, (d,) each."""
+    """Lower and upper bounds in deviations, (d,) each."""
     U: tuple[list[float], list[float]]
 
 
 class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A family of sets and its claim. The first piece is the one that all others lead to."""
+    """A family of sets and its claim. All other pieces lead to the first one."""
 
     format: int
     kind: Kind
     certified: bool
-    """False: an approximation that claims nothing, kept for comparison."""
+    """False for an approximation without a claim, for comparison."""
     model: ModelOf
     pieces: list[Piece]
     source_of_W: Literal["interval arithmetic", "given"]
     slack: float
-    """eps of the construction, as a share of X's half-widths."""
+    """eps of the construction, as a share of the half-widths of X."""
     steps: int
-    """Of the predecessor iteration."""
+    """Steps of the predecessor iteration."""
 
     @property
     def sha256(self) -> str:
-        """Of everything in it."""
+        """SHA-256 of all fields."""
         return hashlib.sha256(encode(self)).hexdigest()
 
 
@@ -106,7 +106,7 @@ def model_of(model: Model) -> ModelOf:
 
 
 def hashes(model: ModelOf) -> dict[str, str]:
-    """sha256 of each part of a model, by name."""
+    """Return the SHA-256 of each part of a model, by name."""
     return {
         name: hashlib.sha256(msgspec.msgpack.encode(getattr(model, name))).hexdigest()
         for name in model.__struct_fields__
@@ -114,7 +114,7 @@ def hashes(model: ModelOf) -> dict[str, str]:
 
 
 def require_match(certificate: Certificate, model: Model) -> None:
-    """Raise `CertificateError`, naming what differs, unless the certificate is about this model, to rounding."""
+    """Raise `CertificateError` with the differences unless the certificate is for this model, up to rounding."""
     here, there = model_of(model), certificate.model
     mine, its = hashes(here), hashes(there)
     different = [
@@ -127,7 +127,7 @@ def require_match(certificate: Certificate, model: Model) -> None:
             f"{name}: sha256 {its[name][:12]} there, {mine[name][:12]} here" for name in different
         )
         raise CertificateError(
-            f"the certificate is about another model ({parts}). Compute the sets again with this configuration: "
+            f"the certificate is for another model ({parts}). Compute the sets again with this configuration: "
             "tandem sets compute"
         )
 
@@ -140,12 +140,12 @@ def _rounding(mine: object, its: object) -> bool:
 
 
 def encode(certificate: Certificate) -> bytes:
-    """JSON; numbers come back bit for bit."""
+    """Return JSON from which numbers are read back exactly."""
     return msgspec.json.encode(certificate)
 
 
 def decode(data: bytes) -> Certificate:
-    """Raises `CertificateError`: not a certificate, or inconsistent in its shapes."""
+    """Raise `CertificateError` for data that is no certificate or has inconsistent shapes."""
     try:
         certificate = msgspec.json.decode(data, type=Certificate)
     except msgspec.DecodeError as error:
@@ -163,7 +163,7 @@ def _require_shapes(certificate: Certificate) -> None:
     for name, shape in wanted.items():
         _require(getattr(said, name), f"the model's {name}", shape)
     if not certificate.pieces:
-        raise CertificateError("the certificate holds no set")
+        raise CertificateError("the certificate contains no set")
     for piece in certificate.pieces:
         rows = len(piece.g)
         wanted = {
@@ -180,13 +180,13 @@ def _require_shapes(certificate: Certificate) -> None:
         for name, shape in wanted.items():
             _require(getattr(piece, name), f"piece {piece.name!r}: {name}", shape)
         if not (rows and len(piece.W) and 0 <= piece.target < len(certificate.pieces)):
-            raise CertificateError(f"piece {piece.name!r}: no rows, no W, or a target that is not there")
+            raise CertificateError(f"piece {piece.name!r}: no rows, no W, or a target that does not exist")
         if not (np.abs(np.array(piece.G)).max(axis=1) >= 1 / LARGEST).all():
             raise CertificateError(f"piece {piece.name!r}: a row of G has no direction")
         lower, upper = np.array(piece.u_lower), np.array(piece.u_upper)
         if not ((said.U[0] <= lower) & (lower <= upper) & (upper <= said.U[1])).all():
             raise CertificateError(
-                f"piece {piece.name!r}: the inputs allowed are not in order, or outside of U"
+                f"piece {piece.name!r}: the bounds of the allowed inputs are not in order, or outside U"
             )
 
 
@@ -198,4 +198,4 @@ def _require(value: object, what: str, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise CertificateError(f"{what} has shape {array.shape}, not {shape}")
     if not (np.abs(array) <= LARGEST).all():
-        raise CertificateError(f"{what}: not finite, or beyond {LARGEST:g}")
+        raise CertificateError(f"{what}: not finite, or above {LARGEST:g}")

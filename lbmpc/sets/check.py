@@ -1,21 +1,20 @@
-"""Verifies the claim of a certificate, in floating point with every rounding error bounded, from the claim alone.
+"""Verifies the claim of a certificate from the claim alone, in floating point with bounds on every rounding error.
 
-It shares nothing with the construction but the libraries. Why it may be believed, for a piece {x : G x <= g}:
+The check shares only libraries with the construction. Its argument for a piece {x : G x <= g}:
 
-1. The piece is widened a little, each row by its own random amount, so that no vertex is degenerate. What holds for
+1. The piece is widened slightly, each row by a random amount of its own, so that no vertex is degenerate. A property of
    the wider set holds for the piece.
-2. Qhull proposes the vertices, as bases: d rows that meet. Each is confirmed: it is proposed once, the rows are
-   independent, their point is enclosed in a ball of known radius, and it is strictly inside all other rows.
-3. No vertex is missing: every edge, that is every d - 1 rows of a basis, is found in exactly two bases, which are not
-   one basis said twice. The graph of a
-   polyhedron's vertices is connected (Balinski 1961), so a list closed under its edges is complete, and no edge is a
-   ray, so the set is bounded, and the hull of its vertices.
-4. Each row touches the set, so that the set is the one that was written down.
-5. For each vertex an input is found for which all rows of the target hold for every w; the rows are linear, so the
-   inputs in between serve the states in between.
+2. Qhull proposes the vertices as bases, d rows that intersect. Each basis is confirmed: it is proposed once, its rows
+   are independent, their intersection lies in a ball of known radius, and it is strictly inside all other rows.
+3. No vertex is missing: every edge, i.e. every d - 1 rows of a basis, occurs in exactly two different bases. The graph
+   of a polyhedron's vertices is connected (Balinski 1961), so a list closed under its edges is complete. No edge is a
+   ray, so the set is bounded and is the hull of its vertices.
+4. Each row touches the set, so the set is the one that was written.
+5. For each vertex an input is found for which all rows of the target hold for every w. The rows are linear, so convex
+   combinations of these inputs serve all other states.
 
-Rounding: |fl(a'b) - a'b| <= gamma_n |a|'|b|, gamma_n = n u / (1 - n u), u = 2^-53 (Higham 2002, (3.5)), whatever the
-order of summation; the bounds themselves are computed with room for their own rounding.
+Rounding: |fl(a'b) - a'b| <= gamma_n |a|'|b|, gamma_n = n u / (1 - n u), u = 2^-53 (Higham 2002, (3.5)), for any order
+of summation. The bounds are computed with an allowance for their own rounding.
 """
 
 from __future__ import annotations
@@ -31,30 +30,30 @@ from scipy.spatial import HalfspaceIntersection, QhullError
 from lbmpc.sets.certificate import Certificate, Piece
 
 UNIT = 2.0**-53
-# Bounds on errors are computed in floating point too: this much wider covers it, for up to 10^6 terms.
+# Error bounds are computed in floating point too. This factor covers their rounding for up to 10^6 terms.
 ROOM = 1.0 + 1e-9
 WIDEN = 1e-7
-"""By how much rows are moved outwards at random, as a share of their scaled length."""
+"""Random outward shift of the rows, as a share of their scaled length."""
 LOOSE = 3e-4
-"""How far, as a share of X's half-widths, a row may be from the set that it is said to bound."""
+"""Largest distance between a row and the set, as a share of the half-widths of X."""
 TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of checking a certificate."""
+    """The result of checking a certificate."""
 
     ok: bool
     reason: str
-    """Why not, naming the piece; empty when ok."""
+    """Reason for a failure with the name of the piece; empty if ok."""
     margin: float
-    """The smallest room left in any target row at any vertex, as a share of X's half-widths; negative when not ok."""
+    """The smallest slack of any target row at any vertex, as a share of the half-widths of X; negative on failure."""
     vertices: int
-    """Confirmed, over all pieces."""
+    """Number of confirmed vertices of all pieces."""
 
 
 class Refuted(Exception):
-    """Inside this module: a part of the claim that does not hold, or cannot be confirmed."""
+    """A part of the claim is false or cannot be confirmed. Used inside this module only."""
 
     def __init__(self, reason: str, margin: float = float("nan")):
         super().__init__(reason)
@@ -64,15 +63,17 @@ class Refuted(Exception):
 def check(
     certificate: Certificate, seed: int = 0, progress: Callable[[float], None] = lambda done: None
 ) -> Verdict:
-    """Verify the claim. The W of each piece is taken as given; everything else is not.
+    """Verify the claim. The W of each piece is assumed; everything else is verified.
 
     Args:
-        certificate: what `lbmpc.sets.certificate.decode` gave.
-        seed: of the random widening.
-        progress: called with the share that is done.
+        certificate: a certificate as returned by `lbmpc.sets.certificate.decode`.
+        seed: seed of the random widening.
+        progress: called with the share of the work that is done.
     """
     if not certificate.certified:
-        return Verdict(False, f"it is a {certificate.kind} and claims nothing", float("nan"), 0)
+        return Verdict(
+            False, f"it is of the kind {certificate.kind}, which is not certified", float("nan"), 0
+        )
     random = np.random.default_rng(seed)
     margin, count = np.inf, 0
     for index, piece in enumerate(certificate.pieces):
@@ -87,11 +88,11 @@ def check(
 
 
 def _check_piece(certificate: Certificate, piece: Piece, random: np.random.Generator) -> tuple[float, int]:
-    """The smallest margin of the piece and the number of its vertices. Raises `Refuted`."""
+    """Return the smallest margin of the piece and the number of its vertices. Raises `Refuted`."""
     model = certificate.model
     x_lower, x_upper = (np.array(bound) for bound in model.X)
     scale = _powers_of_two((x_upper - x_lower) / 2)
-    # Exact: a power of two moves no digit.
+    # Scaling by powers of two is exact.
     G, g = np.array(piece.G) * scale, np.array(piece.g)
     points, radius = _vertices(G, g, random)
     boxes = {
@@ -107,7 +108,7 @@ def _check_piece(certificate: Certificate, piece: Piece, random: np.random.Gener
     step = _Step(certificate, piece, scale)
     inputs = step.inputs(points, u_lower, u_upper)
     if (inputs < u_lower).any() or (inputs > u_upper).any():
-        raise Refuted("an input outside those allowed")  # cannot be: they are clipped
+        raise Refuted("an input outside those allowed")  # impossible, because they are clipped
     room = step.room(points, radius, inputs)
     margin = float(room.min())
     if margin < 0.0:
@@ -122,7 +123,7 @@ def _check_piece(certificate: Certificate, piece: Piece, random: np.random.Gener
 
 
 class _Step:
-    """Rows of the target over the next state: P x + Q u <= r - err, all scaled by powers of two."""
+    """Rows of the target for the next state: P x + Q u <= r - err, all scaled by powers of two."""
 
     def __init__(self, certificate: Certificate, piece: Piece, scale: np.ndarray):
         model, target = certificate.model, certificate.pieces[piece.target]
@@ -134,12 +135,12 @@ class _Step:
         error = _gamma(W.shape[1] + 1) * (np.abs(self.T) @ np.abs(W).T)
         self.reach = np.nextafter((self.T @ W.T + error * ROOM).max(axis=1), np.inf)
         self.P, self.Q = self.T @ self.A, self.T @ self.B
-        # Whatever the order of summation: |T| (|A| |x| + |B| |u|) times gamma of all terms, the sum A + slope included.
+        # For any order of summation: |T| (|A| |x| + |B| |u|) times gamma of all terms, including the sum A + slope.
         self._abs_P, self._abs_Q = np.abs(self.T) @ np.abs(self.A), np.abs(self.T) @ np.abs(self.B)
         self._gamma = _gamma(2 * sum(self.B.shape) + 4)
 
     def inputs(self, points: np.ndarray, u_lower: np.ndarray, u_upper: np.ndarray) -> np.ndarray:
-        """An input for each point, (k, m), that leaves the most room; only proposed here, confirmed by `room`."""
+        """Propose an input for each point, (k, m), with the largest slack. `room` confirms it."""
         base = (points @ self.P.T + self.reach - self.t) / self.lengths
         slope = self.Q / self.lengths[:, None]
         m = len(u_lower)
@@ -154,18 +155,18 @@ class _Step:
         )
 
     def room(self, points: np.ndarray, radius: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """A lower bound on the room in the target at each point, whatever w, per scaled length; (k,)."""
+        """Return a lower bound on the slack in the target at each point for any w, per scaled length; (k,)."""
         value = points @ self.P.T + inputs @ self.Q.T
         size = np.abs(points) @ self._abs_P.T + np.abs(inputs) @ self._abs_Q.T
         error = (self._gamma * size + radius[:, None] * self._abs_P.sum(axis=1)) * ROOM + TINY
         room = self.t - self.reach - value - error
-        # The last three operations round as well.
+        # The last three operations are rounded too.
         room -= 4 * UNIT * (np.abs(self.t) + np.abs(self.reach) + np.abs(value) + error) * ROOM
         return np.asarray((room / (self.lengths * (1 + 8 * UNIT))).min(axis=1))
 
 
 def _best_single(base: np.ndarray, slope: np.ndarray, low: float, high: float) -> np.ndarray:
-    """argmin over u of max over rows of base + slope u, for each row of base (k, r), one input; by bisection."""
+    """Return argmin over u of the max over rows of base + slope u, per row of base (k, r), one input; by bisection."""
     best = np.full(len(base), (low + high) / 2)
     up, down = slope > 0, slope < 0
     for part in np.array_split(np.arange(len(base)), max(1, base.size // 500_000)):
@@ -183,10 +184,10 @@ def _best_single(base: np.ndarray, slope: np.ndarray, low: float, high: float) -
 
 
 def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Balls in the maximum norm, points (k, d) and radii (k,), around all vertices of a slightly wider set.
+    """Return balls in the maximum norm, points (k, d) and radii (k,), around all vertices of a slightly wider set.
 
     Raises:
-        Refuted: the vertices cannot be confirmed to be all.
+        Refuted: the list of vertices cannot be confirmed as complete.
     """
     d = G.shape[1]
     lengths = np.linalg.norm(G, axis=1)
@@ -211,7 +212,7 @@ def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tupl
         residual + _gamma(d + 2) * ((np.abs(rows) @ np.abs(points)[..., None])[..., 0] + np.abs(bounds))
     ) * ROOM
     if not (theta < 0.5).all():
-        raise Refuted("rows that should meet in a point are too nearly parallel")
+        raise Refuted("rows that should meet in a point are almost parallel")
     radius = (np.abs(inverses) @ residual[..., None])[..., 0].max(axis=1) / (1 - theta) * ROOM + TINY
     _require_strict(G, wide, bases, points, radius)
     _require_closed(bases)
@@ -219,23 +220,23 @@ def _vertices(G: np.ndarray, g: np.ndarray, random: np.random.Generator) -> tupl
 
 
 def _bases(G: np.ndarray, g: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Which d rows meet in each vertex, (k, d), as Qhull sees it."""
-    if G.shape[1] == 1:  # Qhull has no dimension 1: of the rows of each sign the tightest
+    """Return the d rows that intersect in each vertex, (k, d), as proposed by Qhull."""
+    if G.shape[1] == 1:  # Qhull needs d > 1; take the tightest row of each sign
         bounds = np.divide(g, np.abs(G[:, 0]))
         return np.array([[np.where(side, bounds, np.inf).argmin()] for side in (G[:, 0] > 0, G[:, 0] < 0)])
     try:
-        # An unbounded set has a vertex at infinity; it is found out below.
+        # An unbounded set has a vertex at infinity, which is detected below.
         with np.errstate(divide="ignore", invalid="ignore"):
             found = HalfspaceIntersection(np.column_stack([G, -g]), inside)
     except QhullError as error:
         raise Refuted(f"Qhull cannot list its vertices: {str(error).splitlines()[0]}") from error
     if any(len(facet) != G.shape[1] for facet in found.dual_facets):
-        raise Refuted("two vertices are too close to be told apart")
+        raise Refuted("two vertices are too close to be distinguished")
     return np.array(found.dual_facets)
 
 
 def _distinct(bases: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The bases, (k, d), each in order. One that is there twice would have all its edges twice, without a neighbour."""
+    """Return the sorted bases, (k, d). A repeated basis would repeat all its edges and hide a missing neighbour."""
     rows, d = shape
     if bases.shape[1:] != (d,) or not ((bases >= 0) & (bases < rows)).all():
         raise Refuted(f"a vertex is not given by {d} of its {rows} rows")
@@ -248,20 +249,20 @@ def _distinct(bases: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def _require_strict(
     G: np.ndarray, g: np.ndarray, bases: np.ndarray, points: np.ndarray, radius: np.ndarray
 ) -> None:
-    """Every vertex is strictly inside every row but its own."""
+    """Raise `Refuted` unless every vertex is strictly inside every row except its own."""
     d = G.shape[1]
     value, size = points @ G.T, np.abs(points) @ np.abs(G).T
     error = (_gamma(d + 2) * (size + np.abs(g)) + radius[:, None] * np.abs(G).sum(axis=1)) * ROOM
     room = g - value - error
     np.put_along_axis(room, bases, np.inf, axis=1)
     for vertex, row in np.argwhere(~(room > 0.0)):
-        # Rows that are nearly parallel meet in a point that floating point places badly.
+        # The intersection of almost parallel rows is inaccurate in floating point.
         if not _inside_exactly(G, g, bases[vertex], row):
             raise Refuted("one of its rows cuts off what should be a vertex")
 
 
 def _inside_exactly(G: np.ndarray, g: np.ndarray, basis: np.ndarray, row: int) -> bool:
-    """Whether the point where the rows of the basis meet is strictly inside another row, in rational arithmetic."""
+    """Return whether the intersection of the basis is strictly inside another row, in rational arithmetic."""
     system = [[Fraction(float(a)) for a in G[i]] + [Fraction(float(g[i]))] for i in basis]
     d = len(system)
     for k in range(d):
@@ -278,28 +279,26 @@ def _inside_exactly(G: np.ndarray, g: np.ndarray, basis: np.ndarray, row: int) -
 
 
 def _require_closed(bases: np.ndarray) -> None:
-    """Every edge joins two vertices of the list."""
+    """Raise `Refuted` unless every edge joins two vertices of the list."""
     d = bases.shape[1]
-    if d == 1:  # the edge of an interval is all of it
+    if d == 1:  # an interval is its own edge
         counts = np.array([len(bases)])
     else:
         edges = np.concatenate([np.delete(bases, i, axis=1) for i in range(d)])
         _, counts = np.unique(edges, axis=0, return_counts=True)
     if not (counts == 2).all():
-        raise Refuted(f"{int((counts != 2).sum())} of its edges lead to no vertex that was found")
+        raise Refuted(f"{int((counts != 2).sum())} of its edges do not end at a known vertex")
 
 
 def _require_touched(G: np.ndarray, g: np.ndarray, points: np.ndarray) -> None:
-    """Every row touches the set: a row further out bounds nothing, and whoever wrote it meant another set."""
+    """Raise `Refuted` unless every row touches the set. A row outside has no effect, so it indicates an error."""
     lengths = np.linalg.norm(G, axis=1)
     gap = np.full(len(g), np.inf)
     for part in np.array_split(points, 1 + points.shape[0] * len(g) // 4_000_000):
         gap = np.minimum(gap, ((g - part @ G.T) / lengths).min(axis=0))
     worst = int(np.argmax(gap))
     if gap[worst] > LOOSE:
-        raise Refuted(
-            f"row {worst} bounds nothing: no state of the set comes nearer to it than {gap[worst]:.2g}"
-        )
+        raise Refuted(f"row {worst} has no effect: no state of the set is nearer to it than {gap[worst]:.2g}")
 
 
 def _require_inside(
@@ -311,12 +310,12 @@ def _require_inside(
     upper: np.ndarray,
     what: str,
 ) -> None:
-    """The piece lies in a box: by a row of its own that says so, or because all vertices do."""
+    """Raise `Refuted` unless the piece lies in a box, by a row of its own or because all its vertices do."""
     for i in range(G.shape[1]):
         alone = (G != 0.0).sum(axis=1) == 1
         for sign, bound in ((1.0, upper[i]), (-1.0, -lower[i])):
             said = alone & (sign * G[:, i] > 0)
-            # g / |G| <= bound, without the rounding of a quotient: G is +-1 for bounds, else the vertices decide.
+            # g / |G| <= bound without the rounding of a quotient. |G| is 1 for bounds; otherwise the vertices decide.
             if (said & (np.abs(G[:, i]) * bound >= g) & (np.frexp(np.abs(G[:, i]))[0] == 0.5)).any():
                 continue
             reached = float((sign * points[:, i] + radius).max())
@@ -332,5 +331,5 @@ def _powers_of_two(values: np.ndarray) -> np.ndarray:
 
 
 def _gamma(n: int) -> float:
-    """gamma_n of Higham, rounded up."""
+    """Return gamma_n of Higham, rounded up."""
     return float(np.nextafter(n * UNIT / (1 - n * UNIT), np.inf))

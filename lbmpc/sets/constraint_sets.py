@@ -10,21 +10,21 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope
 
 
 def state_set(model: Model) -> Polytope:
-    """X in deviation coordinates: its box, then its rows."""
+    """Return X in deviation coordinates: its box, then its rows."""
     plant = model.plant
     box = Polytope.box(plant.x_min - plant.x_e, plant.x_max - plant.x_e, plant.states)
     return _beside(box, plant.state_rows.about(plant.x_e))
 
 
 def input_set(model: Model) -> Polytope:
-    """U in deviation coordinates: its box, then its rows."""
+    """Return U in deviation coordinates: its box, then its rows."""
     plant = model.plant
     box = Polytope.box(plant.u_min - plant.u_e, plant.u_max - plant.u_e, plant.inputs)
     return _beside(box, plant.input_rows.about(plant.u_e))
 
 
 def disturbance_set(model: Model, half_widths: np.ndarray | None = None) -> Polytope:
-    """W as a box of half-widths (d,); by default the plant's own, which grow with the period as h does."""
+    """Return W as a box of half-widths (d,), by default the plant's W times the period."""
     w = np.asarray(model.plant.W * model.period if half_widths is None else half_widths, dtype=float)
     if w.shape != (model.d,):
         raise EmptySetError(f"W has {w.size} half-widths, the plant has {model.d} states")
@@ -32,7 +32,7 @@ def disturbance_set(model: Model, half_widths: np.ndarray | None = None) -> Poly
 
 
 def _beside(box: Polytope, rows: LinearRows) -> Polytope:
-    """What keeps both; the box's rows come first. A box where there are no others."""
+    """Return the intersection of box and rows, with the rows of the box first."""
     if not rows.names:
         return box
     return Polytope(

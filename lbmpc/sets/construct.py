@@ -1,4 +1,4 @@
-"""From a model to a certificate: W, then the invariant set, then what lies around it."""
+"""The construction of a certificate from a model: W, the invariant set, and sets around it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from lbmpc.sets.invariance.robust_control import Stage, UncertainSystem, predece
 from lbmpc.sets.motion import over_any_delay
 
 Saved = MutableMapping[str, dict[str, np.ndarray]]
-"""Where work is kept, so that an interrupted construction goes on: arrays by name."""
+"""Intermediate results by name, from which an interrupted construction continues."""
 Report = Callable[[str, float], None]
-"""What is being done, and the share of it that is done."""
+"""Receives the present task and the share of it that is done."""
 SAVE_EVERY = 5
 
 
 def silent(_what: str, _done: float) -> None:
-    """A `Report` to nobody."""
+    """A `Report` that does nothing."""
 
 
 def construct(
@@ -44,21 +44,22 @@ def construct(
     saved: Saved | None = None,
     report: Report = silent,
 ) -> Certificate:
-    """The sets of one kind for the whole of X and U.
+    """Compute the sets of one kind for the whole of X and U.
 
     Args:
-        model: what they are for.
-        kind: `given` takes W as it is; `box` and `hull` bound h over X x U rigorously; `regions` adds to the set of
-            `hull` sets around a way from `start` into it, with h bounded locally; `extension` is the approximation that
-            the paper follows (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X: it claims nothing.
-        start: a state that should be in the sets, (d,), deviation.
-        W: half-widths (d,) for `given`; the plant's own by default. The sets have a little more, `over_any_delay`.
+        model: the model.
+        kind: `given` uses W as it is. `box` and `hull` bound h over X x U rigorously. `regions` adds sets around a path
+            from `start` into the set of `hull`, with local bounds of h. `extension` is the approximation used in the
+            paper (Aswani, Bouffard and Tomlin 2012), X with one predecessor of X, and is not certified.
+        start: a state that should be in the sets, (d,), in deviations.
+        W: half-widths (d,) for `given`; the plant's own by default. The sets use slightly more, see `over_any_delay`.
         slack, patience: as for `predecessor_iteration`.
-        saved: of an earlier call with the same arguments; filled as the work goes on.
+        saved: intermediate results of an earlier call with the same arguments; updated during the work.
+        report: receives the progress.
 
     Raises:
-        EmptySetError: there are none; the text says what is empty at which step, and what would help.
-        SetError, DisturbanceError: the model or its bounds admit no such construction.
+        EmptySetError: there are no such sets. The text says which set is empty at which step, and what may help.
+        SetError, DisturbanceError: the construction does not apply to this model or its bounds.
     """
     saved = {} if saved is None else saved
     bound = _bound(model, kind, W, saved, report)
@@ -92,7 +93,7 @@ def _extension(model: Model, bound: DisturbanceBound) -> Certificate:
 
 
 def whole(model: Model) -> Region:
-    """All of X and U. Raises `SetError` where they have no end."""
+    """Return the region X x U. Raises `SetError` if it is not bounded."""
     X, U, plant = state_set(model), input_set(model), model.plant
     open_ends = [
         f"{name} {end}"
@@ -105,7 +106,7 @@ def whole(model: Model) -> Region:
         raise SetError(
             f"{plant.name}: not bounded: {', '.join(open_ends)}. The model error h is bounded over all of X and U, so "
             "certified sets need a finite x_min, x_max, u_min and u_max of each state and input. Give the plant such "
-            "bounds, as wide as its use; its `scale` is no bound"
+            "bounds, as wide as its range of use; `scale` is not a bound"
         )
     return Region(X.lower, X.upper, U.lower, U.upper)
 
@@ -117,8 +118,8 @@ def _bound(model: Model, kind: Kind, W: np.ndarray | None, saved: Saved, report:
         return given_box(model, over_any_delay(model, half), region)
     if model.equations is None:
         raise SetError(
-            f"{model.plant.name} is numbers alone, and what h can be is found from equations: sets of the kind `given` "
-            "take W as it is"
+            f"{model.plant.name} is given by numbers alone, but bounds of h need equations; use the kind `given`, "
+            "which uses W as it is"
         )
     name = "W as a box" if kind == "box" else "W as a hull"
     if "W" not in saved:
@@ -139,7 +140,7 @@ def _invariant(
             stage = found
             if stage.invariant or stage.step % SAVE_EVERY == 0:
                 saved["stage"] = _freeze(stage)
-            # The excess falls roughly by the same factor at each step, down to the slack.
+            # The excess decreases by about the same factor at each step, down to the slack.
             first = max(stage.excess, 2 * slack) if first is None else first
             left = np.log(max(stage.excess, slack / 10) / (slack / 10)) / np.log(first / (slack / 10))
             report(
@@ -161,7 +162,7 @@ def _freeze(stage: Stage) -> dict[str, np.ndarray]:
 
 def _thaw(arrays: dict[str, np.ndarray], X: Body) -> Stage:
     step, excess, slack, radius = arrays["at"]
-    # The very same numbers: an interrupted construction ends with the same set as one that was not.
+    # The numbers are exactly those that were saved, so an interrupted construction gives the same set.
     again = Body(arrays["G"], arrays["g"], X.scale, arrays["centre"], float(radius))
     return Stage(int(step), again, float(excess), float(slack))
 
@@ -206,9 +207,10 @@ def _piece(name: str, set_: Body, bound: DisturbanceBound, target: int) -> Piece
 
 
 def volume_fraction(certificate: Certificate, samples: int = 20_000, seed: int = 0) -> float:
-    """Volume of the union of all pieces, as a share of X's.
+    """Return the volume of the union of all pieces as a share of the volume of X.
 
-    The first piece exactly; of the others what none before them holds, by sampling (Karp and Luby 1983).
+    The volume of the first piece is exact. The part of each other piece outside the earlier ones is found by sampling
+    (Karp and Luby 1983).
     """
     low, high = (np.array(bound) for bound in certificate.model.X)
     half = (high - low) / 2
@@ -224,7 +226,7 @@ def volume_fraction(certificate: Certificate, samples: int = 20_000, seed: int =
 
 
 def points_in(piece: Body, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Uniform points inside, (count, d), out of a box around."""
+    """Return uniform points inside the piece, (count, d), by rejection from a bounding box."""
     low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
     found = np.zeros((0, piece.dimension))
     while len(found) < count:

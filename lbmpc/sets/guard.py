@@ -1,11 +1,11 @@
-"""The first input that keeps the plant in a certified family of sets: bounds on v_0 alone, for the state at hand.
+"""Bounds on the first input v_0 that keep the plant in a certified family of sets, for a given state.
 
-From x in a piece, the next state is in the piece's target for every w in W as long as
+From x in a piece, the next state is in the piece's target for every w in W if
 
     T (A + slope_x) x + T (B + slope_u) v_0 <= t - h_W(T),          {x : T x <= t} the target.
 
-For one input that is an interval, whatever the number of facets. For more, it is a polytope in v_0, of which the box
-around the best-centred input is used: smaller, and as safe.
+For a single input this is an interval, for any number of facets. For several inputs it is a polytope in v_0, and the
+box around its best-centred input is used. The box is smaller and equally safe.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from lbmpc.sets.certificate import Certificate
 from lbmpc.sets.geometry.linear_program import linprog, load
 
 ROW_ROUNDING = 1e-10
-"""In scaled lengths: rounding of a row's value must not put a state outside that was steered onto its facet."""
+"""Allowance in scaled lengths, so that rounding does not put a state outside that was steered onto its facet."""
 SHARE, MOST = 0.5, 0.04
-"""Half the distance from the target's boundary that some input keeps is kept, where a distance beyond MOST, as a share
-of X's half-widths, counts as MOST. The claim does not need it, but a command that acts late, or a measurement that is
-off, is not part of W. Some input keeps the margin that `lbmpc.sets.check` found, from every state of the family, so
-half of that is kept everywhere."""
+"""The bounds keep this share of the largest possible distance from the target's boundary. Distances above MOST, a share
+of X's half-widths, count as MOST. The certificate does not need this reserve. It covers late commands and measurement
+errors, which are not part of W. From every state of the family some input keeps the margin that `lbmpc.sets.check`
+found, so half of that margin is kept everywhere."""
 ROUNDS = 100
-"""Of Newton's method at most; it ends by itself, as a rule after three."""
+"""Largest number of Newton iterations. Usually three are enough."""
 
 
 Bounds = tuple[np.ndarray, np.ndarray]
-"""Lower and upper, (m,) each."""
+"""Lower and upper bounds, (m,) each."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstInputs:
-    """What v_0 is to be in a state.
+    """The bounds of v_0 in a state.
 
-    Inside, what lies between `lower` and `upper`, (m,) each, keeps the family, at some distance from its boundary.
-    Outside nothing is certified: the bounds are what would lead into the target of the nearest piece if that were as
-    certified here as inside, or, where nothing would, the one input that leads least far out of it. `margin` is the
-    distance to the nearest facet, as a share of X's half-widths, negative outside. `piece` is the set that x is in,
-    -1 outside.
+    Inside the family, every input between `lower` and `upper`, (m,) each, keeps the plant in it, at some distance from
+    the boundary. Outside, nothing is certified. The bounds then lead into the target of the nearest piece, as if the
+    state were inside. If no input does, both bounds are the input that leads least far out. `margin` is the distance to
+    the nearest facet as a share of X's half-widths, negative outside. `piece` is the index of the piece that contains
+    x, -1 outside.
     """
 
     lower: np.ndarray
@@ -50,13 +50,13 @@ class FirstInputs:
 
 
 class InputRows:
-    """Rows of one piece's target over (x, v_0): P x + Q v_0 <= r."""
+    """Rows of one piece's target in (x, v_0): P x + Q v_0 <= r."""
 
     def __init__(self, certificate: Certificate, index: int, scale: np.ndarray):
         piece, model = certificate.pieces[index], certificate.model
         target = certificate.pieces[piece.target]
         T, t = np.array(target.G), np.array(target.g)
-        # Unit rows in scaled coordinates, so that one tolerance fits all.
+        # Unit rows in scaled coordinates, so that one tolerance suits all rows.
         lengths = np.linalg.norm(T * scale, axis=1)
         T, t = T / lengths[:, None], t / lengths
         self.P = T @ (np.array(model.A) + np.array(piece.slope_x))
@@ -73,17 +73,17 @@ class InputRows:
             load()
 
     def room(self, x: np.ndarray) -> np.ndarray:
-        """What is left of each row for Q v_0 in the state x, (d,); (rows,)."""
+        """Return the slack of each row for Q v_0 in the state x, (d,); (rows,)."""
         return np.asarray(self.r - self.P @ x)
 
     def within(self, room: np.ndarray, reserve: float) -> Bounds | None:
-        """Bounds on v_0, (m,) each, that keep this distance from the target's boundary; None when there are none."""
+        """Return bounds on v_0, (m,) each, that keep `reserve` from the boundary; None if there are none."""
         return self._interval(room - reserve) if self.single else self._box(room - reserve)
 
     def farthest(self, room: np.ndarray, most: float) -> tuple[float, np.ndarray]:
-        """The largest distance from the target's boundary that some input keeps, and that input, (m,).
+        """Return the largest distance from the target's boundary that some input keeps, and that input, (m,).
 
-        At most `most`. Negative where every input leads outside: then the input leads least far.
+        The distance is at most `most`. It is negative if every input leads outside; the input then leads least far.
         """
         return self._farthest_single(room, most) if self.single else self._farthest(room, most)
 
@@ -95,7 +95,7 @@ class InputRows:
         return np.array([low]), np.array([high])
 
     def _farthest_single(self, room: np.ndarray, most: float) -> tuple[float, np.ndarray]:
-        """Newton's method on the width of the interval at a distance, which is concave and falls with the distance."""
+        """Apply Newton's method to the width of the interval, a concave and decreasing function of the distance."""
         distance = min(most, room[self._none].min(initial=np.inf))
         per_up, per_down = np.append(self._per_up, 0.0), np.append(self._per_down, 0.0)
         high, low = (
@@ -130,7 +130,7 @@ class InputRows:
         )
 
     def _box(self, room: np.ndarray) -> Bounds | None:
-        """The largest box of U's proportions inside {Q v <= room} and U, by a linear program in (centre, size)."""
+        """Return the largest box with U's proportions in {Q v <= room} and U, by a linear program."""
         m, half = len(self.low), (self.high - self.low) / 2
         rows = np.column_stack([self.Q, np.abs(self.Q) @ half])
         ends = np.vstack([np.column_stack([np.eye(m), half]), np.column_stack([-np.eye(m), half])])
@@ -148,7 +148,7 @@ class InputRows:
 
 
 class Guard:
-    """A certified family of sets, ready to be asked at every tick."""
+    """A certified family of sets, prepared for use in every tick."""
 
     def __init__(self, certificate: Certificate, share: float = SHARE, most: float = MOST):
         self._share, self._most = share, most
@@ -166,11 +166,11 @@ class Guard:
         self._steps = [InputRows(certificate, i, self.scale) for i in range(len(certificate.pieces))]
 
     def margins(self, x: np.ndarray) -> np.ndarray:
-        """Distance of x (d,) to the nearest facet of each piece, as a share of X's half-widths; (pieces,)."""
+        """Return the distance of x (d,) to the nearest facet of each piece, as a share of half-widths; (pieces,)."""
         return np.minimum.reduceat(self._g - self._G @ x, self._starts)
 
     def first_inputs(self, x: np.ndarray) -> FirstInputs:
-        """What is certified in state x, (d,). The first piece that holds x decides: it is the nearest to the end."""
+        """Return the certified bounds in state x, (d,), from the first piece that contains x."""
         margins = self.margins(x)
         best = float(margins.max())
         for index in np.flatnonzero(margins >= 0.0):

@@ -1,9 +1,9 @@
 """All constraint rows of a problem over (v, zbar) as one block: inputs, their changes, then states step by step.
 
-The rows of inputs are hard, and kept exactly: each input in turn is clipped to its box and to what it can reach from
-the one before. What acts is in U, so that there always is such an input. Where U has rows beside its box, an input that
-breaks one is drawn to the equilibrium's, which is inside, and under rate limits all inputs move on the straight way
-from the one before: U is convex, so both are kept.
+Input rows are hard and satisfied exactly. Each input in turn is clipped to its box and to its reachable range from the
+previous one. The present input is in U, so such an input always exists. If U has rows besides its box, an input that
+violates one is moved towards the equilibrium input, which is inside. Under rate limits all inputs then move along the
+line from the previous input. U is convex, so both kinds of rows hold.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from lbmpc.solver.least_distance import (
 from lbmpc.solver.priorities import Eased, contradicts, in_order
 
 KEPT = 1e-7
-"""A row that is off by less of its scale counts as kept: that much a QP's own tolerance may leave."""
+"""Share of a row's scale. A smaller violation counts as satisfied, because a QP has a tolerance."""
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds, (m,) each."""
 
 
 class Rows:
-    """The rows' bounds, their values, their slopes, what their violation costs, and the step that they allow."""
+    """Bounds, values and slopes of the rows, the cost of violations, and the nearest feasible step."""
 
     def __init__(self, problem: Problem):
         n, m, d = problem.horizon, problem.model.m, problem.model.d
@@ -44,17 +44,17 @@ class Rows:
         self.input_rows = problem.inputs[0].F
         self.state_rows = problem.states[0].F
         common, of_stage = len(self.state_rows), len(self.input_rows)
-        # U beside its box, about the equilibrium.
+        # The rows of U besides its box, in deviations from the equilibrium.
         self._beside = plant.input_rows.about(plant.u_e)
         last = problem.states[-1]
-        # The last step may carry the rows of a terminal set behind the rows that all steps share.
+        # The last step can have the rows of a terminal set in addition to the common rows.
         self.terminal_rows = last.F[common:]
-        # Boxes throughout: the rows are the variables themselves.
+        # With boxes only, the rows are the variables themselves.
         boxes = problem.states[0].is_box and problem.inputs[0].is_box
         self._plain = boxes and not len(self.terminal_rows)
         self._steps = problem.input_steps
         self._limited = bool(np.isfinite(self._steps).any())
-        # Of all inputs, stage by stage, those with a row for the change from the one before. That of v_0 is a bound.
+        # Indices of inputs with a row for the change from the previous stage. The change of v_0 is a bound instead.
         self._changing = m + np.flatnonzero(np.tile(np.isfinite(self._steps), n - 1))
         change = np.tile(self._steps, n)[self._changing]
         self._together = self._limited and bool(self._beside.names)
@@ -66,13 +66,13 @@ class Rows:
             [*(part.upper for part in problem.inputs), change, *(part.upper for part in problem.states)]
         )
         self.count_inputs = of_stage * n + len(change)
-        # The same numbers as seen by inputs (N, m).
+        # Views of the same numbers for inputs (N, m).
         self._lower_v, self._upper_v = (
             b[: of_stage * n].reshape(n, of_stage)[:, :m] for b in (self.lower, self.upper)
         )
         self._first = self.lower[:m].copy(), self.upper[:m].copy()
         self._before = np.zeros(m)
-        # Of the plain sets' half-widths: tightening must not make a violation weigh more.
+        # Ranges of the sets before tightening, so that tightening does not increase the weight of a violation.
         of_inputs, of_states, of_terminal = (
             row_ranges(F, half)
             for F, half in (
@@ -89,7 +89,7 @@ class Rows:
         self._levels = np.array(of_rows)
         self._in_order = max(problem.priorities) > 0
         self._last = replace(self.penalty, soft=self._levels == self._levels.max())
-        # Since `bound_first`, where priorities contradicted each other.
+        # Bounds with relaxations, once priorities have conflicted since `bound_first`.
         self._eased: Eased | None = None
         self._hard = replace(self.penalty, soft=np.zeros_like(soft))
         self.names = [
@@ -98,15 +98,15 @@ class Rows:
 
     @property
     def first(self) -> Box:
-        """The bounds on v_0 that are in force."""
+        """The bounds on v_0 in force."""
         return self.lower[: self.m], self.upper[: self.m]
 
     def bound_first(self, first: Box | None, previous: np.ndarray | None) -> None:
-        """Bounds on v_0 from now on.
+        """Set the bounds on v_0.
 
         Args:
-            first: taken into those of the problem; None: those of the problem.
-            previous: what acts before v_0, (m,), from which rate limits count; None: the equilibrium's.
+            first: additional bounds; None for those of the problem alone.
+            previous: the input before v_0, (m,), as start of rate limits; None for the equilibrium's.
         """
         low, high = self._first
         self._eased = None
@@ -119,14 +119,14 @@ class Rows:
         self.lower[: self.m], self.upper[: self.m] = low, high
 
     def clip(self, v: np.ndarray) -> np.ndarray:
-        """Inputs (N, m) brought exactly inside their bounds; the QP keeps them to its tolerance only."""
+        """Return inputs (N, m) clipped exactly to their bounds. The QP satisfies them up to its tolerance only."""
         if self._one_by_one is None and not self._together:
-            # np.clip takes twice as long for so few numbers.
+            # np.clip takes twice as long on such small arrays.
             return self._beside.pulled(np.minimum(np.maximum(v, self._lower_v), self._upper_v), 0.0)
         return self.within_steps(v)
 
     def within_steps(self, v: np.ndarray) -> np.ndarray:
-        """The same, for what keeps the box of U: all of U, and the rate limits; as it is where there are none."""
+        """Apply the rows of U and the rate limits to inputs that already are in the box of U."""
         if self._together:
             return self._straight(v)
         if self._one_by_one is None:
@@ -137,7 +137,7 @@ class Rows:
         return self._one_by_one.outputs["clipped"].T.copy()
 
     def _straight(self, v: np.ndarray) -> np.ndarray:
-        """Inputs (N, m) of all of U, each on the straight way from the one before it."""
+        """Return inputs (N, m) in U, each on the line from the previous one."""
         inside = self._beside.pulled(np.clip(v, *self._first), 0.0)
         kept, before, (low, high) = np.empty_like(v), self._before, self.first
         for i, u in enumerate(inside):
@@ -146,11 +146,11 @@ class Rows:
         return kept
 
     def values(self, v: np.ndarray, zbar: np.ndarray) -> np.ndarray:
-        """Row values of inputs v (m, n) and nominal states zbar (d, n)."""
+        """Return the row values of inputs v (m, n) and nominal states zbar (d, n)."""
         return self.apply(np.concatenate([v.T.ravel(), zbar.T.ravel()]))
 
     def apply(self, y: np.ndarray) -> np.ndarray:
-        """The rows of y = (v_0..n-1, zbar_1..n), stage by stage: ((m + d) n,) -> (rows,), or for many columns."""
+        """Apply the rows to y = (v_0..n-1, zbar_1..n), stage by stage: ((m + d) n,) -> (rows,), or to many columns."""
         n, split, later = self.n, self.m * self.n, self._changing
         if self._plain:
             return np.concatenate([y[:split], y[later] - y[later - self.m], y[split:]]) if len(later) else y
@@ -163,23 +163,23 @@ class Rows:
         return np.concatenate(blocks).reshape(-1, *y.shape[1:])
 
     def kept(self, values: np.ndarray) -> bool:
-        """Whether values (rows,) are inside their bounds."""
+        """Return whether values (rows,) are within their bounds."""
         return bool(((values <= self.upper) & (values >= self.lower)).all())
 
     def price(self, values: np.ndarray) -> float:
-        """What it costs that values (rows,) are outside their bounds, were every state row soft.
+        """Return the cost of the violations of values (rows,), with every state row taken as soft.
 
-        What had to be granted for the sake of an order costs nothing.
+        Violations granted to rows by the order of priorities cost nothing.
         """
         return self.penalty.cost(violation(values, *(self._eased or (self.lower, self.upper))))
 
     def nearest(
         self, values: np.ndarray, slopes: np.ndarray, hint: np.ndarray = NO_ROWS, ready: Shown | None = None
     ) -> tuple[Nearest | None, bool]:
-        """The w nearest to 0 that the rows allow, and whether the hard state rows can be met.
+        """Return the w nearest to 0 that satisfies the rows, and whether the hard state rows are feasible.
 
-        Softly where state rows are soft or contradict each other; None where the numbers are unusable. Arguments as for
-        `least_distance`.
+        State rows are relaxed if they are soft or conflict. The first result is None if the numbers are not finite.
+        Arguments as for `least_distance`.
         """
         if self._eased is None:
             first = self.penalty if self.soft else self._hard
@@ -194,25 +194,25 @@ class Rows:
                 return nearest, feasible
             self._eased = ordered[1]
             return ordered[0], feasible
-        # What was granted stays, so that the cost is comparable from step to step.
+        # Granted relaxations are kept, so that costs remain comparable from step to step.
         return least_distance(values, slopes, *self._eased, self._last, hint), self.soft
 
     def fresh(self) -> Rows:
-        """The same rows, to be given other bounds; those of v_0 are in force."""
+        """Return a copy of the rows to be given other bounds; the bounds on v_0 are kept."""
         rows = copy(self)
         rows._eased = None
         return rows
 
     @property
     def ordered(self) -> bool:
-        """Whether priorities contradicted each other since `bound_first`."""
+        """Whether priorities have conflicted since `bound_first`."""
         return self._eased is not None
 
     def _contradicts(self, nearest: Nearest) -> bool:
         return contradicts(nearest.values, self.lower, self.upper, self.penalty.scale, self._levels)
 
     def slack(self, outside: np.ndarray) -> tuple[float, str]:
-        """The largest violation of a state row, in shares, and the row's name, from all rows' violations, (rows,)."""
+        """Return the largest relative violation of a state row and its name, given those of all rows, (rows,)."""
         states = (outside / self.penalty.scale)[self.count_inputs :]
         worst = int(states.argmax())
         slack = float(states[worst])
@@ -220,9 +220,9 @@ class Rows:
 
 
 def build_clip(n: int, steps: np.ndarray) -> ca.Function:
-    """(v, lower, upper) -> clipped, (m, n) each: each input in its bounds and within `steps`, (m,), of the one before.
+    """Build (v, lower, upper) -> clipped, (m, n) each: inputs within bounds and within `steps`, (m,), of the last one.
 
-    The first is within its bounds alone.
+    The first input is only clipped to its bounds.
     """
     m = len(steps)
     v, lower, upper = (ca.SX.sym(name, m, n) for name in ("v", "lower", "upper"))

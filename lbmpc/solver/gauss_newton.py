@@ -1,8 +1,8 @@
-"""Solves (e:LBMPC) by a feasible Gauss-Newton SQP, bounded in iterations and never by the clock.
+"""Solves (e:LBMPC) by a feasible Gauss-Newton SQP whose iterations are limited by number, never by time.
 
-The constraints are linear with constant matrices and do not see the oracle, so from the first step on every iterate
-keeps them: stopping early costs optimality, never safety, and a lying oracle costs performance, never a hard
-constraint. An oracle whose numbers cannot be used at all is set aside for that solve, in favour of the nominal model.
+The constraints are linear with constant matrices and do not depend on the oracle, so every iterate after the first step
+satisfies them. Stopping early costs optimality but not safety, and a wrong oracle costs performance but never violates
+a hard constraint. If the oracle gives numbers that cannot be used, the nominal model replaces it for that solve.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from lbmpc.solver.solution import Solution, Status
 from lbmpc.solver.subproblem import Subproblem, Target, finite
 
 MAX_HALVINGS = 12
-# Steps that shrink this fast need no watching: the next one will be this much smaller again.
+# A step that shrinks this fast is extrapolated: the next one will be smaller by the same factor.
 FAST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A linearisation about a predicted state, waiting for the measured one."""
+    """A linearisation about a predicted state, to be completed with the measured one."""
 
     s: np.ndarray
-    """Predicted state, (D,), and where changes cost something the input before, (m,): here D counts that too."""
+    """Predicted state, (D,), followed by the previous input, (m,), if changes have a cost; D then includes it."""
     first: Box
     """Bounds on v_0."""
     status: Status
@@ -49,27 +49,27 @@ class Prepared:
     free: np.ndarray
     """The unconstrained minimiser's inputs, (N, m)."""
     slopes_v: np.ndarray
-    """How those move with w, (m N, m N)."""
+    """Slopes of these inputs in w, (m N, m N)."""
     follow_v: np.ndarray
-    """How they follow s, (m N, D)."""
+    """Slopes of these inputs in s, (m N, D)."""
     steered: np.ndarray
     """The inputs of the minimiser's learned trajectory, (N, m)."""
     slopes_u: np.ndarray
-    """How those move with w, (m N, m N)."""
+    """Slopes of these inputs in w, (m N, m N)."""
     follow_u: np.ndarray
-    """How they follow s, (m N, D)."""
+    """Slopes of these inputs in s, (m N, D)."""
     shown: Shown | None
-    """The QP as it was solved at s; None where no row was violated there."""
+    """The QP as solved at s; None if no row was violated there."""
 
 
 class Solver:
-    """One problem, solved again and again from new states, parameters and references.
+    """Solves one problem repeatedly for new states, parameters and references.
 
     Args:
-        problem: what to solve; nothing in it is rebuilt later.
-        max_iterations: Gauss-Newton steps in one solve, at least 1.
-        tolerance: converged when no input of the plan moves by more, as a share of its half-width.
-        realise: what turns a CasADi function into the one that is called, a compiler for instance.
+        problem: the problem. Nothing of it is rebuilt later.
+        max_iterations: Gauss-Newton steps per solve, at least 1.
+        tolerance: the solve has converged if no input of the plan moves by more, as a share of its half-width.
+        realise: turns a CasADi function into the function that is called, for example by compiling it.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Solver:
         self._nominal = self._learned if same else self._subproblem(nominal)
         self._follow = Bound(realise(build_nominal(problem)))
         self._begin = Bound(realise(build_start(problem)))
-        # Built at the first preparation: a controller that converges every tick does not need it.
+        # Built at the first preparation, because a controller that solves to convergence does not need it.
         self._tangent: Bound | None = None
         self._prepared: Prepared | None = None
 
@@ -115,21 +115,21 @@ class Solver:
         """Minimise from x_t = x.
 
         Args:
-            x: measured state, (d,), deviation coordinates; where the oracle looks back, the past pairs behind it:
-                s of `lbmpc.oracles.base`, (D,).
-            oracle_parameters: theta, as the oracle packs it.
-            warm_start: c to start from, (N, m), that of an earlier solution for one; it need not be feasible.
-            xr, ur: references over the horizon, (N + 1, d) and (N, m), or one row for all of it; the equilibrium by
-                default.
-            first: hard bounds on v_0 for this solve, (m,) each, inside U; U itself by default.
-            previous: what acts now, (m,): v_{-1} and u_{-1}; the equilibrium's input by default. Without rate limits
-                and S nothing depends on it.
+            x: measured state, (d,), in deviations. For an oracle with a window, the past pairs follow: s of
+                `lbmpc.oracles.base`, (D,).
+            oracle_parameters: theta, as packed by the oracle.
+            warm_start: initial c, (N, m), for example that of an earlier solution; it may be infeasible.
+            xr, ur: references over the horizon, (N + 1, d) and (N, m), or one row for the whole horizon; the
+                equilibrium by default.
+            first: hard bounds on v_0 for this solve, (m,) each, inside U; U by default.
+            previous: the present input, (m,), as v_{-1} and u_{-1}; the equilibrium input by default. It has no effect
+                without rate limits and S.
 
         Returns:
-            A `Solution`; never raises for numbers, whatever they are.
+            A `Solution`. The method never raises because of its numbers.
         """
         self._rows.bound_first(first, previous)
-        # Wild oracles overflow on their way to being refused.
+        # An oracle with bad numbers may overflow before it is refused.
         with np.errstate(all="ignore"):
             start = self._start(x, warm_start)
             s = with_input(self.problem.model, x, previous)
@@ -152,9 +152,10 @@ class Solver:
         ur: np.ndarray | None = None,
         previous: np.ndarray | None = None,
     ) -> None:
-        """Linearise ahead of the sample, about a predicted state x, (D,); everything that needs no x_t is done here.
+        """Linearise about a predicted state x, (D,), and do all work that does not need x_t.
 
-        Arguments as for `solve`; `previous` is what will act then. One Gauss-Newton step is left for `feedback`.
+        Arguments as for `solve`; `previous` is the input that will act then. `feedback` completes the Gauss-Newton
+        step.
         """
         if self._tangent is None:
             function = build_tangent(self.problem.model, self.problem.horizon, self._behind)
@@ -177,7 +178,7 @@ class Solver:
             values, all_slopes = subproblem.values(rows), rows.apply(slopes)
             guess = None
             if status is not Status.NUMERICAL and not rows.kept(values):
-                # At the measured state mostly the same rows will matter.
+                # The same rows will usually be active at the measured state.
                 guess, _feasible = rows.nearest(values, all_slopes)
             self._prepared = Prepared(
                 np.array(s, dtype=float),
@@ -199,17 +200,17 @@ class Solver:
     def feedback(
         self, x: np.ndarray, first: Box | None = None, previous: np.ndarray | None = None
     ) -> Solution:
-        """Complete the prepared step for the measured state x, (D,): a correction of x, and a few QP rows.
+        """Complete the prepared step for the measured state x, (D,), with a correction for x and a small QP.
 
-        `first` as for `solve`: it depends on x, so that the preparation does not know it. `previous` likewise, where
-        something else acts than the preparation was told.
+        `first` is that of `solve`; it depends on x and is therefore not known in the preparation. `previous` is needed
+        if another input acts than the one given to the preparation.
 
-        The nominal trajectory is linear in x, so the constraints hold for x itself, not for its prediction.
+        The nominal trajectory is linear in x, so the constraints hold for x itself and not only for its prediction.
 
         Raises:
             RuntimeError: nothing was prepared.
         """
-        # Used once: a QP solved twice remembers, and the same calls must give the same bits.
+        # A preparation is used once. A QP that is solved twice keeps memory, and equal calls must give equal bits.
         ready, self._prepared = self._prepared, None
         if ready is None:
             raise RuntimeError("feedback without preparation: call prepare first")
@@ -227,7 +228,7 @@ class Solver:
                 shown, hint = ready.shown, NO_ROWS
                 others = first is not None or not np.array_equal(rows.first, ready.first)
                 if shown is not None and others and (shown.seen < rows.m).any():
-                    # It was set up with other bounds on v_0.
+                    # The QP was set up with other bounds on v_0.
                     hint, shown = shown.seen, None
                 nearest, feasible = rows.nearest(values, ready.slopes, hint, shown)
                 if nearest is None:
@@ -240,7 +241,7 @@ class Solver:
     # -- to convergence --------------------------------------------------------------------------------------
 
     def _solve(self, subproblem: Subproblem, x: np.ndarray, v: np.ndarray) -> Solution:
-        """Step after step from inputs v, (N, m), inside their bounds, with what was loaded."""
+        """Iterate from inputs v, (N, m), inside their bounds, with the loaded data."""
         merit, u = np.inf, v
         subproblem.linearise(v)
         status, values, seen = Status.ITERATION_LIMIT, self._rollout(x, v)["values"][:, 0].copy(), NO_ROWS
@@ -260,10 +261,10 @@ class Solver:
             if np.isfinite(merit) and (
                 size < self.tolerance or (rate < FAST and size * rate < self.tolerance)
             ):
-                # What is left to go is not worth another linearisation. v is feasible already.
+                # The remaining distance does not justify another linearisation. v is feasible.
                 v, u, status = target.v, target.u, arrived
                 break
-            # The first step leads into the feasible set; after it the true cost must fall.
+            # The first step leads into the feasible set. After it, the true cost must decrease.
             trial, trial_u, trial_values = target.v, target.u, target.values
             scaled = step * self._per_input
             share, whole = _share(scaled, whole, share), scaled
@@ -275,18 +276,18 @@ class Solver:
             if not np.isfinite(trial_merit):
                 break
             if subproblem is self._nominal:
-                # The model is linear, and the step exact.
+                # For a linear model the step is exact.
                 v, u, merit, status = trial, trial_u, trial_merit, arrived
                 break
             halvings = 0
             while trial_merit > merit and halvings < MAX_HALVINGS and self._size(step) >= self.tolerance:
-                # The rows are linear in v, so half a step has half the change.
+                # The rows are linear in v, so half a step gives half the change.
                 step, share, halvings = 0.5 * step, 0.5 * share, halvings + 1
                 trial, trial_u = v + step, 0.5 * (u + trial_u)
                 trial_values = 0.5 * (values + trial_values)
                 trial_merit = self._merit(subproblem, trial, trial_values)
             if not trial_merit <= merit:
-                # No descent is left at this precision: v is as good as this linearisation can tell.
+                # No descent is possible at this precision, so v is optimal for this linearisation.
                 status = arrived
                 break
             v, u, values, merit = trial, trial_u, trial_values, trial_merit
@@ -296,19 +297,19 @@ class Solver:
         return self._finish(status, x, v, u, merit, iterations)
 
     def _size(self, step: np.ndarray) -> float:
-        """The largest entry of a step in the inputs, (N, m), as a share of that input's half-width."""
+        """Return the largest entry of a step in the inputs, (N, m), as a share of the input's half-width."""
         return float((np.abs(step) * self._per_input).max())
 
     def _merit(self, subproblem: Subproblem, v: np.ndarray, values: np.ndarray) -> float:
-        """Linearise at v, (N, m), with row values (rows,); its true cost, soft constraints included, or inf.
+        """Linearise at v, (N, m), with row values (rows,), and return its true cost with soft constraints, or inf.
 
-        As a share of the model's `cost_scale`, as everything in here.
+        The cost is in units of the model's `cost_scale`, like all costs in this module.
         """
         total = subproblem.linearise(v) + self._rows.price(values)
         return total if np.isfinite(total) else np.inf
 
     def _target(self, subproblem: Subproblem, hint: np.ndarray) -> Target | None:
-        """The minimiser of the linearised problem; None when the numbers are unusable."""
+        """Return the minimiser of the linearised problem; None if the numbers are not finite."""
         values = subproblem.values(self._rows)
         if not finite(values):
             return None
@@ -317,7 +318,7 @@ class Solver:
         return subproblem.constrained(self._rows, values, hint)
 
     def _start(self, x: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Inputs inside their bounds, (N, m), from x or s by c, (N, m)."""
+        """Return inputs inside their bounds, (N, m), from x or s with c, (N, m)."""
         inputs = self._begin.inputs
         inputs["x"][:, 0], inputs["c"][:] = x[: self.problem.model.d], _numbers(c).T
         inputs["lower"][:, 0], inputs["upper"][:, 0] = self._rows.first
@@ -325,7 +326,7 @@ class Solver:
         return self._rows.clip(_numbers(self._begin.outputs["v"].T))
 
     def _rollout(self, x: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-        """What `lbmpc.solver.nominal_rollout` says of inputs v, (N, m), from x or s; valid until the next call."""
+        """Return `lbmpc.solver.nominal_rollout` for inputs v, (N, m), from x or s; valid until the next call."""
         inputs, rows = self._follow.inputs, self._rows
         inputs["x"][:, 0], inputs["v"][:] = x[: self.problem.model.d], v.T
         inputs["lower"][:, 0], inputs["upper"][:, 0] = rows.lower, rows.upper
@@ -343,7 +344,7 @@ class Solver:
         elif slack > 0.0 and status in (Status.CONVERGED, Status.REAL_TIME):
             status = Status.INFEASIBLE
         u = np.minimum(np.maximum(u, self._u_min), self._u_max)
-        # Both begin in x_t: bounds on v_0 are bounds on u_0.
+        # Both trajectories begin at x_t, so bounds on v_0 are bounds on u_0.
         u[0] = v[0]
         u = self._rows.within_steps(u)
         cost = merit * self.problem.model.cost_scale
@@ -352,10 +353,10 @@ class Solver:
 
 
 def _share(step: np.ndarray, before: np.ndarray, taken: float) -> float:
-    """How much of a step to take, at most 1, where of the step `before` a share `taken` was; (N, m), scaled.
+    """Return the share of a step to take, at most 1, after the share `taken` of the step `before`; (N, m), scaled.
 
-    Gauss-Newton leaves the curvature of h_hat out. Where the true one is 1 + a times as large, a share t of a step
-    leaves 1 - t (1 + a) of it to go. Two steps say what a is, and 1 / (1 + a) is the best share (Aitken).
+    Gauss-Newton neglects the curvature of h_hat. If the true curvature is 1 + a times as large, a share t of a step
+    leaves 1 - t (1 + a) of the distance. Two steps determine a, and the best share is 1 / (1 + a) (Aitken).
     """
     length = float((before * before).sum())
     left = float((step * before).sum()) / length if length > 0.0 else 0.0
@@ -363,5 +364,5 @@ def _share(step: np.ndarray, before: np.ndarray, taken: float) -> float:
 
 
 def _numbers(v: np.ndarray) -> np.ndarray:
-    """`v` with a number in the place of what is none; to look first takes a tenth of the time."""
+    """Return `v` with NaN and infinities replaced. The check first takes a tenth of the time."""
     return v if finite(v) else np.nan_to_num(v)

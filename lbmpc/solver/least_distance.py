@@ -1,6 +1,6 @@
 """Least-distance problems with few active rows out of many: min |w|^2 / 2, lower <= y + M w <= upper.
 
-DAQP solves them; it is shown only the rows that some iterate violated, which in MPC are few.
+DAQP solves them. It receives only the rows that some iterate violated, which are few in MPC.
 """
 
 from __future__ import annotations
@@ -10,26 +10,26 @@ from dataclasses import dataclass
 import daqp
 import numpy as np
 
-# Of w, and of each row's scale. DAQP's own default, 1e-6, moves the first input by 5e-6.
+# Tolerance of w, and of each row relative to its scale. DAQP's default, 1e-6, moves the first input by 5e-6.
 PRIMAL_TOLERANCE = 1e-9
 UNMOVED = 1e-12
-"""Of a row's scale: a row that w = 1 moves by less is not moved at all. Soft ones then are what they are: a position at
-the first step, say, of a model in which an input moves the speed."""
+"""Share of a row's scale. A row that w = 1 moves by less does not depend on w, and a soft one then keeps its violation.
+An example is a position at the first step of a model whose input changes the velocity."""
 SOFT = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Penalty:
-    """Soft rows pay weight (e + e^2 / 2), e = violation / scale; exact for multipliers up to weight / scale."""
+    """Cost of soft rows: weight (e + e^2 / 2), e = violation / scale; exact for multipliers up to weight / scale."""
 
     soft: np.ndarray
-    """Which rows are soft, (rows,) of bool."""
+    """Mask of the soft rows, (rows,) of bool."""
     scale: np.ndarray
-    """What counts as 1, (rows,), of hard rows too: the unit of their tolerance."""
+    """Units of the rows, (rows,), also for hard rows, whose tolerance uses them."""
     weight: float
 
     def cost(self, violation: np.ndarray) -> float:
-        """Sum over the soft rows; violation is (rows,), zero where kept."""
+        """Return the sum over the soft rows; violation is (rows,), zero for satisfied rows."""
         if not violation.any():
             return 0.0
         e = violation[self.soft] / self.scale[self.soft]
@@ -37,7 +37,7 @@ class Penalty:
 
 
 def violation(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """How far each row is outside its bounds, zero inside; (rows,)."""
+    """Return the violation of each row, zero inside its bounds; (rows,)."""
     return np.maximum(np.maximum(lower - values, values - upper), 0.0)
 
 
@@ -45,11 +45,11 @@ NO_ROWS: np.ndarray = np.zeros(0, dtype=np.intp)
 
 
 class Shown:
-    """The QP over some of the rows: set up once, then solved for one y after another.
+    """The QP over a subset of the rows, set up once and solved for several y.
 
     Args:
         M, lower, upper, penalty: as for `least_distance`.
-        seen: which rows, indices.
+        seen: indices of the rows.
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class Shown:
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         moved = norms > UNMOVED * penalty.scale[seen]
         self._usable = not np.isnan(norms).any()
-        # Hard ones that are not moved are kept or not.
+        # Hard rows that do not depend on w are either satisfied or not.
         fixed = seen[~moved & ~penalty.soft[seen]]
         self._fixed, self._low, self._high = fixed, lower[fixed], upper[fixed]
         if not moved.all():
             seen, rows, norms = seen[moved], rows[moved], norms[moved]
         self._own = seen
-        # Rows of length 1, so that DAQP's tolerances and weights mean distances.
+        # Rows of length 1 give DAQP's tolerances and weights the meaning of distances.
         self._inverse = 1.0 / norms
         self._rows = rows * self._inverse[:, None]
         self._lower, self._upper = lower[seen] * self._inverse, upper[seen] * self._inverse
@@ -77,12 +77,12 @@ class Shown:
         self._model: daqp.Model | None = None
 
     def solve(self, y: np.ndarray) -> np.ndarray | None:
-        """w (n,) for the row values y (rows,) at w = 0; None when the shown rows contradict each other."""
+        """Return w (n,) for the row values y (rows,) at w = 0; None if the rows conflict."""
         fixed = y[self._fixed]
         if not (self._usable and (fixed >= self._low).all() and (fixed <= self._high).all()):
             return None
         if not len(self._own):
-            # Rows may be outside by less than the tolerance: nothing holds w away from 0.
+            # Rows may be violated by less than the tolerance, so no row moves w away from 0.
             return np.zeros(self._free)
         offset = y[self._own] * self._inverse
         if self._model is None:
@@ -109,7 +109,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Minimiser w (n,), the row values y + M w (rows,) there, and the QP that gave it."""
+    """Minimiser w (n,), the row values y + M w (rows,), and the QP."""
 
     w: np.ndarray
     values: np.ndarray
@@ -125,15 +125,15 @@ def least_distance(
     hint: np.ndarray = NO_ROWS,
     ready: Shown | None = None,
 ) -> Nearest | None:
-    """The minimiser, or None when hard rows contradict each other or the numbers are unusable.
+    """Return the minimiser; None if hard rows conflict or the numbers are not finite.
 
     Args:
         y: row values at w = 0, (rows,).
-        M: how they move with w, (rows, n).
+        M: slopes of the rows in w, (rows, n).
         lower, upper: bounds, (rows,).
-        penalty: which rows are soft, and the rows' scales.
-        hint: indices of rows to show from the start; they change the time, not the result.
-        ready: a QP over rows of this very M, to begin with.
+        penalty: soft rows, and the scales of all rows.
+        hint: indices of rows to include from the start. They affect the time, not the result.
+        ready: an existing QP over rows of the same M to start with.
     """
     low, high = lower - PRIMAL_TOLERANCE * penalty.scale, upper + PRIMAL_TOLERANCE * penalty.scale
     seen = ready.seen if ready is not None else hint
@@ -142,7 +142,7 @@ def least_distance(
     values, shown = y, ready
     if shown is None:
         seen = np.concatenate([seen, np.flatnonzero(((y > high) | (y < low)) & unseen)])
-    # Each round adds a row at least, so the rows themselves bound the rounds.
+    # Each round adds at least one row, so the number of rows limits the rounds.
     for _ in range(len(y) + 1):
         shown = shown or Shown(M, lower, upper, penalty, seen)
         w = shown.solve(y)

@@ -1,7 +1,7 @@
-"""The nominal trajectory of given inputs and what its rows say, in one call; and the inputs of given c in another.
+"""Two compiled calls: the nominal trajectory of given inputs with its row values, and the inputs for a given c.
 
-Every solve ends with it, and in a fast loop the dozen small array operations that it stands for would take longer than
-the rest of the feedback.
+Every solve ends with the first. In a fast loop, the equivalent dozen numpy operations would take longer than the rest
+of the feedback step.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from lbmpc.problem import Problem
 
 
 def build_nominal(problem: Problem) -> ca.Function:
-    """(x, v, lower, upper) -> (zbar, c, values, outside, total) for x_t = x (d,) and inputs v (m, n).
+    """Build (x, v, lower, upper) -> (zbar, c, values, outside, total) for x_t = x (d,) and inputs v (m, n).
 
-    zbar (d, n) are the nominal states zbar_1..n; c (m, n) is v_i - K zbar_i; values (rows,) those of the rows of
-    `constraint_rows`; outside (rows,) how far each is beyond its bounds, 0 where it keeps them; total the sum of all
-    values, finite where all are.
+    zbar (d, n) are the nominal states zbar_1..n. c (m, n) is v_i - K zbar_i. values (rows,) are those of the rows of
+    `constraint_rows`. outside (rows,) is the violation of each row, 0 within its bounds. total is the sum of all
+    values, which is finite if all of them are.
     """
     model, n = problem.model, problem.horizon
     a, b = ca.DM(model.A), ca.DM(model.B)
@@ -32,7 +32,7 @@ def build_nominal(problem: Problem) -> ca.Function:
     if limited := np.flatnonzero(np.isfinite(problem.input_steps)).tolist():
         blocks += [(entry - before)[limited] for before, entry in pairwise(inputs)]
     blocks += [state if of_states.is_box else ca.DM(of_states.F) @ state for state in states[1:]]
-    # The last step may carry the rows of a terminal set behind those that all steps share.
+    # The last step can have the rows of a terminal set in addition to the common rows.
     if len(terminal := problem.states[-1].F[len(of_states.F) :]):
         blocks.append(ca.DM(terminal) @ states[-1])
     values, c = ca.vertcat(*blocks), v - ca.DM(model.K) @ ca.horzcat(*states[:-1])
@@ -48,10 +48,10 @@ def build_nominal(problem: Problem) -> ca.Function:
 
 
 def build_start(problem: Problem) -> ca.Function:
-    """(x, c, lower, upper) -> v: inputs K zbar_i + c_i, (m, n), brought inside their bounds one after the other.
+    """Build (x, c, lower, upper) -> v: inputs K zbar_i + c_i, (m, n), clipped one after the other.
 
-    `lower` and `upper`, (m,), are those of v_0; where inputs may step, they are left to whoever clips v. A plan from
-    before, put in this way, stays near its own trajectory from a state that it did not expect.
+    `lower` and `upper`, (m,), are the bounds of v_0 under rate limits. Without rate limits the caller clips v_0. An
+    earlier plan in this form stays near its own trajectory when it starts from an unexpected state.
     """
     model, n = problem.model, problem.horizon
     a, b, gain = ca.DM(model.A), ca.DM(model.B), ca.DM(model.K)

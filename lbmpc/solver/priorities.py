@@ -1,11 +1,11 @@
-"""Soft rows that give way in order: successive QPs, one a priority (lexicographic; Kerrigan and Maciejowski 2002).
+"""Relaxation of soft rows in order of priority: successive QPs (lexicographic; Kerrigan and Maciejowski 2002).
 
-A row is violated as it would be if there were no rows of less importance. So they are left out at first; what the more
-important rows are then violated by is granted to them as bounds, which from there on are hard, and the next priority
-joins. Weights would have to grow with every priority, with the horizon and with how steep rows are to each other.
+The violation of a row does not depend on less important rows. The less important rows are left out at first. The
+violations of the important rows are then granted as hard bounds, and the next priority is added. With weights instead
+of QPs, the weights would have to grow with every priority, with the horizon and with the angles between rows.
 
-Where all are soft with one weight and nothing that is violated could be mended by a row of less importance, that is
-the same solution. It is looked at first, so that only a contradiction of two priorities costs more than one QP.
+If all rows are soft with one weight, and no violation could be reduced by relaxing a less important row, the solution
+is the same. This case is checked first, so only a conflict of two priorities needs more than one QP.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 from lbmpc.solver.least_distance import NO_ROWS, Nearest, Penalty, least_distance, violation
 
 AT_ONCE = 1e-7
-"""Of a row's scale: nearer to its bound a row counts as holding something up, further beyond it as violated."""
+"""Share of a row's scale. A row counts as active within this distance of its bound, and as violated beyond it."""
 GRANTED = 1e-8
-"""Of a row's scale, more than it was violated by: so that the next QP has a solution."""
+"""Share of a row's scale that is granted in addition to the violation, so that the next QP is feasible."""
 
 
 class Eased(NamedTuple):
-    """The bounds, (rows,) each, with what was granted to violated rows."""
+    """The bounds, (rows,) each, with the relaxations granted to violated rows."""
 
     lower: np.ndarray
     upper: np.ndarray
@@ -33,7 +33,7 @@ class Eased(NamedTuple):
 def contradicts(
     values: np.ndarray, lower: np.ndarray, upper: np.ndarray, scale: np.ndarray, levels: np.ndarray
 ) -> bool:
-    """Whether a row is violated while one of less importance, a larger level, is at its bound or beyond."""
+    """Return whether a row is violated while a less important one, with a larger level, is active or violated."""
     beyond = np.maximum(lower - values, values - upper) / scale
     violated, holding = levels[(beyond > AT_ONCE) & (levels >= 0)], levels[beyond > -AT_ONCE]
     return bool(violated.size and violated.min() < holding.max(initial=-1))
@@ -47,9 +47,9 @@ def in_order(
     penalty: Penalty,
     levels: np.ndarray,
 ) -> tuple[Nearest, Eased] | None:
-    """The minimiser, and the bounds with what it grants; None where the numbers are unusable.
+    """Return the minimiser and the relaxed bounds; None if the numbers are not finite.
 
-    Arguments as for `least_distance`. levels: (rows,), the priority of soft rows, -1 of hard ones.
+    Arguments as for `least_distance`. levels: (rows,), the priority of soft rows, -1 for hard rows.
     """
     found, hint = None, NO_ROWS
     for level in sorted(set(levels[levels >= 0].tolist())):

@@ -1,27 +1,27 @@
-"""The two CasADi functions inside the solver: one Gauss-Newton linearisation, whitened by a Riccati sweep.
+"""The CasADi functions of the solver: a Gauss-Newton linearisation whitened by a Riccati sweep, and its sensitivities.
 
-The learned trajectory is steered by u_i = v_i + K (z_i - zbar_i). At an iterate v the Gauss-Newton subproblem in the
-step du is a linear-quadratic problem. Its Riccati recursion gives gains such that, with
+The inputs of the learned trajectory are u_i = v_i + K (z_i - zbar_i). At an iterate v the Gauss-Newton subproblem in
+the step du is a linear-quadratic problem. Its Riccati recursion gives gains such that, with
 
     du_i = K_i dz_i + k_i + L_i^{-T} w_i,
 
-the cost is a constant plus |w|^2 / 2. The constrained subproblem is then a least-distance problem in w: as close to
-w = 0, the unconstrained minimiser, as the rows allow. `sweep` finds that minimiser; `rows` says how the inputs and
-the nominal states move with w, by
+the cost is a constant plus |w|^2 / 2. The constrained subproblem is then a least-distance problem in w: find the
+feasible w nearest to 0, the unconstrained minimiser. `sweep` computes that minimiser. `rows` computes the dependence
+of inputs and nominal states on w by
 
     dv_i = du_i - K (dz_i - dzbar_i),   dzbar_{i+1} = A dzbar_i + B dv_i,
 
-so that v and zbar of any step keep the nominal model exactly, whatever the linearisation of z is worth.
+so v and zbar of any step satisfy the nominal model exactly, independent of the accuracy of the linearisation of z.
 
-No Hessian is formed and nothing is factorised but m x m blocks.
+No Hessian is formed, and only m x m blocks are factorised.
 
-The rows look at the nominal states zbar. A backup policy (`controller.backup_policy`) has them look at the learned
-states z instead, of which the recursion holds the linearisation anyway, and there u is v: `constrained`.
+The rows constrain the nominal states zbar. In a backup policy (`controller.backup_policy`) they constrain the learned
+states z, whose linearisation the recursion contains anyway, and u is v; see `constrained`.
 
-Where the oracle looks back, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D: the
-cost sees x alone, and of the Jacobians only the d rows of x+ are stored, since the rest of s+ is a shift. Without a
-look back s is x and D is d. Where changes of the input cost something, the input before stands behind all that, so that
-D has m entries more: it is what s+ has of u.
+For an oracle with a window, the state of the recursion is s = (x, past pairs) of `lbmpc.oracles.base`, of length D. The
+cost depends on x alone, and only the d rows of x+ of the Jacobians are stored, because the rest of s+ is a shift.
+Without a window s is x and D is d. If changes of the input have a cost, the previous input follows in s, so that D is
+larger by m; in s+ it is u.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from lbmpc.model import Model
 from lbmpc.oracles.base import Oracle, follow_symbols, remembered
 
 Constrained = Literal["nominal", "learned"]
-"""Whose states the rows look at."""
+"""Selects the states that the rows constrain."""
 
 
 def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained = "nominal") -> ca.Function:
-    """(x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
+    """Build (x, v, theta, xr, ur) -> (cost, vs, us, zs, A, B, K, L) for a horizon of n.
 
-    Inputs: x (D,), which is s_0 and, where it counts, u_{-1}, iterate v (m, n), theta, references xr (d, n + 1) and ur
-    (m, n).
-    Outputs: half of psi at v, as a share of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m,
-    n), the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along
-    the learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
-    With `learned`, zs are the minimiser's learned states as this linearisation has them; z (d, n) are those of v.
+    Inputs: x (D,), which is s_0 followed by u_{-1} if changes have a cost; iterate v (m, n); theta; references xr
+    (d, n + 1) and ur (m, n).
+    Outputs: half of psi at v, in units of the model's `cost_scale`; the subproblem's unconstrained minimiser vs (m, n),
+    the inputs us (m, n) of its learned states and its *nominal* states zbar_1..n, zs (d, n); the Jacobians along the
+    learned trajectory A (d, D n), B (d, m n); gains K (m, D n) and L^{-T} (m, m n).
+    With `learned`, zs are the minimiser's learned states in this linearisation; z (d, n) are those of v.
     """
     d, m, behind, before = model.d, model.m, remembered(oracle), input_before(model)
-    # The cost's own scale is the unit: w, the penalty and the QP's tolerances then mean the same for any Q and R.
+    # The cost is in units of its own scale, so that w, the penalty and the QP's tolerances are comparable for any Q, R.
     q, r, p, change = (
         ca.DM(weight / model.cost_scale) for weight in (model.Q, model.R, model.P, model.S[:before, :before])
     )
@@ -139,23 +139,23 @@ def build_sweep(model: Model, oracle: Oracle, n: int, constrained: Constrained =
 
 
 def build_rows(model: Model, n: int, behind: int = 0, constrained: Constrained = "nominal") -> ca.Function:
-    """(A, B, K, L) of `sweep` -> M' (m n, (m + d) n), U' (m n, m n), transposed.
+    """Build (A, B, K, L) of `sweep` -> M' (m n, (m + d) n), U' (m n, m n), transposed.
 
-    M: how v_0..n-1, then zbar_1..n, move with w; U: how u_0..n-1 do. `behind`: D - d. With `learned`, z_1..n instead
-    of zbar_1..n.
+    M contains the slopes of v_0..n-1 and zbar_1..n in w; U those of u_0..n-1. `behind` is D - d. With `learned`, z_1..n
+    replace zbar_1..n.
     """
     return _propagation(model, n, behind, follow_state=False, constrained=constrained)
 
 
 def build_tangent(model: Model, n: int, behind: int = 0) -> ca.Function:
-    """`build_rows`, and besides Y' (D, (m + d) n) and X' (D, m n): how the same follow s_0 when w stays."""
+    """Build `build_rows` with the slopes in s_0 for constant w in addition: Y' (D, (m + d) n) and X' (D, m n)."""
     return _propagation(model, n, behind, follow_state=True)
 
 
 def _propagation(
     model: Model, n: int, behind: int, follow_state: bool, constrained: Constrained = "nominal"
 ) -> ca.Function:
-    """Forward sensitivities, one row a direction: the blocks of all stages then lie side by side in memory."""
+    """Build forward sensitivities with one row per direction, so that the blocks of all stages are contiguous."""
     d, m, past, before = model.d, model.m, model.d + behind, input_before(model)
     length = past + before
     a, b = ca.DM(model.A).T, ca.DM(model.B).T
@@ -163,7 +163,7 @@ def _propagation(
     k_all, l_all = ca.MX.sym("K", m, length * n), ca.MX.sym("L", m, m * n)
     a_i, b_i = ca.horzsplit(a_all, length), ca.horzsplit(b_all, m)
     k_i, l_i = ca.horzsplit(k_all, length), ca.horzsplit(l_all, m)
-    # Directions: those of s_0, where they are followed, then all of w.
+    # Directions: those of s_0 if requested, then all of w.
     of_state = length if follow_state else 0
     rows = of_state + m * n
     start = (
@@ -175,7 +175,7 @@ def _propagation(
     gain = _gain(model, constrained).T
     moves, steered, states = [], [], []
     for i in range(n):
-        # w_i begins to act at stage i.
+        # w_i acts from stage i on.
         own = ca.vertcat(ca.MX(of_state + m * i, m), l_i[i].T, ca.MX(m * (n - 1 - i), m))
         steered.append(step @ k_i[i].T + own)
         moves.append(steered[i] - (step[:, :d] - nominal) @ gain)
@@ -194,23 +194,23 @@ def _propagation(
 
 
 def input_before(model: Model) -> int:
-    """Entries of the recursion's state for the input before: m where changes of it cost something."""
+    """Return the number of entries for the previous input in the recursion's state: m if changes have a cost."""
     return model.m if model.changes_cost else 0
 
 
 def with_input(model: Model, s: np.ndarray, previous: np.ndarray | None) -> np.ndarray:
-    """What `sweep` takes for x: s, and where it counts the input before, (m,), behind it; None: the equilibrium's."""
+    """Return x of `sweep`: s, followed by the previous input, (m,), if it matters; None means the equilibrium's."""
     before = input_before(model)
     return np.concatenate([s, np.zeros(before) if previous is None else previous]) if before else s
 
 
 def _gain(model: Model, constrained: Constrained) -> ca.DM:
-    """K, (m, d), that holds the learned trajectory at the nominal one; 0 where there is no nominal one."""
+    """Return K, (m, d), of the learned trajectory about the nominal one; 0 without a nominal one."""
     return ca.DM(model.K) if constrained == "nominal" else ca.DM(model.m, model.d)
 
 
 def _learned_stage(model: Model, oracle: Oracle, parts: list[ca.MX]) -> ca.Function:
-    """(s, v, parts...) -> A z + B v + h_hat(s, v), with z the first d entries of s."""
+    """Build (s, v, parts...) -> A z + B v + h_hat(s, v), with z the first d entries of s."""
     s, v = ca.MX.sym("z", model.d + remembered(oracle)), ca.MX.sym("v", model.m)
     z = s if oracle.pairs == 1 else s[: model.d]
     symbols = [ca.MX.sym(f"part{i}", *part.shape) for i, part in enumerate(parts)]
@@ -219,7 +219,7 @@ def _learned_stage(model: Model, oracle: Oracle, parts: list[ca.MX]) -> ca.Funct
 
 
 def _riccati_stage(d: int, m: int, q: ca.DM, r: ca.DM) -> ca.Function:
-    """One step back: (P, p, A, B, q, r) -> (P-, p-, K, k, L^{-T})."""
+    """Build one backward step: (P, p, A, B, q, r) -> (P-, p-, K, k, L^{-T})."""
     p_matrix, p_vector = ca.SX.sym("P", d, d), ca.SX.sym("p", d)
     a, b = ca.SX.sym("A", d, d), ca.SX.sym("B", d, m)
     gradient_z, gradient_v = ca.SX.sym("q", d), ca.SX.sym("r", m)
@@ -245,10 +245,10 @@ def _riccati_stage(d: int, m: int, q: ca.DM, r: ca.DM) -> ca.Function:
 
 
 def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM, change: ca.DM) -> ca.Function:
-    """`_riccati_stage` where s+ = (A s + B v, s without x and its oldest pair, x, v): A (d, D), B (d, m).
+    """Build `_riccati_stage` for s+ = (A s + B v, s without x and its oldest pair, x, v): A (d, D), B (d, m).
 
-    Where changes of the input cost something, `change` (m, m), s ends with the input before, and s+ with v. q is then
-    (D,), as it is where s has pairs. The shift costs no product: the transposed dynamics pick rows.
+    If changes of the input have a cost, `change` (m, m), s ends with the previous input, and s+ with v. q is then (D,),
+    as it is for an s with pairs. The shift needs no product: the transposed dynamics select rows.
     """
     past, pair, before = d + behind, d + m, change.shape[0]
     length = past + before
@@ -257,7 +257,7 @@ def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM, chang
     gradient_s, gradient_v = ca.MX.sym("q", length), ca.MX.sym("r", m)
 
     def back(rows: ca.MX) -> ca.MX:
-        """From the derivative along s+, one row an entry, to that along s."""
+        """Map the derivative along s+, one row per entry, to that along s."""
         derivative = a.T @ rows[:d, :]
         if behind:
             forgotten, free = ca.MX.zeros(pair, rows.shape[1]), ca.MX.zeros(before, rows.shape[1])
@@ -297,5 +297,5 @@ def _riccati_stage_behind(d: int, m: int, behind: int, q: ca.DM, r: ca.DM, chang
 
 
 def _padded(matrix: ca.DM, behind: int) -> ca.MX:
-    """A weight on x as a weight on s, `behind` entries longer."""
+    """Extend a weight on x to a weight on s, which is `behind` entries longer."""
     return ca.MX(ca.densify(ca.diagcat(matrix, ca.DM(behind, behind))) if behind else matrix)

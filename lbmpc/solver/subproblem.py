@@ -1,4 +1,4 @@
-"""The Gauss-Newton subproblem: the cost's quadratic model about an iterate, and the best step that the rows allow."""
+"""The Gauss-Newton subproblem: the quadratic model of the cost at an iterate, and its minimiser under the rows."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from lbmpc.solver.constraint_rows import Rows
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where one Gauss-Newton step leads."""
+    """The result of one Gauss-Newton step."""
 
     v: np.ndarray
     """Inputs, (N, m)."""
     u: np.ndarray
-    """Those of the learned trajectory, (N, m)."""
+    """Inputs of the learned trajectory, (N, m)."""
     values: np.ndarray
-    """Row values there, (rows,)."""
+    """Row values, (rows,)."""
     feasible: bool
-    """Whether the hard state rows can be met."""
+    """Whether the hard state rows are feasible."""
     seen: np.ndarray
-    """Rows that the QP was shown."""
+    """Indices of the rows in the QP."""
 
 
 class Subproblem:
-    """Linearised at one iterate after another.
+    """The subproblem, linearised at successive iterates.
 
     Args:
-        sweep: `riccati.build_sweep`, with the states that the rows look at.
+        sweep: `riccati.build_sweep` for the states that the rows constrain.
         move: `riccati.build_rows` for the same states; the sweeps of two oracles may share it.
     """
 
@@ -51,31 +51,31 @@ class Subproblem:
     def load(
         self, x: np.ndarray, theta: np.ndarray, xr: np.ndarray | None = None, ur: np.ndarray | None = None
     ) -> None:
-        """From which state, (D,), with which oracle's parameters and towards which references, from now on."""
+        """Set the initial state, (D,), the oracle's parameters and the references."""
         inputs = self.sweep.inputs
         inputs["x"][:, 0], inputs["theta"][:, 0] = x, theta
         inputs["xr"][:] = 0.0 if xr is None else np.asarray(xr).T
         inputs["ur"][:] = 0.0 if ur is None else np.asarray(ur).T
 
     def linearise(self, v: np.ndarray) -> float:
-        """Linearise at v, (N, m); its true cost, soft constraints left out, as a share of the model's `cost_scale`."""
+        """Linearise at v, (N, m), and return its true cost without soft constraints, in units of `cost_scale`."""
         self.sweep.inputs["v"][:] = v.T
         self.sweep()
         return float(self.sweep.outputs["cost"][0, 0])
 
     def values(self, rows: Rows) -> np.ndarray:
-        """Row values, (rows,), at w = 0: the unconstrained minimiser."""
+        """Return the row values, (rows,), at w = 0, the unconstrained minimiser."""
         return rows.values(self.sweep.outputs["vs"], self.sweep.outputs["zs"])
 
     def propagate(self, function: Bound) -> dict[str, np.ndarray]:
-        """What `riccati.build_rows` or `build_tangent` says about this linearisation."""
+        """Evaluate `riccati.build_rows` or `build_tangent` for this linearisation."""
         for name in "ABKL":
             function.inputs[name][:] = self.sweep.outputs[name]
         function()
         return function.outputs
 
     def constrained(self, rows: Rows, values: np.ndarray, hint: np.ndarray) -> Target | None:
-        """The minimiser that keeps the rows, from their `values` at w = 0; None when the numbers are unusable.
+        """Return the minimiser under the rows, given their `values` at w = 0; None if the numbers are not finite.
 
         `hint` as for `least_distance`.
         """
@@ -90,6 +90,6 @@ class Subproblem:
 
 
 def finite(values: np.ndarray) -> bool:
-    """Whether all are numbers, none of them beyond 1e150; then, and only then, their sum of squares is one."""
+    """Return whether all values are finite and none exceeds 1e150, which holds if their sum of squares is finite."""
     flat = values.ravel(order="K")
     return isfinite(flat.dot(flat))

@@ -1,1 +1,1 @@
-"""One file for each architecture of the hidden layers; the file's name is what `network.architecture` says."""
+"""Architectures of the hidden layers, one file each; `network.architecture` is the file's name."""

@@ -1,8 +1,8 @@
-"""A 1-D convolution along the window, n_1 channels, then dense layers on all its positions.
+"""A 1-D convolution along the window with n_1 channels, followed by dense layers on all its positions.
 
     c_j = psi_1(W' (1, p_j .. p_{j+w-1})),  j = 1 .. k - w + 1,    phi from (c_1 .. c_{k-w+1}) through n_2..n_L
 
-with w the option `kernel`.
+where w is the option `kernel`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Cnn(Architecture):
         kernel = sizes.options["kernel"]
         if not 1 <= kernel <= sizes.window:
             raise ValueError(
-                f"the kernel of a cnn covers 1 to {sizes.window} pairs, the window, not {kernel}"
+                f"the kernel of a cnn covers 1 to {sizes.window} pairs (the window); it is {kernel}"
             )
         channels = sizes.hidden[0]
         return [
@@ -29,7 +29,7 @@ class Cnn(Architecture):
         ]
 
     def outputs(self, sizes: Sizes) -> int:
-        # One layer alone leaves every position's channels.
+        # With a single layer, the channels of every position are the output.
         return sizes.hidden[-1] * (_positions(sizes) if len(sizes.hidden) == 1 else 1)
 
     def forward(

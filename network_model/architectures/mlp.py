@@ -1,4 +1,4 @@
-"""The multilayer perceptron of the paper: dense layers on (x, u), or on the whole window where it is longer."""
+"""The multilayer perceptron of the paper: dense layers on (x, u), or on the whole window when it is longer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recurrent network (Elman): one hidden state goes along the window, dense layers stand on its last value.
+"""A recurrent network (Elman): one hidden state runs along the window, and dense layers act on its last value.
 
 s_1 = psi_1(W' (1, p_1)),    s_j = psi_1(W' (1, p_j) + R' (1, s_{j-1})),    phi from s_k through n_2..n_L
 """
@@ -16,7 +16,7 @@ class Rnn(Architecture):
     def shapes(self, sizes: Sizes) -> list[tuple[int, int]]:
         if sizes.window < 2:
             raise ValueError(
-                "an rnn needs a window of at least 2 pairs: with one it has nothing to recur over"
+                "an rnn needs a window of at least 2 pairs, because it recurs over the pairs; raise network.window"
             )
         n = sizes.hidden[0]
         return [(1 + sizes.pair, n), (1 + n, n), *dense_shapes(n, sizes.hidden[1:])]

@@ -1,4 +1,4 @@
-"""Messages that nobody waits for travel together: at 1 kHz, to send each one costs more than to make it."""
+"""Batches of messages that are not urgent. At 1 kHz, sending a message alone costs more than creating it."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ BATCH_TOPICS = {topic.name for topic in topics.BATCH.values()}
 
 
 class Waiting(NamedTuple):
-    """A message that waits for others."""
+    """A message that waits to be sent in a batch."""
 
     topic: str
     published_ns: int
-    """On the monotonic clock."""
+    """Monotonic clock."""
     payload: bytes
 
 
 def encode_batch(run_id: str, seq: int, waiting: list[Waiting]) -> bytes:
-    """The `Batch` of these messages, sent now."""
+    """Return the `Batch` of these messages, sent now."""
     now_ns = clock.now_ns()
     parts = [m.Gathered(topic, max(0, now_ns - at), payload) for topic, at, payload in waiting]
     return codec.encode(m.Batch(run_id=run_id, seq=seq, messages=parts))
 
 
 def unbatch(delivery: Delivery, bad: RejectedMessages) -> Iterator[Delivery]:
-    """The messages of a batch as if each had travelled alone, or the delivery itself when it is none.
+    """Yield the messages of a batch as if each had been sent alone; yield any other delivery unchanged.
 
-    Each arrived, as it were, as long before the batch as it was published before the batch was sent. A batch that
-    cannot be read is counted and handed on as it is.
+    The time of arrival of each message precedes that of the batch by the time that the message waited before it was
+    sent. A batch that cannot be read is counted and yielded unchanged.
     """
     topic = topics.topic_of(delivery.key)
     if topic is None or topic.name not in BATCH_TOPICS:
@@ -54,16 +54,16 @@ def unbatch(delivery: Delivery, bad: RejectedMessages) -> Iterator[Delivery]:
 
 
 class UnbatchingMailbox(Mailbox):
-    """A mailbox that takes batches in and gives out what is in them; its capacity counts batches."""
+    """A mailbox that unpacks batches; its capacity counts batches."""
 
     def __init__(self, name: str, capacity: int, bad: RejectedMessages):
-        """`bad`: where batches that cannot be read are counted."""
+        """`bad` counts batches that cannot be read."""
         super().__init__(name, capacity)
         self._bad = bad
         self._unbatched: deque[Delivery] = deque()
 
     def get(self, timeout_s: float = 0.0) -> Delivery | None:
-        """The oldest message, waiting up to `timeout_s` for one; None when there is none. One thread only."""
+        """Return the oldest message, waiting up to `timeout_s` for one; None if there is none. For one thread only."""
         if not self._unbatched:
             delivery = super().get(timeout_s)
             if delivery is not None:
@@ -71,7 +71,7 @@ class UnbatchingMailbox(Mailbox):
         return self._unbatched.popleft() if self._unbatched else None
 
     def drain(self) -> list[Delivery]:
-        """Everything that is here, oldest first. One thread only."""
+        """Return all messages, oldest first. For one thread only."""
         before = list(self._unbatched)
         self._unbatched.clear()
         return before + [one for delivery in super().drain() for one in unbatch(delivery, self._bad)]

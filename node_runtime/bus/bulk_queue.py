@@ -1,4 +1,4 @@
-"""What a bus has published on its bulk lane and not sent yet: bounded, in order, in batches where a loop is fast."""
+"""The queue of messages on a bus's bulk lane: bounded, in order, and in batches if a loop is fast."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_BYTES = 256 * 1024 * 1024
 
 
 class BulkQueue:
-    """One bus's messages on their way to the thread that sends them. Any thread may call; nobody waits for the link."""
+    """The messages of one bus for the sending thread. Any thread may call; no call waits for the link."""
 
     def __init__(
         self,
@@ -25,7 +25,7 @@ class BulkQueue:
         post: Callable[[Callable[[], None]], None],
         send: Callable[[Topic, bytes], None],
     ):
-        """`batch`: the process's own topic for batches; `post`: leaves a call of `send` to the thread that sends."""
+        """`batch`: the process's topic for batches; `post`: hands a call of `send` to the sending thread."""
         self._run_id, self._batch_topic, self._post, self._send = run_id, batch, post, send
         self._waiting: list[Waiting] = []
         self._waiting_bytes = 0
@@ -35,16 +35,16 @@ class BulkQueue:
         self._bytes = 0
         self._closed = False
         self.overflow = 0
-        """Messages that found no place here."""
+        """Number of messages dropped because the queue was full."""
 
     def put(self, topic: Topic, payload: bytes) -> None:
-        """Send a message by itself, after the batch of those that were published before."""
+        """Send a message by itself, after the batch of the messages published before it."""
         with self._empty:
             self._put_batch()
             self._put(topic, len(payload), 1, lambda: payload)
 
     def put_batched(self, topic: Topic, payload: bytes, now_ns: int) -> None:
-        """Let a message wait for others, published at `now_ns` (monotonic); send them all when it is time."""
+        """Add a message, published at `now_ns` (monotonic), to the batch, and send the batch when it is due."""
         with self._empty:
             self._waiting.append(Waiting(topic.name, now_ns, payload))
             self._waiting_bytes += len(payload)
@@ -54,34 +54,34 @@ class BulkQueue:
 
     @property
     def unsent(self) -> int:
-        """Messages that are here, or on their way out."""
+        """Number of messages in the queue or being sent."""
         with self._empty:
             return self._messages + len(self._waiting)
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until everything is sent; False when it is not after `timeout_s`."""
+        """Wait until all messages are sent; False if they are not after `timeout_s`."""
         with self._empty:
             self._put_batch()
             return self._empty.wait_for(lambda: self._messages == 0, timeout_s)
 
     def close(self) -> None:
-        """Take nothing more."""
+        """Accept no more messages."""
         with self._empty:
             self._closed = True
 
     def _put_batch(self) -> None:
-        """With the lock held: what has waited is one message more to send. Its parts count one by one if lost."""
+        """Queue the waiting messages as one batch, with the lock held. If it is dropped, its parts count one by one."""
         waiting, size = self._waiting, self._waiting_bytes
         self._waiting, self._waiting_bytes = [], 0
         if waiting and self._batch_topic is not None:
-            # Numbered only when it is sent: a batch that finds no place leaves no gap.
+            # The number is assigned at sending, so a dropped batch leaves no gap.
             def encode() -> bytes:
                 return encode_batch(self._run_id, next(self._batches), waiting)
 
             self._put(self._batch_topic, size, len(waiting), encode)
 
     def _put(self, topic: Topic, size: int, messages: int, encode: Callable[[], bytes]) -> None:
-        """With the lock held."""
+        """Queue one message, with the lock held."""
         if self._closed:
             return
         if self._messages >= MAX_MESSAGES or self._bytes + size > MAX_BYTES:
@@ -92,7 +92,7 @@ class BulkQueue:
         self._post(partial(self._send_one, topic, size, encode))
 
     def _send_one(self, topic: Topic, size: int, encode: Callable[[], bytes]) -> None:
-        """In the thread that sends, where nobody waits for it."""
+        """Send one message in the sending thread."""
         try:
             self._send(topic, encode())
         finally:

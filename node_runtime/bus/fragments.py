@@ -1,9 +1,9 @@
-"""Large messages travel in fragments: a slow link is then never held for longer than one fragment takes.
+"""Large messages are sent in fragments, so that a slow link is occupied for at most the time of one fragment.
 
-Zenoh closes a link on which one message has waited for too long, and at 1 Mbit/s a megabyte takes eight seconds. A
-fragment fits into one of its batches. Fragments travel at the key of their message, one after the other, and the
-receiver puts them together before anybody reads them: whoever reads, logs or replays sees the whole message and nothing
-else. In the counters, and so in every log, they are called pieces.
+Zenoh closes a link on which a message has waited too long, and a megabyte takes eight seconds at 1 Mbit/s. A fragment
+fits into one Zenoh batch. The fragments of a message use its key, one after the other, and the receiver joins them
+before delivery. Readers, logs and replays therefore see whole messages only. Counters, and so logs, call fragments
+"pieces".
 """
 
 from __future__ import annotations
@@ -22,47 +22,47 @@ from protocol.codec import UNREADABLE
 from protocol.messages import Count
 
 FRAGMENT_BYTES = 48 * 1024
-"""Of a message in each of its fragments but the last; what is no longer travels whole."""
+"""Size of the data in each fragment except the last. Shorter messages are sent whole."""
 MARK = b"\xc1"
-"""Before each fragment: the one byte that no msgpack begins with."""
+"""First byte of a fragment: the only byte that cannot begin a msgpack message."""
 HEADER_BYTES = 512
-"""At most, around the data of a fragment."""
+"""Maximum overhead of a fragment."""
 WRITER_CHARACTERS = 128
 INCOMPLETE = 1024
-"""Messages that may be incomplete at once; a fleet's trainer hears one writer a plant."""
+"""Largest number of incomplete messages. A fleet's trainer receives from one writer per plant."""
 
 
 class Fragment(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """One fragment of a message of `size` bytes."""
 
     writer: str
-    """run_id of the process that sends it."""
+    """run_id of the sending process."""
     number: Count
-    """Which of its messages; every one in fragments has a higher number."""
+    """Number of the message. It increases with every message sent in fragments."""
     index: Count
     size: Count
-    """Bytes of the whole message."""
+    """Size of the whole message in bytes."""
     crc32: Count
-    """Of the whole message."""
+    """CRC-32 of the whole message."""
     data: bytes
 
 
 class BadFragmentError(ValueError):
-    """A fragment, or a message made of pieces, that must not be used; the text says why, for counting."""
+    """A fragment, or a message made of fragments, that must not be used. The text is the reason for the counter."""
 
 
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Fragment)
 
 
 class Fragmenter:
-    """Cuts what one process sends; any thread may call."""
+    """Splits the messages of one process; any thread may call."""
 
     def __init__(self, run_id: str):
         self._run_id = run_id
         self._numbers = itertools.count()
 
     def split(self, payload: bytes) -> Iterator[bytes]:
-        """What to send instead of a payload: itself, or its fragments in order."""
+        """Yield what must be sent for a payload: the payload itself, or its fragments in order."""
         number = next(self._numbers)
         if len(payload) <= FRAGMENT_BYTES:
             yield payload
@@ -81,12 +81,11 @@ class _Incomplete:
 
 
 class Reassembler:
-    """Puts messages together, those of each writer one at a time. Any thread may call; nothing is raised.
+    """Joins the fragments of messages, one message per writer at a time. Any thread may call; nothing is raised.
 
     Args:
-        limit: bytes held at most, of all messages that are not whole yet; the oldest gives way. As it does when there
-            are more than `INCOMPLETE` of them.
-        bad: where fragments that do not fit, and messages that never became whole, are counted.
+        limit: bytes held for all incomplete messages. Beyond it, or beyond `INCOMPLETE` messages, the oldest is
+        dropped. bad: counts invalid fragments and messages that stayed incomplete.
     """
 
     def __init__(self, limit: int, bad: RejectedMessages):
@@ -95,12 +94,12 @@ class Reassembler:
         self._lock = threading.Lock()
         self._incomplete: OrderedDict[tuple[str, str], _Incomplete] = OrderedDict()
         self.held = 0
-        """Bytes that wait for the rest of their messages."""
+        """Bytes of incomplete messages."""
 
     def whole(self, name: str, payload: bytes, largest: int) -> bytes | None:
-        """The message that a payload is, or that it completes if it is a fragment; None if it completes none.
+        """Return the message of a payload, or the message that a fragment completes; None if it completes none.
 
-        name: where it arrived; largest: bytes of a message there.
+        name: topic of the payload; largest: maximum size of a message there, in bytes.
         """
         if payload[:1] != MARK:
             return payload
@@ -112,7 +111,7 @@ class Reassembler:
             return None
 
     def end(self) -> None:
-        """Nothing more is coming: what is not whole now is lost."""
+        """Drop all incomplete messages, because no more fragments will arrive."""
         with self._lock:
             while self._incomplete:
                 self._forget(next(iter(self._incomplete)))
@@ -122,7 +121,7 @@ class Reassembler:
         at = (name, fragment.writer)
         message = self._incomplete.get(at)
         if message is not None and fragment.number > message.first.number:
-            # A writer sends one after the other, so the rest of the one before is not coming.
+            # A writer sends one message after the other, so the previous one will not be completed.
             self._forget(at)
             message = None
         if message is None:

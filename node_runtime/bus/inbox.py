@@ -1,4 +1,4 @@
-"""From raw payloads to messages that may be obeyed: decoded, of the right size, in order, of known age."""
+"""From raw payloads to accepted messages: decoded, of valid size, in order, and of known age."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ FollowVerdict = Literal["ok", "out of order", "foreign"]
 
 
 class Follower:
-    """Whom to obey on one topic; pure, no clock of its own.
+    """Selects the sender to follow on one topic. The class is pure and has no clock.
 
-    The first process incarnation seen is followed, with rising sequence numbers. After `silence` seconds in
-    which none of its messages was accepted, any incarnation may take over, the same one with a lower number
-    too.
+    The first process incarnation seen is followed, with rising sequence numbers. After `silence` seconds without an
+    accepted message, any incarnation may take over, including the same one with a lower number.
     """
 
     def __init__(self, silence: float):
@@ -37,15 +36,15 @@ class Follower:
 
     @property
     def run_id(self) -> str | None:
-        """The incarnation followed now, None before the first."""
+        """The incarnation followed now; None before the first."""
         return self._run_id
 
     def silent(self, now: float) -> bool:
-        """Whether nobody is followed, or none of its messages was accepted for so long that anybody may take over."""
+        """Return whether any sender may take over: none is followed, or its last accepted message is too old."""
         return self._run_id is None or now - self._last > self._silence
 
     def accept(self, run_id: str, seq: int, now: float) -> FollowVerdict:
-        """Judge one message that arrived at `now`, seconds on any monotonic clock."""
+        """Check one message that arrived at `now`, in seconds on any monotonic clock."""
         if not self.silent(now):
             if run_id != self._run_id:
                 return "foreign"
@@ -56,12 +55,12 @@ class Follower:
 
 
 class AgeEstimate:
-    """How old a message is, from the sender's own clock, without synchronised clocks; pure.
+    """Estimates the age of messages from the sender's clock, without synchronised clocks. The class is pure.
 
-    Arrival minus sender time is the unknown offset between the clocks plus the delay. Its running minimum is
-    the offset plus the shortest delay seen, so what lies above the minimum is age. The minimum leaks upwards
-    by `drift`, so that two clocks that drift apart do not make everything look old. It does not follow a
-    longer delay: what piled up during an outage must come out old.
+    Arrival time minus sender time is the unknown clock offset plus the delay. Its running minimum is the offset plus
+    the shortest delay, so the excess over the minimum is age. The minimum rises by `drift`, so that drifting clocks do
+    not make every message look old. It does not adapt to a longer delay, because messages queued during an outage must
+    be recognised as old.
     """
 
     # Quartz clocks disagree by tens of parts per million.
@@ -72,41 +71,41 @@ class AgeEstimate:
         self._at = 0.0
 
     def reset(self) -> None:
-        """Forget the offset: another process, another clock."""
+        """Forget the offset, for another process with another clock."""
         self._offset = None
 
     def plausible(self, sent: float, arrived: float) -> bool:
-        """False when the sender's clock seems to have leapt ahead: all that follows would look old.
+        """Return False if the sender's clock seems to have jumped ahead, so that all later messages would look old.
 
-        Or the messages so far were all late, by more than that; either shows in what follows.
+        The other possible cause is that all earlier messages were late by more than the limit.
         """
         return self._offset is None or arrived - sent > self._offset - self._implausible
 
     def observe(self, sent: float, arrived: float) -> None:
-        """Take note of a message sent at `sent` (sender's clock) and arrived at `arrived` (ours); seconds."""
+        """Record a message sent at `sent` (sender's clock) that arrived at `arrived` (own clock), in seconds."""
         offset = arrived - sent
         if self._offset is not None:
             offset = min(offset, self._offset + self._drift * max(0.0, arrived - self._at))
         self._offset, self._at = offset, max(arrived, self._at)
 
     def age(self, sent: float, now: float) -> float:
-        """Seconds since `sent`, beyond the shortest delay ever seen; 0 before the first observation."""
+        """Return the seconds since `sent` beyond the shortest delay seen; 0 before the first observation."""
         return 0.0 if self._offset is None else max(0.0, now - sent - self._offset)
 
 
 @dataclass(frozen=True, slots=True)
 class Received(Generic[M]):
-    """A message that may be obeyed, as far as its age allows."""
+    """An accepted message."""
 
     message: M
     arrived: float
     """Seconds on this process's monotonic clock."""
     sent: float | None
-    """Seconds on the sender's clock, where the message says."""
+    """Seconds on the sender's clock, if the message contains them."""
 
 
 class Inbox(Generic[M]):
-    """One topic's messages, checked. Never raises; whatever is wrong is counted in `bus.bad`."""
+    """Checks the messages of one topic. It never raises; rejected messages are counted in `bus.bad`."""
 
     def __init__(
         self,
@@ -119,9 +118,16 @@ class Inbox(Generic[M]):
         capacity: int = 256,
         arrived: threading.Condition | None = None,
     ):
-        """`states`, `inputs`: the plant's dimensions, None to leave them unchecked. `sent`: the sender's time
-        in a message, for its age. A flood beyond `capacity` between two reads loses the oldest. `arrived`: notified of
-        every message, for who waits for any of several inboxes."""
+        """Subscribe to a topic.
+
+        Args:
+            bus: the bus.
+            topic: the topic.
+            states, inputs: the plant's dimensions; None to leave them unchecked.
+            sent: returns the sender's time of a message, for its age.
+            capacity: messages kept between two reads; beyond it the oldest are lost.
+            arrived: notified of every message, so that a thread can wait for several inboxes.
+        """
         self.topic = topic
         self.follower = Follower(bus.config.bus.follow_silence)
         self._mailbox: Mailbox = bus.queue(topic, capacity, arrived)
@@ -131,13 +137,13 @@ class Inbox(Generic[M]):
         self._ages = AgeEstimate()
 
     def __len__(self) -> int:
-        """Messages that wait to be taken, whatever they are worth."""
+        """Number of messages to be taken, valid or not."""
         return len(self._mailbox)
 
     def take(self) -> Received[M] | None:
-        """The newest message that arrived since the last call and may be obeyed; never blocks.
+        """Return the newest acceptable message since the last call; never block.
 
-        All that arrived is looked at, so that garbage behind a good message does not hide it.
+        All messages are checked, so an invalid message after a valid one does not hide it.
         """
         newest = None
         for delivery in self._mailbox.drain():
@@ -145,12 +151,12 @@ class Inbox(Generic[M]):
         return newest
 
     def take_all(self) -> list[Received[M]]:
-        """All that arrived since the last call and may be obeyed, in order; never blocks."""
+        """Return all acceptable messages since the last call, in order; never block."""
         checked = (self._check(delivery) for delivery in self._mailbox.drain())
         return [received for received in checked if received is not None]
 
     def wait(self, timeout_s: float) -> Received[M] | None:
-        """Like `take`, waiting up to `timeout_s` for a message that may be obeyed."""
+        """Do the same as `take`, but wait up to `timeout_s` for an acceptable message."""
         newest = self.take()
         deadline = clock.now() + timeout_s
         while newest is None:
@@ -160,20 +166,20 @@ class Inbox(Generic[M]):
             newest = self._check(delivery)
             newest = self.take() or newest
             if clock.now() >= deadline:
-                # Also where what must not be obeyed never ends.
+                # This also ends a stream of messages that must not be accepted.
                 break
         return newest
 
     def age(self, received: Received[M], now: float) -> float:
-        """Seconds since the message was sent, beyond the shortest delay seen from this sender."""
+        """Return the seconds since the message was sent, beyond the shortest delay from this sender."""
         return 0.0 if received.sent is None else self._ages.age(received.sent, now)
 
     def forget_ages(self) -> None:
-        """Take the next message for as quick as any: who reads them knows that the shortest delay was none."""
+        """Reset the age estimate. Use it when the next message is known to have the shortest delay."""
         self._ages.reset()
 
     def undelayed(self, received: Received[M]) -> float:
-        """When the message would have arrived with the shortest delay seen from its sender; seconds."""
+        """Return the arrival time for the shortest delay from this sender, in seconds."""
         return received.arrived - self.age(received, received.arrived)
 
     def _check(self, delivery: Delivery) -> Received[M] | None:
@@ -188,7 +194,7 @@ class Inbox(Generic[M]):
         sent = None if self._sent is None else self._sent(message)
         followed = self.follower.run_id
         leapt = sent is not None and message.run_id == followed and not self._ages.plausible(sent, arrived)
-        # After silence it is taken for what the sender's clock says now: it must not be shut out for ever.
+        # After a silence the sender's clock is accepted as it is, so that the sender is not rejected permanently.
         if leapt and not self.follower.silent(arrived):
             self._bad.count(self.topic.name, "implausible time", f"sent at {sent} s by {message.run_id}")
             return None
@@ -198,7 +204,7 @@ class Inbox(Generic[M]):
             self._bad.count(
                 self.topic.name,
                 verdict,
-                f"{message.seq} of {message.run_id}, following {followed or 'nobody'}",
+                f"{message.seq} of {message.run_id}, following {followed or 'no sender'}",
             )
             return None
         if sent is not None:

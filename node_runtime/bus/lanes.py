@@ -1,4 +1,4 @@
-"""The two links of a process to its router, one a lane, and the thread that sends what is bulk."""
+"""The two links of a process to its router, one per lane, and the thread that sends bulk messages."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ log = logging.getLogger(__name__)
 
 
 class Lanes:
-    """A control session and a bulk session of one process; the buses of many plants may share them. A context manager.
+    """A control session and a bulk session of one process, which several plants' buses can share. A context manager.
 
-    *Control* (states, commands) is dropped rather than queued, sent at once, at real-time priority. *Bulk* (weights,
-    logs) blocks when the link is full, so it has a session and a thread of its own, and a full link never delays a
-    command.
+    *Control* messages (states, commands) are dropped rather than queued, and sent at once at real-time priority. *Bulk*
+    messages (weights, logs) block when the link is full. They have a session and a thread of their own, so a full link
+    never delays a command.
     """
 
     def __init__(self, config: Config, process: str, stop: threading.Event | None = None):
-        """`stop`: when set, a pending `open` gives up with `OpenInterrupted`."""
+        """`stop`: when it is set, a pending `open` ends with `OpenInterrupted`."""
         self._config, self._process = config, process
         self.stop = stop or threading.Event()
         self._sessions: dict[Lane, zenoh.Session] = {}
@@ -33,11 +33,11 @@ class Lanes:
         self._sender = threading.Thread(target=self._send, name="bulk", daemon=True)
 
     def open(self) -> None:
-        """Connect to the router at `config.bus.endpoint`, waiting for it for ever.
+        """Connect to the router at `config.bus.endpoint`, waiting for it without a time limit.
 
         Raises:
-            OpenInterrupted: the stop event was set first.
-            ConfigError: the endpoint is none, our certificate cannot be used, or the router and we refuse each other.
+            OpenInterrupted: the stop event was set.
+            ConfigError: the endpoint is not valid, our certificate cannot be used, or either side refuses the other.
         """
         if self._sessions:
             raise RuntimeError("these lanes are open already")
@@ -46,11 +46,11 @@ class Lanes:
         self._sender.start()
 
     def close(self, drain_s: float = 2.0) -> None:
-        """Leave, within about `drain_s` seconds. Safe to call twice, and before `open`."""
+        """Close the sessions within about `drain_s` seconds. Safe to call twice, and before `open`."""
         if not self._sender.is_alive():
             return
         self._outgoing.put(None)
-        # Leaving a link that is full and dead could take long, and the process must end nevertheless.
+        # Closing a link that is full and dead can take long. The process must end nevertheless.
         leaving = threading.Thread(target=self._leave, name="leave", daemon=True)
         leaving.start()
         leaving.join(drain_s)
@@ -64,13 +64,13 @@ class Lanes:
         self.close()
 
     def session(self, lane: Lane) -> zenoh.Session:
-        """Raises `RuntimeError` before `open`."""
+        """Return the session of a lane. Raises `RuntimeError` before `open`."""
         if not self._sessions:
             raise RuntimeError("the bus is not open; call open() first")
         return self._sessions[lane]
 
     def post(self, send: Callable[[], None]) -> None:
-        """Leave it to the thread that sends bulk to call `send`, after all that was left to it before."""
+        """Queue a call of `send` for the bulk thread, after all earlier calls."""
         self._outgoing.put(send)
 
     def _send(self) -> None:
@@ -78,7 +78,7 @@ class Lanes:
             try:
                 send()
             except Exception:
-                # Whatever one message did, the others, of other plants too, are to be sent.
+                # A failure of one message must not stop the others, which may belong to other plants.
                 log.exception("a message was not sent")
 
     def _leave(self) -> None:

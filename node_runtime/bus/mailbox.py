@@ -1,4 +1,4 @@
-"""Bounded places where the bus's receiving threads leave messages. It never blocks: the oldest gives way."""
+"""Bounded mailboxes between the bus's receiving threads and the readers. They never block; the oldest is dropped."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-# A queue of the largest messages must not take the machine's memory.
+# Limit for queues of the largest messages, to protect the machine's memory.
 MAX_BYTES = 256 * 1024 * 1024
 
 
@@ -17,11 +17,11 @@ class Delivery:
     key: str
     payload: bytes
     received_ns: int
-    """Monotonic clock (`clock.now_ns`) when the bus's receiving thread got it."""
+    """Monotonic clock (`clock.now_ns`) when the bus's receiving thread received it."""
 
 
 class Mailbox:
-    """A queue of at most `capacity` messages and `max_bytes` bytes; the oldest is dropped and counted."""
+    """A queue of at most `capacity` messages and `max_bytes` bytes. Beyond that the oldest is dropped and counted."""
 
     def __init__(
         self,
@@ -30,7 +30,7 @@ class Mailbox:
         max_bytes: int = MAX_BYTES,
         arrived: threading.Condition | None = None,
     ):
-        """arrived: notified of every message, for who waits for any of several mailboxes; None: its own."""
+        """arrived: notified of every message, so that a thread can wait for several mailboxes; None for its own."""
         if capacity < 1:
             raise ValueError(f"a mailbox needs a capacity of at least 1, not {capacity}")
         self.name = name
@@ -40,10 +40,10 @@ class Mailbox:
         self._bytes = 0
         self._arrived = arrived or threading.Condition(threading.Lock())
         self.overflow = 0
-        """Messages dropped because nobody fetched them in time."""
+        """Number of messages dropped before they were read."""
 
     def put(self, delivery: Delivery) -> None:
-        """Called by the receiving thread; never blocks for longer than a few microseconds."""
+        """Add a message, from the receiving thread; blocks for a few microseconds at most."""
         with self._arrived:
             self._items.append(delivery)
             self._bytes += len(delivery.payload)
@@ -55,7 +55,7 @@ class Mailbox:
             self._arrived.notify()
 
     def get(self, timeout_s: float = 0.0) -> Delivery | None:
-        """The oldest message, waiting up to `timeout_s` for one; None when there is none."""
+        """Return the oldest message, waiting up to `timeout_s` for one; None if there is none."""
         with self._arrived:
             if not self._items and timeout_s > 0.0:
                 self._arrived.wait_for(lambda: self._items, timeout_s)
@@ -66,7 +66,7 @@ class Mailbox:
             return delivery
 
     def drain(self) -> list[Delivery]:
-        """Everything that is here, oldest first."""
+        """Return all messages, oldest first."""
         with self._arrived:
             items = list(self._items)
             self._items.clear()

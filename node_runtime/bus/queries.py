@@ -1,4 +1,4 @@
-"""Questions between processes and their answers, which travel in fragments like any large message."""
+"""Queries between processes and their answers, which are sent in fragments like other large messages."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ log = logging.getLogger(__name__)
 PENDING_QUERIES = 32
 
 Handler = Callable[[dict[str, str]], list[bytes]]
-"""Parameters of a question to the payloads of its answer. Raises `ValueError` for what the asker did wrong."""
+"""Maps the parameters of a query to the payloads of its answer. Raises `ValueError` for an error of the sender."""
 
 
 class Queries:
-    """What one process answers, one query at a time in a thread of its own, and asks on the bus of one plant."""
+    """Answers queries of one process, one at a time in a thread of its own, and sends queries for one plant."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Queries:
         bad: RejectedMessages,
         count: Callable[[str], int],
     ):
-        """`bad`: where what is refused is counted; `count`: counts what could not be sent, and gives how many."""
+        """`bad` counts refused queries; `count` counts failures to send and returns their number."""
         self._lanes, self._plant, self._fragmenter, self._bad, self._count = (
             lanes,
             plant,
@@ -51,7 +51,7 @@ class Queries:
         self._thread: threading.Thread | None = None
 
     def close(self) -> None:
-        """Answer nothing more."""
+        """Answer no more queries."""
         with contextlib.suppress(queue.Full):
             self._pending.put_nowait(None)
         if self._thread is not None:
@@ -61,7 +61,7 @@ class Queries:
         """See `Bus.serve`."""
 
         def arrived(query: zenoh.Query) -> None:
-            # A router's limits are for payloads, and a question has none.
+            # A router limits payloads only, and a query has none.
             if len(str(query.parameters)) > LARGEST_QUESTION:
                 self._bad.count(name, "oversized question")
                 query.drop()
@@ -84,7 +84,7 @@ class Queries:
     def _answer(self) -> None:
         while (item := self._pending.get()) is not None:
             query, name, handler = item
-            pairs: Any = query.parameters  # the stub lacks that it converts to a dict
+            pairs: Any = query.parameters  # the type stub does not know the conversion to dict
             parameters: dict[str, str] = dict(pairs)
             with query:
                 try:

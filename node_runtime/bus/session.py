@@ -1,4 +1,4 @@
-"""Zenoh sessions as Tandem uses them: explicit endpoints, no scouting, an opening that can be interrupted."""
+"""Zenoh sessions with explicit endpoints, without scouting, whose opening can be interrupted."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ log = logging.getLogger(__name__)
 
 OBEYING = ("controller", "plant")
 PATIENT_LEASE_MS = 10_000
-"""A reader that is silent for less than this has only been without a core; the messages wait for it meanwhile."""
+"""A reader that is silent for less than this is waiting for a core. Its messages are kept meanwhile."""
 OPEN_MS = 500
-"""After so long those who obey give up an attempt to reach their router: on a cut link its first packet is lost, and
-TCP repeats it only after a second. Another attempt is made before that, so that control is back within one."""
+"""Time limit of an attempt to reach the router for the processes in a control loop. On a cut link the first packet is
+lost, and TCP repeats it only after a second. A new attempt before that restores control within a second."""
 RETRY_MS, RETRY_SECURE_MS = 100, 1000
-"""Between two attempts, at most. What is said before a recorder is back is in no log; but who is refused need not be
-refused ten times a second."""
+"""Longest pause between two attempts. Messages sent before the recorder is connected are not logged, so the pause is
+short. A refused process need not try ten times a second, so the pause with certificates is longer."""
 GIVE_UP_US = 1_000_000
-"""For as long the router holds everybody's bulk messages back where a reader's link is full; then it cuts that link."""
+"""Time for which the router holds back all bulk messages for a full link of one reader; then it closes that link."""
 ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.%]+\]|[^\s:/\[\]]+):\d{1,5}([?#].*)?")
 
 
 class OpenInterrupted(RuntimeError):
-    """The process was told to stop while it still waited for the router."""
+    """The process was told to stop while it waited for the router."""
 
 
 def session_config(
@@ -48,12 +48,17 @@ def session_config(
     remote: str | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> zenoh.Config:
-    """Zenoh's configuration: explicit endpoints, no scouting, no shared memory.
+    """Return Zenoh's configuration: explicit endpoints, no scouting, no shared memory.
 
-    remote: where a router listens as well; more: settings on top, for links with certificates.
+    Args:
+        mode: of the session.
+        endpoint: address to connect to, or of a router to listen at.
+        lease_ms: silence after which a link counts as cut.
+        remote: a second address for a router to listen at.
+        more: additional settings, for links with certificates.
 
     Raises:
-        ConfigError: `endpoint` is not like `tcp/127.0.0.1:7447`. Zenoh itself would try it again for ever.
+        ConfigError: an endpoint is not like `tcp/127.0.0.1:7447`. Zenoh itself would retry it without end.
     """
     for key, place in (("endpoint", endpoint), ("remote", remote)):
         if place is not None and not ENDPOINT.fullmatch(place):
@@ -64,15 +69,15 @@ def session_config(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # Messages above 3 kB vanish without an error where the receiver's memlock limit is small.
+        # With a small memlock limit at the receiver, messages above 3 kB would be lost without an error.
         "transport/shared_memory/enabled": False,
-        # The other end takes the link for cut after this much silence, and all that is on its way here is lost then.
+        # The peer closes the link after this silence, and messages on their way are lost then.
         "transport/link/tx/lease": lease_ms,
         "transport/link/tx/keep_alive": 4,
-        # With Zenoh's two places a busy machine loses up to 3 % of the control messages: whatever is put while
-        # the sending thread waits for a core. Sixteen small ones are still younger than a period.
+        # With Zenoh's default of two slots a busy machine loses up to 3 % of the control messages, those published
+        # while the sending thread waits for a core. Sixteen small messages are still younger than a period.
         "transport/link/tx/queue/size/real_time": 16,
-        # And with two for the rest, 100 kB, the router waits for a reader that is without a core for a moment.
+        # With two slots for bulk, 100 kB, the router would wait for a reader that has no core for a moment.
         "transport/link/tx/queue/size/data": 16,
     }
     if mode == "client":
@@ -103,35 +108,36 @@ def session_config(
 
 
 def _place(endpoint: str) -> str:
-    """Where Zenoh is to connect. For certificates it takes the brackets of an IPv6 address for a part of the name.
+    """Return the address that Zenoh connects to.
 
-    Without them it finds the port behind the last colon, and compares the address with those in the certificate.
+    With certificates Zenoh takes the brackets of an IPv6 address as part of the name. Without them it finds the port
+    after the last colon and compares the address with those in the certificate.
 
     Raises:
-        ConfigError: certificates and an address with a zone, which no certificate can name.
+        ConfigError: an address with a zone is used with certificates, which cannot contain one.
     """
     if not secure(endpoint) or "[" not in endpoint:
         return endpoint
     if "%" in endpoint:
         raise ConfigError(
-            f"bus.endpoint = {endpoint!r}: no certificate can name an address with a zone; write another address of "
-            "the router, or a name, that its certificate has (`tandem keys renew --role router --host HOST`)"
+            f"bus.endpoint = {endpoint!r}: a certificate cannot contain an address with a zone; use another address or "
+            "a name of the router that its certificate contains (`tandem keys renew --role router --host HOST`)"
         )
     protocol, _, place = endpoint.partition("/")
     return f"{protocol}/{place.replace('[', '', 1).replace(']', '', 1)}"
 
 
 def secure(endpoint: str) -> bool:
-    """Whether links to this endpoint need certificates."""
+    """Return whether links to this endpoint need certificates."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def lease_ms(config: Config, process: str) -> int:
-    """After how much silence of `process` its link counts as cut.
+    """Return the silence in milliseconds after which a link of `process` counts as cut.
 
-    Controller and plant obey each other, so a link that they are behind no more is cut soon. A reader gets no core
-    while they need all of them, and to cut its link for that would lose what it should read. Both ends cut: a reader
-    that runs again finds its own clock past the router's lease, so the router's is long too.
+    Controller and plant control each other, so their links are cut soon. A reader may have no core while they need all
+    of them, and closing its link would lose messages. Both ends apply the lease: a reader that runs again compares its
+    clock with the router's lease, so the router's lease is long too.
     """
     short = config.bus.lease_ms
     return short if process in OBEYING else max(short, PATIENT_LEASE_MS)
@@ -140,16 +146,16 @@ def lease_ms(config: Config, process: str) -> int:
 def connect(
     config: Config, stop: threading.Event, process: str, sessions: int = 1
 ) -> tuple[zenoh.Session, ...]:
-    """Client sessions of `process` to the router at `config.bus.endpoint`; waits for the router for ever.
+    """Open client sessions of `process` to the router at `config.bus.endpoint`, waiting without a time limit.
 
     Raises:
-        OpenInterrupted: `stop` was set first.
-        ConfigError: the endpoint is none; our certificate cannot be used; or the router and we refuse each other,
-            which no waiting heals. The text says why.
+        OpenInterrupted: `stop` was set.
+        ConfigError: the endpoint is not valid, our certificate cannot be used, or either side refuses the other, so
+            that waiting cannot help. The text says why.
     """
     tls = None
     if secure(config.bus.endpoint):
-        # Only here, for a machine that needs no certificates loads nothing for them.
+        # Created only here, so that a machine without certificates imports nothing for them.
         from node_runtime.tls.client import TlsClient
 
         tls = TlsClient(config, process)
@@ -165,11 +171,11 @@ def connect(
 
 
 def _connect(config: Config, stop: threading.Event, process: str, tls: TlsClient | None) -> zenoh.Session:
-    """`zenoh.open` cannot be interrupted by a signal, so it runs in a thread that can be left behind."""
+    """Open a session in a thread that can be abandoned, because a signal cannot interrupt `zenoh.open`."""
     endpoint = config.bus.endpoint
     more: Mapping[str, Any] = {"transport/unicast/open_timeout": OPEN_MS} if process in OBEYING else {}
     if tls is not None:
-        # A handshake with certificates takes its time.
+        # A handshake with certificates takes longer than the short time limit.
         more = tls.settings
     client = session_config("client", endpoint, lease_ms(config, process), more=more)
     result: Future[zenoh.Session] = Future()

@@ -1,7 +1,7 @@
 """The bus: raw payloads between processes, over Zenoh.
 
-Two client sessions to one router, one for each lane; what is large travels in fragments. Receiving threads only copy
-the payload into a bounded mailbox: a slow reader loses its own oldest messages and stalls nobody.
+A process has two client sessions to one router, one per lane. Large messages are sent in fragments. Receiving threads
+only copy the payload into a bounded mailbox, so a slow reader loses its own oldest messages and delays no other reader.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ __all__ = ["Bus", "Delivery", "Handler", "Mailbox", "OpenInterrupted", "session_
 
 
 class Bus:
-    """One process's place on the bus of one plant. A context manager; `open` waits for the router.
+    """The connection of one process to the bus of one plant. A context manager; `open` waits for the router.
 
-    Everything may be called from any thread. Nothing here raises because of what arrives.
+    All methods may be called from any thread. Received messages never cause an exception here.
     """
 
     def __init__(
@@ -47,15 +47,20 @@ class Bus:
         stop: threading.Event | None = None,
         lanes: Lanes | None = None,
     ):
-        """`stop`: when set, a pending `open` gives up with `OpenInterrupted`.
+        """Create the bus without connecting.
 
-        lanes: open ones that the buses of other plants use too, and that outlive this bus; None: its own.
+        Args:
+            config: the configuration.
+            process: the role of the process.
+            run_id: identifies this incarnation of the process.
+            stop: when it is set, a pending `open` ends with `OpenInterrupted`.
+            lanes: open lanes that other plants' buses share and that outlive this bus; None for lanes of its own.
         """
         self.config = config
         self.process = process
         self.run_id = run_id
         self.bad = RejectedMessages()
-        """Where this process counts what it does not obey, and the bus what it does not deliver."""
+        """Counts messages that this process rejects and that the bus does not deliver."""
         self._lanes = lanes or Lanes(config, process, stop)
         self._shared = lanes is not None
         self._lock = threading.Lock()
@@ -71,7 +76,7 @@ class Bus:
     # -- opening and closing -----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Connect to the router, as `Lanes.open` does where the lanes are its own, and declare what is published."""
+        """Connect to the router as `Lanes.open` does, unless the lanes are shared, and declare the publishers."""
         if not self._shared:
             self._lanes.open()
         for topic in topics.ALL:
@@ -79,7 +84,7 @@ class Bus:
                 self._publisher(topic)
 
     def close(self, drain_s: float = 2.0) -> None:
-        """Send what is left of the bulk lane, for at most `drain_s`, and leave. Safe to call twice."""
+        """Send the rest of the bulk lane for at most `drain_s`, and close. Safe to call twice."""
         if self._closed:
             return
         self._outgoing.flush(drain_s)
@@ -90,7 +95,7 @@ class Bus:
             self._lanes.close(drain_s)
             return
         for declared in (*self._declared, *self._publishers.values()):
-            # The session may be gone already.
+            # The session may be closed already.
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
 
@@ -104,7 +109,7 @@ class Bus:
     # -- publishing --------------------------------------------------------------------------------------
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Send one message: control at once, bulk by the bulk thread. Never waits for a reader."""
+        """Send one message: control at once, bulk by the bulk thread. Never wait for a reader."""
         payload = codec.encode(message)
         if len(payload) > topic.max_bytes:
             self._count(f"not sent, oversized {topic.name}")
@@ -117,10 +122,11 @@ class Bus:
             self._outgoing.put(topic, payload)
 
     def when_heard(self, topic: Topic, call: Callable[[int], None]) -> None:
-        """Whenever `topic`, which nobody heard, is heard again: `call`, in a thread of the bus, so it must be short.
+        """Call `call` whenever `topic` has a subscriber again after having none.
 
-        A link that was cut and is back is one such time: what was sent meanwhile reached nobody. `call` is told how
-        many messages of the bulk lane still wait to be sent: these will be heard.
+        This happens, for example, after a link was cut and restored; messages sent meanwhile are lost. `call` receives
+        the number of messages of the bulk lane that still wait and will be delivered. It runs in a thread of the bus,
+        so it must be short.
         """
 
         def matching(status: zenoh.MatchingStatus) -> None:
@@ -130,7 +136,7 @@ class Bus:
         self._declared.append(self._publisher(topic).declare_matching_listener(matching))
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until the bulk lane is empty; False when it is not after `timeout_s`."""
+        """Wait until the bulk lane is empty; False if it is not after `timeout_s`."""
         return self._outgoing.flush(timeout_s)
 
     def _send_bulk(self, topic: Topic, payload: bytes) -> None:
@@ -170,9 +176,9 @@ class Bus:
     def queue(
         self, topic: Topic, capacity: int = 1000, arrived: threading.Condition | None = None
     ) -> Mailbox:
-        """Follow all messages of a topic; beyond `capacity` unread ones the oldest is dropped and counted.
+        """Subscribe to all messages of a topic. Beyond `capacity` unread ones the oldest is dropped and counted.
 
-        arrived: notified of each; None: only the mailbox itself waits.
+        arrived: notified of each message; None for a condition of the mailbox's own.
         """
         mailbox = Mailbox(topic.name, capacity, arrived=arrived)
         self._boxes.append(mailbox)
@@ -183,9 +189,9 @@ class Bus:
         return mailbox
 
     def everything(self, capacity: int = 100_000) -> Mailbox:
-        """Follow all that is published below `tandem/<plant>/`, this process's own messages included.
+        """Subscribe to all messages below `tandem/<plant>/`, including those of this process.
 
-        What travelled in a `Batch` is here one by one, as if it had travelled alone.
+        The messages of a `Batch` are delivered one by one.
         """
         mailbox = UnbatchingMailbox("everything", capacity, self.bad)
         self._boxes.append(mailbox)
@@ -195,12 +201,12 @@ class Bus:
     def _subscribe(
         self, session: zenoh.Session, key: str, mailbox: Mailbox, only: Topic | None = None
     ) -> None:
-        """`only`: what `key` is the key of, None where it covers many."""
+        """`only` is the topic of `key`; None if the key covers several topics."""
         bad = self.bad
         plain = None if only is None else only.key(self.config.name)
         reassembler = Reassembler(2 * (LARGEST_MESSAGE if only is None else only.max_bytes), bad)
 
-        # Runs on the link's receiving thread, so it must be short: a stamp, a copy, an append.
+        # This runs in the link's receiving thread, so it must be short.
         def arrived(sample: zenoh.Sample) -> None:
             received_ns = clock.now_ns()
             key = plain or str(sample.key_expr)
@@ -220,25 +226,25 @@ class Bus:
         callback = zenoh.handlers.Callback(arrived, indirect=False)
         self._declared.append(session.declare_subscriber(key, callback))
 
-    # -- questions and answers ---------------------------------------------------------------------------
+    # -- queries -----------------------------------------------------------------------------------------
 
     def serve(self, name: str, handler: Handler) -> None:
-        """Answer queries at `tandem/<plant>/<name>`: `handler(parameters)` gives the payloads to send back.
+        """Answer queries at `tandem/<plant>/<name>` with the payloads of `handler(parameters)`.
 
-        The handler runs in the bus's own query thread, one query at a time. A `ValueError` from it is the
-        asker's fault: counted, named once, answered with the text. Queries beyond a few pending ones go
-        unanswered.
+        The handler runs in the bus's query thread, one query at a time. A `ValueError` from it is an error of the
+        sender: it is counted, logged once, and its text is the answer. If too many queries are pending, further ones
+        get no answer.
         """
         self._declared.append(self._queries.serve(name, handler))
 
     def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
-        """Payloads of all answers to a query at `tandem/<plant>/<name>`; [] when nobody answers in time."""
+        """Return the payloads of all answers to a query at `tandem/<plant>/<name>`; [] without answers in time."""
         return self._queries.ask(name, parameters, timeout_s)
 
-    # -- figures -----------------------------------------------------------------------------------------
+    # -- counters ----------------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """What was sent, what was lost here and why, bad messages included; for `Health`."""
+        """Return the counters of sent, lost and rejected messages, for `Health`."""
         with self._lock:
             counts = dict(self._counts)
         if self._outgoing.overflow:

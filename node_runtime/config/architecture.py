@@ -1,4 +1,4 @@
-"""The architecture that a configuration names in a file of its own, made known to this process."""
+"""Loads and registers an architecture that a configuration names in a user's file."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from node_runtime.config.strict import ConfigError
 
 
 class OwnArchitecture(NamedTuple):
-    """Of a stranger's file."""
+    """An architecture from a user's file."""
 
     name: str
-    """What descriptions call it, "gru.py:GRU@0f3a...": it ends in the hash of the file's text."""
+    """Name in descriptions, such as "gru.py:GRU@0f3a...", which ends in the hash of the file's text."""
     architecture: Architecture
 
 
 def load_architecture(reference: str) -> OwnArchitecture:
-    """What "gru.py:GRU" names. Raises `ConfigError`: nothing there, or no architecture."""
+    """Load the architecture of a reference such as "gru.py:GRU". Raises `ConfigError` if there is none."""
     found = loaded(reference, lambda value: isinstance(value, Architecture), "architecture")
     place, _, name = reference.rpartition(":")
     return OwnArchitecture(f"{Path(place).name}:{name}@{found.sha256[:16]}", found.value)
 
 
 def register_architecture(config: Config) -> None:
-    """For who uses the network of a configuration of its own; never for one that came in a log or a message.
+    """Load and register the architecture of the process's own configuration, never that of a log or a message.
 
     Raises:
-        ConfigError: it names a file in which there is no such architecture.
+        ConfigError: the configured file does not contain the architecture.
     """
     reference = config.network.architecture
     if not is_reference(reference):

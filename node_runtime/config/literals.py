@@ -1,4 +1,4 @@
-"""Names to choose from in the configuration; apart from it, so that `tandem --help` need not load numpy."""
+"""Choices of configuration keys. They are kept in this module, so that `tandem --help` does not import numpy."""
 
 from __future__ import annotations
 

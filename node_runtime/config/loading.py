@@ -1,4 +1,4 @@
-"""A configuration read, checked as a whole, and written: TOML files, shipped names, overrides, the JSON of a log."""
+"""Reads, checks and writes configurations: TOML files, shipped names, overrides, and the JSON of a log."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ from node_runtime.config.strict import ConfigError, Fail
 from protocol.codec import first_non_finite
 
 INFINITE = -math.inf, math.inf
-"""Bounds that are none, lower and upper."""
+"""Lower and upper bounds that mean no bound."""
 
 
 def load(path: str | Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Read a TOML file, or the shipped configuration of that name, and apply `section.key=value` overrides on top.
+    """Read a TOML file, or the shipped configuration of that name, and apply `section.key=value` overrides.
 
-    None: all defaults.
+    With `path` None all values are defaults.
 
     Raises:
-        ConfigError: unreadable file, TOML syntax, unknown key, wrong type, value out of range.
+        ConfigError: the file cannot be read, its TOML is not valid, or a key is unknown, of a wrong type or out of
+        range.
     """
     if path is None:
         return _overridden({}, overrides or [], "configuration")
@@ -47,7 +48,7 @@ def load(path: str | Path | None = None, overrides: list[str] | None = None) -> 
 
 
 def override(config: Config, assignments: list[str]) -> Config:
-    """A copy with `section.key=value` assignments applied. Raises `ConfigError`."""
+    """Return a copy with `section.key=value` assignments applied. Raises `ConfigError`."""
     return _overridden(to_tree(config), assignments, "configuration")
 
 
@@ -67,23 +68,23 @@ def from_tree(
 ) -> Config:
     """Convert a plain tree to a `Config`. Raises `ConfigError`.
 
-    `~` at the beginning of a path is the home folder. A reference to a file is written out.
+    `~` at the beginning of a path is replaced by the home folder. References to files become absolute.
 
     Args:
-        tree: tables as TOML gives them.
-        where: the file, for messages.
-        origins: for keys that come from elsewhere (`trainer.batch`), from where.
-        folder: where a reference is relative to; None: it stays as it is.
-        origins_folder: the same for the keys from elsewhere; None: the current folder.
+        tree: tables as read from TOML.
+        where: the file's name for messages.
+        origins: origin of keys that are not from the file, by key (such as `trainer.batch`).
+        folder: base of relative references; None leaves them unchanged.
+        origins_folder: the same for keys in `origins`; None for the current folder.
     """
     fail = strict.failing(where, origins)
-    config = _at_home(_checked(tree, where, origins), fail)
+    config = _with_home_folder(_checked(tree, where, origins), fail)
     places = {**dict.fromkeys(origins or {}, origins_folder or Path.cwd()), "": folder}
-    return _written_out(config, fail, places)
+    return _with_absolute_references(config, fail, places)
 
 
 def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
-    """The tree as a `Config`, its paths as they were written."""
+    """Return the tree as a `Config` with unchanged paths."""
     fail = strict.failing(where, origins)
     config = strict.convert(_with_open_bounds(tree), Config, fail)
     _check_texts(tree, fail)
@@ -96,7 +97,7 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
     if activation not in BOUNDED:
         fail(
             "network.activation",
-            f"network.activation = {activation!r} is unbounded, and the last layer must be bounded; "
+            f"network.activation = {activation!r} is not bounded, but the last layer must be; use "
             f"one of {', '.join(BOUNDED)}",
         )
     _check_architecture(config.network, fail)
@@ -106,28 +107,28 @@ def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None
         fail(
             "controller.input_delay_ms",
             f"controller.input_delay_ms = {delay:g} is more than half a period, {500.0 * config.period:g} ms at "
-            f"rate = {config.rate:g} Hz: so late a command cannot be predicted for",
+            f"rate = {config.rate:g} Hz: the state cannot be predicted over a longer delay",
         )
     truth, most = config.plant.truth, MOST_DEAD_PERIODS * config.period
     if isinstance(truth, dict) and not 0.0 <= (seconds := truth.get(DEAD_TIME, 0.0)) <= most * (1.0 + 1e-9):
         fail(
             "plant.truth",
-            f"plant.truth.{DEAD_TIME} = {seconds:g}: seconds, from 0 to {most:g}, {MOST_DEAD_PERIODS} periods",
+            f"plant.truth.{DEAD_TIME} = {seconds:g} s is out of range: 0 to {most:g} s ({MOST_DEAD_PERIODS} periods)",
         )
     if config.trainer.min_samples > config.trainer.capacity:
         fail(
             "trainer.min_samples",
             f"trainer.min_samples = {config.trainer.min_samples} exceeds trainer.capacity = "
-            f"{config.trainer.capacity}: the first training would never come",
+            f"{config.trainer.capacity}: training would never start",
         )
     for i, place in enumerate(config.trainer.fleet):
         if place.name in {earlier.name for earlier in config.trainer.fleet[:i]}:
-            fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is there twice")
+            fail(f"trainer.fleet[{i}].name", f"trainer.fleet[{i}].name = {place.name!r} is used twice")
     return config
 
 
 def _with_horizon(config: Config, tree: dict[str, Any], fail: Fail, origins: Mapping[str, str]) -> Config:
-    """With `horizon_seconds` as steps. Of the two keys that say the same, one in `origins` comes after the file."""
+    """Convert `horizon_seconds` to steps. If both keys are given, one from `origins` overrides one from the file."""
     controller = config.controller
     seconds, named = controller.horizon_seconds, "controller.horizon_seconds"
     if seconds is None:
@@ -136,7 +137,7 @@ def _with_horizon(config: Config, tree: dict[str, Any], fail: Fail, origins: Map
     if tree["controller"].get("horizon") is not None:
         later = [key for key in ("controller.horizon", named) if key in origins]
         if len(later) != 1:
-            fail(named, f"controller.horizon and {named} are both given; leave one of them out")
+            fail(named, f"controller.horizon and {named} are both given; remove one of them")
         if later != [named]:
             steps = controller.horizon
     if steps > LONGEST_HORIZON:
@@ -149,7 +150,7 @@ def _with_horizon(config: Config, tree: dict[str, Any], fail: Fail, origins: Map
 
 
 def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
-    """Every text must be UTF-8, for it travels and is logged; the log's own name may be any bytes."""
+    """Check that every text is UTF-8, because it is sent and logged. Only the path of the log may have any bytes."""
     if isinstance(value, dict):
         for name, below in value.items():
             _check_texts(below, fail, f"{key}.{name}".lstrip("."))
@@ -157,11 +158,11 @@ def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
         for i, below in enumerate(value):
             _check_texts(below, fail, f"{key}[{i}]")
     elif isinstance(value, str) and value != (said := strict.readable(value)) and key != "log.path":
-        fail(key, f"{key} = '{said}' is not UTF-8, as a configuration is; choose another name")
+        fail(key, f"{key} = '{said}' is not UTF-8, which a configuration must be; choose another name")
 
 
-def _at_home(config: Config, fail: Fail) -> Config:
-    """With the home folder for the `~` that a shell would have replaced."""
+def _with_home_folder(config: Config, fail: Fail) -> Config:
+    """Replace `~` by the home folder, as a shell would have done."""
 
     def found(key: str, section: Section) -> Any:
         *_, last = key.split(".")
@@ -171,7 +172,7 @@ def _at_home(config: Config, fail: Fail) -> Config:
             return section
         there = os.path.expanduser(path)
         if there.startswith("~"):
-            fail(key, f"{key} = {path!r}: no home folder of {user[0]} is known; write the folder out")
+            fail(key, f"{key} = {path!r}: no home folder of {user[0]} is known; write the full path")
         return msgspec.structs.replace(section, **{last: there})
 
     controller = found("controller.sets", found("controller.checkpoint", config.controller))
@@ -182,10 +183,10 @@ def _at_home(config: Config, fail: Fail) -> Config:
     return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
 
 
-def _written_out(config: Config, fail: Fail, places: Mapping[str, Path | None]) -> Config:
-    """With whole paths in the references, so that every process of a run finds the same file from anywhere.
+def _with_absolute_references(config: Config, fail: Fail, places: Mapping[str, Path | None]) -> Config:
+    """Make references absolute, so that every process of a run finds the same file from any folder.
 
-    places: by key, or "" for all others, what is relative to where.
+    places: base folders by key; "" is the key of all others.
     """
 
     def found(key: str, reference: str) -> str:
@@ -206,7 +207,7 @@ def _written_out(config: Config, fail: Fail, places: Mapping[str, Path | None]) 
 
 
 def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
-    """With None for the infinite ends of `plant.bounds`: JSON has no infinity, and no other key may be one."""
+    """Replace infinite ends of `plant.bounds` by None, because JSON has no infinity. Other keys must be finite."""
     plant = tree.get("plant")
     if not isinstance(plant, dict) or not isinstance(bounds := plant.get("bounds"), dict):
         return tree
@@ -220,7 +221,7 @@ def _with_open_bounds(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
-    """Of those that come with Tandem; a file is looked at by who uses it, and only there it has to be."""
+    """Check a shipped architecture. A user's file is checked by the process that uses it, and need not exist here."""
     if is_reference(network.architecture):
         return
     try:
@@ -235,7 +236,7 @@ def _check_architecture(network: NetworkConfig, fail: Fail) -> None:
 
 
 def from_json(text: str) -> Config:
-    """The inverse of `to_json`: a configuration as a log carries it. Raises `ConfigError`."""
+    """Read a configuration from a log, the inverse of `to_json`. Raises `ConfigError`."""
     try:
         tree = msgspec.json.decode(text)
     except (msgspec.DecodeError, RecursionError) as error:
@@ -250,14 +251,14 @@ def to_json(config: Config) -> str:
 
 
 def to_tree(config: Config) -> dict[str, Any]:
-    """Plain dictionaries and lists, in the order of the declaration."""
+    """Return plain dictionaries and lists in the order of declaration."""
     return msgspec.to_builtins(config)
 
 
 def to_toml(config: Config) -> str:
-    """The whole tree as TOML that `load` reads back to an equal `Config`; keys that are None are left out.
+    """Return the whole tree as TOML that `load` reads back to an equal `Config`, without keys that are None.
 
-    A `log.path` that is not UTF-8, which TOML is, comes back as text that shows its bytes.
+    A `log.path` that is not UTF-8 becomes text that shows its bytes.
     """
     tree = to_tree(_readable(config))
     tree["plant"]["bounds"] = {

@@ -1,6 +1,6 @@
-"""The plant that a configuration names: it exists, and every vector of the configuration has its lengths.
+"""Finds the configured plant, and checks every vector and name of the configuration against it.
 
-Whoever asks hands over the function that finds a plant; nothing of the science is imported here.
+The caller passes the function that finds a plant, so that this module does not import `lbmpc`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from node_runtime.config.sections import DEAD_TIME, Config, ReferenceConfig, Sha
 from node_runtime.config.strict import ConfigError, did_you_mean
 
 Row = Mapping[str, float]
-"""As of `lbmpc.plants.description.Description.rows`."""
+"""See `lbmpc.plants.description.Description.rows`."""
 
 
 class Described(Protocol):
-    """What the checks need to know of a plant."""
+    """The part of a plant's description that the checks need."""
 
     @property
     def name(self) -> str: ...
@@ -53,7 +53,7 @@ class Described(Protocol):
 
 
 class Plant(Described, Protocol):
-    """One that can be told to differ."""
+    """A described plant that can be changed."""
 
     def changed(
         self,
@@ -68,27 +68,28 @@ class Plant(Described, Protocol):
 
 
 class Motion(Protocol):
-    """What moves in the plant's place: an object of the user's own."""
+    """A user's object that simulates the plant."""
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray: ...
 
 
 P = TypeVar("P", bound=Plant)
 Find = Callable[[Any, Callable[[P], P]], P]
-"""`lbmpc.plants.get_plant`: of a name or a plant, and what is changed before it is looked at, the plant. It raises
-`LookupError` with a text for a plant that is unknown or cannot be used."""
+"""`lbmpc.plants.get_plant`: takes a name or a plant and a change that is applied before the check, returns the plant,
+and raises `LookupError` with a text for a plant that is unknown or cannot be used."""
 
 
 def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P:
-    """The plant that `config` names, as its model knows it, with every length and name in `config` checked against it.
+    """Return the plant of `config` as its model knows it, after checking every length and name in `config` against it.
 
     Args:
+        config: the configuration.
         find: `lbmpc.plants.get_plant`.
-        plant: taken in the place of the one that `config` names; nothing is loaded then. Of a log.
+        plant: used instead of the configured plant, for example from a log; nothing is loaded then.
 
     Raises:
-        ConfigError: a plant that is unknown or cannot be used, an unknown variable or parameter, or a vector of the
-            wrong length; names the key and the rule.
+        ConfigError: the plant is unknown or cannot be used, a variable or parameter is unknown, or a vector has a wrong
+            length. The text names the key and the rule.
     """
     named = config.plant.model
     try:
@@ -109,14 +110,15 @@ def plant_of(config: Config, find: Find[P], plant: Described | None = None) -> P
 def true_plant_of(
     config: Config, find: Find[P], find_truth: Callable[[Any], P], plant: Described | None = None
 ) -> P | Motion:
-    """The plant as it really moves: `plant_of` with the parameters of `plant.truth`, or what that names.
+    """Return the true plant: `plant_of` with the parameters of `plant.truth`, or the object that `plant.truth` names.
 
     Args:
+        config: the configuration.
         find, plant: as for `plant_of`.
         find_truth: `lbmpc.plants.get_truth`.
 
     Raises:
-        ConfigError: as `plant_of`; `plant.truth` names nothing that moves, or a plant with other states or inputs.
+        ConfigError: as for `plant_of`; or `plant.truth` names no plant or motion, or one with other states or inputs.
     """
     model, truth = plant_of(config, find, plant), config.plant.truth
     if not isinstance(truth, str):
@@ -137,15 +139,15 @@ def true_plant_of(
         if tuple(ours) != tuple(theirs):
             raise ConfigError(
                 f"plant.truth = {truth!r}: its {what} are {', '.join(theirs)}, and those of the model "
-                f"{', '.join(ours)}; the same names in the same order are needed"
+                f"{', '.join(ours)}; both need the same names in the same order"
             )
     return true
 
 
 def true_dead_time(config: Config, known: Described, true: object) -> float:
-    """Seconds: what `plant.truth` says, or what it names has; where neither does it is as known.
+    """Return the true dead time in seconds: from `plant.truth`, from the object it names, or else the known one.
 
-    known, true: of `plant_of` and `true_plant_of`.
+    known, true: results of `plant_of` and `true_plant_of`.
     """
     truth = config.plant.truth
     if isinstance(truth, dict) and DEAD_TIME in truth:
@@ -155,12 +157,12 @@ def true_dead_time(config: Config, known: Described, true: object) -> float:
 
 
 def load_plant(reference: str) -> Any:
-    """The plant that "tanks.py:TANKS" names, as it is there. Raises `ConfigError`."""
+    """Load the plant of a reference such as "tanks.py:TANKS", unchanged. Raises `ConfigError`."""
     return load(reference, _is_plant, "plant")
 
 
 def files_of(config: Config) -> dict[str, str]:
-    """The sha256 of somebody's own files that `config` names, as far as they are here, by key."""
+    """Return the SHA-256 of the user's files in `config`, by key, for files that exist here."""
     named = {
         "plant.model": config.plant.model,
         "plant.truth": config.plant.truth,
@@ -171,7 +173,7 @@ def files_of(config: Config) -> dict[str, str]:
 
 
 def spelt_out(config: Config, plant: Described) -> Config:
-    """With all that is `plant`'s own written into the configuration: the same run, whatever becomes of its file."""
+    """Return the configuration with all properties of `plant`, so that the run does not depend on its file."""
     bounds = {
         name: [low if np.isfinite(low) else None, high if np.isfinite(high) else None]
         for names, lows, highs in (
@@ -205,7 +207,7 @@ def spelt_out(config: Config, plant: Described) -> Config:
 
 
 def initial_state(config: Config, plant: Described) -> np.ndarray:
-    """The configuration's x0, or the plant's own where it has none; (d,), plant units. Lengths as `plant_of` checks."""
+    """Return the configured x0, or the plant's own; (d,), in plant units. `plant_of` checks its length."""
     return np.array(plant.x0 if config.plant.x0 is None else config.plant.x0, dtype=float)
 
 
@@ -218,7 +220,7 @@ def _moves(value: Any) -> bool:
 
 
 def _as_configured(config: Config, plant: P) -> P:
-    """With the bounds, the rows and the equilibrium of the configuration."""
+    """Return the plant with the bounds, rows and equilibrium of the configuration."""
     known = (*plant.states, *plant.inputs)
     for key, values, what, names in (
         ("plant.x0", config.plant.x0, "states", plant.states),
@@ -257,7 +259,7 @@ def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
             hint = did_you_mean(name, plant.states, f"it has {', '.join(plant.states)}")
             raise ConfigError(f"reference.outputs: {plant.name} has no state {name!r}; {hint}")
         if name in outputs[:i]:
-            raise ConfigError(f"reference.outputs: {name!r} is there twice")
+            raise ConfigError(f"reference.outputs: {name!r} is used twice")
     if values is None:
         return
     if len(values) != len(outputs):
@@ -271,7 +273,7 @@ def _check_reference(reference: ReferenceConfig, plant: Described) -> None:
         i = list(plant.states).index(name)
         if not plant.x_min[i] <= value <= plant.x_max[i]:
             raise ConfigError(
-                f"reference.values: {name} = {value:g} is outside of X, {plant.x_min[i]:g} to {plant.x_max[i]:g}"
+                f"reference.values: {name} = {value:g} is outside X, {plant.x_min[i]:g} to {plant.x_max[i]:g}"
             )
 
 
@@ -292,11 +294,11 @@ def _check_names_of_states(config: Config, plant: Described) -> None:
                 hint = did_you_mean(name, plant.states, f"it has {', '.join(plant.states)}")
                 raise ConfigError(f"{key}: {plant.name} has no state {name!r}; {hint}")
     if estimator.measured is not None and not estimator.measured:
-        raise ConfigError("estimator.measured is empty: name the states that a sample measures")
+        raise ConfigError("estimator.measured is empty: give the measured states")
 
 
 def in_half_widths(shares: Shares, plant: Described) -> np.ndarray:
-    """One share for each state, (d,)."""
+    """Return one share per state, (d,)."""
     if isinstance(shares, dict):
         return np.array([shares.get(name, 0.0) for name in plant.states], dtype=float)
     return np.full(len(plant.states), float(shares))

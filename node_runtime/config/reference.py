@@ -1,6 +1,6 @@
-"""Objects that a configuration names outside the package: "tanks.py:TANKS" in a file, "mypackage.module:PLANT".
+"""User objects that a configuration names: "tanks.py:TANKS" in a file, "mypackage.module:PLANT" in a package.
 
-Only a configuration may name code. What a log names is never loaded.
+Only a configuration may name code. Code named in a log is never loaded.
 """
 
 from __future__ import annotations
@@ -19,42 +19,44 @@ from typing import Any, NamedTuple
 from node_runtime.config.strict import ConfigError, did_you_mean
 
 PREFIX = "tandem_reference_"
-"""Of the names that files are loaded under, so that none takes the name of an installed module."""
+"""Prefix of the module names of loaded files, so that they cannot replace an installed module."""
 APPENDED = "__tandem_appended__"
-"""In such a module: the folder that came into `sys.path` for it."""
+"""Attribute of such a module: the folder that was added to `sys.path` for it."""
 LONGEST_TEXT = 300
 
 
 class Loaded(NamedTuple):
-    """An object, and where it came from."""
+    """An object and its file."""
 
     value: Any
     file: str
-    """"": of a package that has no file."""
+    """Path of the file; "" for a package without a file."""
     sha256: str
-    """Of the file's bytes when it was loaded, in hexadecimal."""
+    """SHA-256 of the file's bytes when it was loaded, in hexadecimal."""
 
 
 def load(reference: str, fits: Callable[[Any], bool] | None = None, what: str = "object") -> Any:
-    """The object that `reference` names: "tanks.py:TANKS", "/abs/tanks.py:TANKS" or "mypackage.module:PLANT".
+    """Return the object of `reference`: "tanks.py:TANKS", "/abs/tanks.py:TANKS" or "mypackage.module:PLANT".
 
-    Of a file with one such object the name may be left out.
+    If a file contains exactly one such object, its name may be omitted.
 
-    A file runs once in a process, as long as it stays the same, and its folder comes last in `sys.path`: it may import
-    its neighbours, and none of them replaces what is installed. A package must be installed; the current folder, and
-    the folders of files that were loaded, are not looked at.
+    A file runs once per process as long as its content does not change. Its folder is appended to `sys.path`, so it may
+    import its neighbours, but they cannot replace installed modules. A package must be installed; the current folder
+    and the folders of loaded files are not searched.
 
     Args:
-        fits: which objects may be meant. what: such an object in a word, for messages: "plant".
+        reference: the reference.
+        fits: returns whether an object is of the right kind.
+        what: the kind in a word for messages, such as "plant".
 
     Raises:
-        ConfigError: nothing there, not of that kind, or its code raises; in a person's words.
+        ConfigError: the object does not exist or is of another kind, or its code raises an exception.
     """
     return loaded(reference, fits, what).value
 
 
 def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str = "object") -> Loaded:
-    """`load`, with the file that the object came from."""
+    """Return the object as `load` does, together with its file."""
     place, name = _parts(reference)
     if place.endswith(".py"):
         module, sha256 = _from_file(Path(os.path.expanduser(place)))
@@ -68,7 +70,7 @@ def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str 
         name = right[0]
     if not name:
         example = f"write {place}:{right[0] if right else 'NAME'}"
-        raise ConfigError(f"{reference}: which {what} of it? {example}; {known}")
+        raise ConfigError(f"{reference}: give the name of the {what}: {example}; {known}")
     if name not in there:
         hint = did_you_mean(name, right, known)
         raise ConfigError(f"{reference}: {place} has nothing called {name!r}; {hint}")
@@ -79,7 +81,7 @@ def loaded(reference: str, fits: Callable[[Any], bool] | None = None, what: str 
 
 
 def sha256_of(reference: str) -> str | None:
-    """Of the file's bytes; nothing of it runs. None: not there, or of a package that this process has not loaded."""
+    """Return the SHA-256 of the file without running it; None if it does not exist or its package is not loaded."""
     place, _name = _parts(reference)
     file = (
         os.path.expanduser(place)
@@ -93,15 +95,15 @@ def sha256_of(reference: str) -> str | None:
 
 
 def is_reference(text: str) -> bool:
-    """Whether `text` names code outside the package; the names of what comes with Tandem have none of these signs."""
+    """Return whether `text` refers to user code. Names of objects that come with Tandem contain none of these signs."""
     return any(sign in text for sign in ":/.")
 
 
 def absolute(reference: str, folder: Path) -> str:
-    """The reference of a file with its path written out, `folder` being where it is relative to; others as they are.
+    """Return the reference of a file with an absolute path, relative to `folder`; other references are unchanged.
 
     Raises:
-        ConfigError: `~user` without a home folder.
+        ConfigError: `~user` has no home folder.
     """
     place, name = _parts(reference)
     if not (place.endswith(".py") or "/" in place):
@@ -109,13 +111,13 @@ def absolute(reference: str, folder: Path) -> str:
     there = os.path.expanduser(place)
     if there.startswith("~"):
         raise ConfigError(
-            f"{reference}: no home folder of {place.partition('/')[0]} is known; write the folder out"
+            f"{reference}: no home folder of {place.partition('/')[0]} is known; write the full path"
         )
     return os.path.abspath(folder / there) + (f":{name}" if name else "")
 
 
 def _parts(reference: str) -> tuple[str, str]:
-    """File or package, and the name in it; "" where there is none."""
+    """Split into file or package, and the name in it, which may be ""."""
     place, colon, name = reference.rpartition(":")
     return (place, name.strip()) if colon else (name, "")
 
@@ -138,7 +140,7 @@ def _from_file(path: Path) -> tuple[ModuleType, str]:
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
         setattr(module, APPENDED, str(path.parent))
-    # Dataclasses look their module up while it runs.
+    # Dataclasses look up their module while it runs.
     sys.modules[name] = module
     try:
         exec(compile(source, str(path), "exec", dont_inherit=True), vars(module))
@@ -146,20 +148,22 @@ def _from_file(path: Path) -> tuple[ModuleType, str]:
         del sys.modules[name]
         if not isinstance(error, Exception | SystemExit):
             raise
-        raise _told(error, str(path)) from error
+        raise _user_code_error(error, str(path)) from error
     return module, sha256
 
 
 def _from_package(package: str, name: str) -> tuple[ModuleType, str]:
     if not all(part.isidentifier() for part in package.split(".")):
         raise ConfigError(
-            f"{package}: neither a file that ends in .py nor the name of a package{_rather(package, name)}"
+            f"{package}: neither a file that ends in .py nor the name of a package{_suggestion(package, name)}"
         )
     top = package.partition(".")[0]
     with _installed_only():
         found = next(filter(None, (finder.find_spec(top, None) for finder in sys.meta_path)), None)
         if found is None:
-            raise ConfigError(f"{package}: no package called {top!r} is installed{_rather(package, name)}")
+            raise ConfigError(
+                f"{package}: no package called {top!r} is installed{_suggestion(package, name)}"
+            )
         try:
             module = importlib.import_module(package)
         except (Exception, SystemExit) as error:
@@ -167,13 +171,13 @@ def _from_package(package: str, name: str) -> tuple[ModuleType, str]:
             if absent is not None and f"{package}.".startswith(f"{absent}."):
                 inside, _, last = absent.rpartition(".")
                 raise ConfigError(f"{package}: {inside} has no module called {last!r}") from None
-            raise _told(error, found.origin or package) from error
+            raise _user_code_error(error, found.origin or package) from error
     file = Path(module.__file__ or "")
     return module, hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
-def _rather(place: str, name: str) -> str:
-    """What may have been meant by what is no package: the file beside it, as the end of a message."""
+def _suggestion(place: str, name: str) -> str:
+    """Suggest the file that may have been meant instead of a package, as the end of a message."""
     file = os.path.splitext(place)[0] + ".py"
     if os.path.isfile(os.path.expanduser(file)):
         return f"; did you mean '{file}:{name or 'NAME'}'?"
@@ -184,7 +188,7 @@ def _rather(place: str, name: str) -> str:
 
 @contextmanager
 def _installed_only() -> Iterator[None]:
-    """Without the folder that `python -m` puts first in `sys.path`, and those that files were loaded from."""
+    """Hide the folder that `python -m` puts first in `sys.path`, and the folders of loaded files."""
     before = list(sys.path)
     hidden = {
         vars(module).get(APPENDED) for name, module in list(sys.modules.items()) if name.startswith(PREFIX)
@@ -199,8 +203,8 @@ def _installed_only() -> Iterator[None]:
         sys.path[:] = [*before, *(entry for entry in sys.path if entry not in before)]
 
 
-def _told(error: BaseException, file: str) -> ConfigError:
-    """What somebody else's code raised, in one line, with the last line of theirs that led there."""
+def _user_code_error(error: BaseException, file: str) -> ConfigError:
+    """Describe an exception of user code in one line, with the last line of the user's code that led to it."""
     folder = os.path.dirname(file)
     lines = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     if isinstance(error, SyntaxError) and error.filename:

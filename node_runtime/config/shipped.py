@@ -1,4 +1,4 @@
-"""The files that come with an installation of Tandem: certified sets, experiments and configurations."""
+"""Files that are installed with Tandem: certified sets, experiments and configurations."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from node_runtime.config.strict import ConfigError, did_you_mean
 
 
 def shipped(name: str) -> Path:
-    """A file or folder of them, as "sets" or "experiments". It need not exist: an image may leave them out."""
-    # They are data of the package `tandem`, which is found here and not imported.
+    """Return the path of a shipped file or folder, such as "sets". It may not exist, because an image can omit it."""
+    # The files belong to the package `tandem`, which is located without an import.
     spec = find_spec("tandem")
     places = spec.submodule_search_locations if spec is not None else None
     return Path(*list(places or [])[:1], "configs", name)
 
 
 def config_file(given: str | Path) -> Path:
-    """A file, or the shipped configuration of that name where there is no such file.
+    """Return the path of a file, or of the shipped configuration of that name if there is no such file.
 
     Raises:
-        ConfigError: a plain name, without folder and ending, that is neither.
+        ConfigError: a plain name, without folder and suffix, is neither.
     """
     path = Path(given)
     if path.suffix or path != Path(path.name) or path.is_file():

@@ -1,7 +1,7 @@
-"""A file's tables as typed Structs, strictly: what does not fit is said in a person's words.
+"""Strict conversion of a file's tables to typed Structs, with error messages for a person.
 
-msgspec says "Expected `int` >= 1 - at `$.trainer.batch`"; a person wants the key, what was given, where, and what
-would be right.
+The text of msgspec is like "Expected `int` >= 1 - at `$.trainer.batch`". It is replaced by the key, the given value,
+its place, and the allowed values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import msgspec
 from msgspec import inspect
 
 Fail = Callable[[str, str], NoReturn]
-"""(key, text): raises `ConfigError`."""
+"""Takes a key and a text, and raises `ConfigError`."""
 T = TypeVar("T", bound=msgspec.Struct)
 
 _PLACE = re.compile(r"^(?P<text>.*) - at `\$\.?(?P<key>.*)`$", re.DOTALL)
@@ -27,13 +27,13 @@ _STEP = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the text says what, where and what would be right."""
+    """The configuration cannot be used. The text says what, where, and what is allowed."""
 
 
 def load_tree(path: str | Path) -> dict[str, Any]:
-    """What a TOML file gives, unchecked. Raises `ConfigError` for a file that cannot be read."""
+    """Read a TOML file without checks. Raises `ConfigError` if it cannot be read."""
     try:
-        # Windows' editors begin a file with a byte order mark, which TOML does not know.
+        # Editors on Windows write a byte order mark, which TOML does not allow.
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
@@ -46,14 +46,14 @@ def load_tree(path: str | Path) -> dict[str, Any]:
 
 
 def apply_override(tree: dict[str, Any], assignment: str) -> str:
-    """Put one `section.key=value` into a plain tree; returns the key. Raises `ConfigError`.
+    """Put one `section.key=value` into a plain tree and return the key. Raises `ConfigError`.
 
-    The value is read as TOML (`0.5`, `[32, 32]`, `true`), and as a bare string where it is not.
+    The value is read as TOML (`0.5`, `[32, 32]`, `true`), or as a plain string if it is not TOML.
     """
     key, separator, text = assignment.partition("=")
     key = key.strip()
     if not separator or not key:
-        raise ConfigError(f"{assignment!r}: an override is written section.key=value")
+        raise ConfigError(f"{assignment!r}: write an override as section.key=value")
     try:
         value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
@@ -69,20 +69,20 @@ def apply_override(tree: dict[str, Any], assignment: str) -> str:
 
 
 def readable(text: str) -> str:
-    """What UTF-8 can say: a file's name may be any bytes, and those that are no text become \\udcXX."""
+    """Return text that UTF-8 can encode. Bytes of a file name that are not text become \\udcXX."""
     return text.encode(errors="backslashreplace").decode()
 
 
 def strict(tree: dict[str, Any], kind: type[T], where: str) -> T:
-    """A plain tree as the Struct `kind`. Raises `ConfigError`, as helpful as for a configuration.
+    """Convert a plain tree to the Struct `kind`. Raises `ConfigError` with the same details as for a configuration.
 
-    where: the file, for messages.
+    where: the file's name for messages.
     """
     return convert(tree, kind, failing(where))
 
 
 def failing(where: str, origins: Mapping[str, str] | None = None) -> Fail:
-    """What names the place of a mistake: the file, or for a key that came from elsewhere (`trainer.batch`) that."""
+    """Return a function that raises `ConfigError` with the place of a key: the file, or its entry in `origins`."""
 
     def fail(key: str, text: str) -> NoReturn:
         place = key.split("[")[0]
@@ -93,7 +93,7 @@ def failing(where: str, origins: Mapping[str, str] | None = None) -> Fail:
 
 
 def convert(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
-    """A plain tree as the Struct `kind`; calls `fail` with the key at fault and a text."""
+    """Convert a plain tree to the Struct `kind`; call `fail` with the wrong key and a text."""
     _reject_unknown(tree, _type_info(kind), fail, "")
     try:
         return msgspec.convert(tree, kind)
@@ -102,7 +102,7 @@ def convert(tree: dict[str, Any], kind: type[T], fail: Fail) -> T:
 
 
 def did_you_mean(given: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
-    """A hint for a misspelt name: the nearest that is known, after `prefix`, or what is said otherwise."""
+    """Return a hint for a misspelt name: the nearest known name, after `prefix`, or else `otherwise`."""
     near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
     return f"did you mean {prefix + near[0]!r}?" if near else otherwise
 
@@ -113,9 +113,9 @@ def _type_info(kind: type) -> inspect.Type:
 
 
 def _reject_unknown(value: Any, kind: inspect.Type, fail: Fail, path: str) -> None:
-    """msgspec would reject unknown keys too, but cannot say which key was meant."""
+    """Report unknown keys. msgspec rejects them too, but does not suggest the nearest one."""
     within = f"{path}." if path else ""
-    match _without_none(kind), value:
+    match _bare(kind), value:
         case inspect.StructType(fields=fields), dict():
             known = {field.name: field.type for field in fields}
             for key, below in value.items():
@@ -132,14 +132,14 @@ def _reject_unknown(value: Any, kind: inspect.Type, fail: Fail, path: str) -> No
 
 
 def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
-    """The key at fault and a message for it.
+    """Return the wrong key and a message for it.
 
-    text: of a `msgspec.ValidationError` raised while `tree` was converted to the Struct `kind`.
+    text: that of a `msgspec.ValidationError` raised while `tree` was converted to the Struct `kind`.
     """
     found = _PLACE.match(text)
     if not found or not found["key"]:
         return "", text
-    # msgspec does not say which entry of a table it was.
+    # msgspec does not name the entry of a table.
     key = found["key"].partition("[...]")[0]
     value: Any = tree
     wanted = _type_info(kind)
@@ -150,9 +150,9 @@ def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
                 value = value[name]
             case inspect.ListType(item_type=item), list() if index:
                 wanted, value = item, value[int(index)]
-            case _:  # a place that these types do not have: msgspec's own words are all there is
+            case _:  # a place outside these types: use msgspec's text
                 return key, f"{key}: {found['text']}"
-        wanted = _without_none(wanted)
+        wanted = _bare(wanted)
     given = f"{key} = {_shown(value)}"
     if isinstance(wanted, inspect.LiteralType):
         choices = [str(choice) for choice in wanted.values]
@@ -166,7 +166,7 @@ def _explain(text: str, tree: Any, kind: type) -> tuple[str, str]:
 
 
 def _allowed(kind: inspect.Type) -> str:
-    """What a value of this type may be: "an integer of at least 1 and at most 99"."""
+    """Describe the allowed values of a type, such as "an integer of at least 1 and at most 99"."""
     match kind:
         case inspect.BoolType():
             return "true or false"
@@ -182,11 +182,11 @@ def _allowed(kind: inspect.Type) -> str:
             length = (
                 f" of {kind.min_length}" if kind.min_length and kind.min_length == kind.max_length else ""
             )
-            return f"a list{length}, each entry {_allowed(_without_none(kind.item_type))}"
+            return f"a list{length}, each entry {_allowed(_bare(kind.item_type))}"
         case inspect.DictType():
-            return f"a table, each entry {_allowed(_without_none(kind.value_type))}"
+            return f"a table, each entry {_allowed(_bare(kind.value_type))}"
         case inspect.UnionType(types=types):
-            return " or ".join(_allowed(option) for option in types)
+            return " or ".join(_allowed(_bare(option)) for option in types)
     return f"a {type(kind).__name__.removesuffix('Type').lower()}"
 
 
@@ -196,12 +196,14 @@ def _range(kind: inspect.IntType | inspect.FloatType) -> str:
     return said and f" {said}"
 
 
-def _without_none(kind: inspect.Type) -> inspect.Type:
-    """The type proper of `T | None`."""
+def _bare(kind: inspect.Type) -> inspect.Type:
+    """Return T of `T | None`, without the unit that it may have."""
+    if isinstance(kind, inspect.Metadata):
+        return _bare(kind.type)
     if isinstance(kind, inspect.UnionType):
         rest = [option for option in kind.types if not isinstance(option, inspect.NoneType)]
         if len(rest) == 1:
-            return rest[0]
+            return _bare(rest[0])
     return kind
 
 

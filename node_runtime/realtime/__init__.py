@@ -1,1 +1,1 @@
-"""One clock, slots on its grid, and what makes a Python loop punctual."""
+"""The clock, slots on its grid, and measures that make a Python loop punctual."""

@@ -1,4 +1,4 @@
-"""What makes a Python loop punctual: real-time priority, one BLAS thread, no collection inside a step."""
+"""Measures that make a Python loop punctual: real-time priority, one BLAS thread, no garbage collection in a step."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ from node_runtime.config.strict import ConfigError
 log = logging.getLogger(__name__)
 
 READER_PRIORITY = 1
-"""SCHED_FIFO priority of what reads everything on the bus: below the loops, above all that is not real-time. A reader
-that gets no core fills its link, and then the router waits, with everybody's messages."""
+"""SCHED_FIFO priority of processes that read the whole bus: below the loops and above all ordinary processes. A reader
+without a core fills its link, and the router then holds back the messages of all processes."""
 WAKE_LATENCY = "/dev/cpu_dma_latency"
-"""Linux holds the wake-up latency, in microseconds, that was written here for as long as the file stays open."""
+"""Linux keeps the wake-up latency, in microseconds, that was written to this file while the file is open."""
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Matrices here are small: more BLAS threads would only wait for each other, and may round otherwise."""
+    """Limit BLAS to one thread. For small matrices more threads wait for each other and may round differently."""
     return threadpoolctl.threadpool_limits(limits=1)
 
 
 @contextmanager
 def quick_handover() -> Iterator[None]:
-    """A thread of this process that computes gives way to one that waits after 50 us, instead of after 5 ms.
+    """Let a computing thread of this process give way to a waiting thread after 50 us instead of 5 ms.
 
-    For every message that arrives, the bus's receiving thread needs the interpreter for a moment. A reader that
-    takes 5 ms for each message reads 200 a second; a faster sender then fills the link, and the router waits with
-    everybody's messages, commands too, until there is room.
+    The bus's receiving thread needs the interpreter for a moment per message. If it waits 5 ms each time, it reads 200
+    messages a second. A faster sender then fills the link, and the router holds back all messages, including commands.
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(5e-5)
@@ -48,15 +47,15 @@ def quick_handover() -> Iterator[None]:
 
 @contextmanager
 def awake(wanted: bool = True, device: str = WAKE_LATENCY) -> Iterator[str]:
-    """Keep the cores of this machine from sleeping, so that a wake-up takes microseconds; it costs power.
+    """Keep the cores of this machine from sleeping, so that waking takes microseconds. This costs power.
 
-    Where that is not permitted: one warning, and the text that is yielded, for `Health.note`, says so; else it is "".
+    Without permission, log a warning and yield it as a text for `Health.note`; otherwise yield "".
     """
     if not wanted:
         yield ""
         return
     try:
-        file = open(device, "r+b", buffering=0)  # noqa: SIM115 - whether it opens decides what is yielded
+        file = open(device, "r+b", buffering=0)  # noqa: SIM115 - the result depends on whether it opens
     except OSError as error:
         note = f"{device} cannot be opened ({error.strerror}); cores may sleep between slots and wake late"
         log.warning("%s. Run as root or give access to it, or set realtime.awake = never.", note)
@@ -68,12 +67,12 @@ def awake(wanted: bool = True, device: str = WAKE_LATENCY) -> Iterator[str]:
 
 
 def core_for(config: Config, process: str, allowed: set[int]) -> int | None:
-    """The core on which the loop of "controller" or "plant" stays; None: the scheduler decides.
+    """Return the core for the loop of "controller" or "plant"; None if the scheduler decides.
 
-    A loop that is moved to another core finds its data in no cache there, and at 1 kHz that happens in most slots.
+    A loop that moves to another core finds its data in no cache. At 1 kHz this happens in most slots.
 
     Raises:
-        ConfigError: `realtime.cores` names a core that this process may not use, or not two of them.
+        ConfigError: `realtime.cores` does not name two cores, or names one that this process may not use.
     """
     cores, place = config.realtime.cores, ("controller", "plant").index(process)
     if isinstance(cores, list):
@@ -90,7 +89,7 @@ def core_for(config: Config, process: str, allowed: set[int]) -> int | None:
 
 @contextmanager
 def on_core(core: int | None) -> Iterator[None]:
-    """Keep the calling thread, and those it starts inside, on one core; other threads stay free. None: do nothing."""
+    """Keep the calling thread, and threads that it starts inside, on one core; None does nothing."""
     if core is None:
         yield
         return
@@ -103,21 +102,21 @@ def on_core(core: int | None) -> Iterator[None]:
 
 
 def core_note(core: int | None) -> str:
-    """For `Health.note`."""
+    """Return the text for `Health.note`."""
     return "" if core is None else f"its loop stays on core {core}"
 
 
 @contextmanager
 def punctual(priority: int, *, keep_awake: bool = False, silent: bool = False) -> Iterator[str]:
-    """Make the calling thread, and all threads it starts from here on, punctual.
+    """Make the calling thread, and all threads that it starts afterwards, punctual.
 
-    Enter it before the bus opens, whose threads inherit the priority. Without the privilege the loop runs at
-    ordinary priority: one warning, and the text that is yielded, for `Health.note`, says so; else it is "".
+    Enter it before opening the bus, whose threads inherit the priority. Without the privilege the loop runs at ordinary
+    priority; a warning is then logged and yielded as a text for `Health.note`. Otherwise "" is yielded.
 
     Args:
-        priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduler alone.
+        priority: SCHED_FIFO priority 1 to 99; 0 for ordinary scheduling.
         keep_awake: see `awake`.
-        silent: no warning; for a process beside others that warn.
+        silent: suppresses the warning, for a process beside others that log it.
     """
     before = (os.sched_getscheduler(0), os.sched_getparam(0))
     collecting = gc.isenabled()
@@ -126,7 +125,7 @@ def punctual(priority: int, *, keep_awake: bool = False, silent: bool = False) -
         try:
             yield "; ".join(filter(None, (note, sleepy)))
         finally:
-            # What a `GarbageCollection` inside has set.
+            # Undo the settings of a `GarbageCollection` inside.
             gc.unfreeze()
             if collecting:
                 gc.enable()
@@ -151,10 +150,10 @@ def _raise_priority(priority: int, silent: bool) -> str:
 
 
 class GarbageCollection:
-    """Garbage is collected between steps, where there is time, instead of inside one.
+    """Runs garbage collection between steps, where there is time, instead of inside a step.
 
-    A full collection in a process that has loaded much stops all its threads for 100 ms; in one that reads the bus,
-    that stops the router's messages to everybody.
+    A full collection in a large process stops all its threads for 100 ms. In a process that reads the bus, this stops
+    the router's messages to all processes.
     """
 
     def __init__(self, every: int = 20):
@@ -164,19 +163,19 @@ class GarbageCollection:
 
     @classmethod
     def at(cls, period: float) -> GarbageCollection:
-        """For a loop with this period, in seconds: every 20 steps, and at most five times a second."""
+        """Return one for a loop with this period in seconds: every 20 steps, and at most five times a second."""
         return cls(max(20, math.ceil(0.2 / period)))
 
     def begin(self) -> None:
-        """All that exists now stays: take it out of what is searched, and stop automatic collection."""
+        """Exclude all present objects from the search, and stop automatic collection."""
         gc.collect()
         gc.freeze()
         gc.disable()
 
     def idle(self) -> None:
-        """Called once a step, after all urgent work."""
+        """Collect if it is due. Call it once per step, after all urgent work."""
         self._calls += 1
         if self._calls % self._every == 0:
-            # Only what is new: a full collection would also walk all that is remembered, 20,000 samples for
-            # instance, and take longer than a fast loop's period.
+            # Collect young objects only. A full collection would also visit all stored data, such as 20,000 samples,
+            # and take longer than a fast loop's period.
             gc.collect(1)

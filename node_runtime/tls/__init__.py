@@ -1,1 +1,1 @@
-"""Links with certificates: who is let in, what each may do, and why a link is refused."""
+"""Links with certificates: authentication, rights, and reasons of refusals."""

@@ -1,4 +1,4 @@
-"""What Zenoh's configuration needs for TLS with certificates on both sides, rights by role, and limits of size."""
+"""Zenoh's settings for TLS with certificates on both sides, rights by role, and size limits."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MESSAGES = [
 
 
 def client_settings(own: Credentials) -> dict[str, Any]:
-    """For a session that connects by `tls/` or `quic/`."""
+    """Return the settings of a session that connects by `tls/` or `quic/`."""
     return {"transport/link/tls": _link("connect", own) | {"verify_name_on_connect": True}}
 
 
 def router_settings(own: Credentials, plant: str) -> dict[str, Any]:
-    """For a router that listens by `tls/` or `quic/`: no client without a certificate, and none beyond its rights."""
+    """Return the settings of a router at `tls/` or `quic/`: clients need certificates and have limited rights."""
     return {
         "transport/link/tls": _link("listen", own),
         "access_control": access_control(plant),
@@ -48,16 +48,17 @@ def _link(way: Literal["connect", "listen"], own: Credentials) -> dict[str, Any]
 
 
 def access_control(plant: str) -> dict[str, Any]:
-    """Zenoh's rules: everything on plain links, which do not leave the machine; on the others by certificate.
+    """Return Zenoh's rules: all rights on plain links, which stay on the machine, and rights by certificate on others.
 
-    Default deny. "ingress" is what the router receives from the holder of a certificate, "egress" what it sends it.
+    The default is to deny. "ingress" is from the holder of a certificate to the router, "egress" the opposite
+    direction.
     """
     rules = [
         _rule("plain", MESSAGES, ["ingress", "egress"], ["**", topics.below("*", f"{topics.DIRECT}/**")])
     ]
     subjects: list[dict[str, Any]] = [{"id": "plain", "link_protocols": PLAIN}]
     policies = [{"rules": ["plain"], "subjects": ["plain"]}]
-    # Who listens where: without it a publisher believes that nobody does, and sends nothing.
+    # Clients need the subscriptions of others: a publisher that sees no subscriber sends nothing.
     all_keys = [topics.everything(plant), topics.below(plant, f"{topics.DIRECT}/**")]
     rules.append(_rule("matching", ["declare_subscriber", "declare_queryable"], ["egress"], all_keys))
     for role in ROLES:
@@ -88,7 +89,7 @@ def access_control(plant: str) -> dict[str, Any]:
 
 
 def size_limits(plant: str) -> list[dict[str, Any]]:
-    """What comes in by a certificate is no larger than its topic allows, already at the router."""
+    """Return the router's size limits by topic for messages that arrive on links with certificates."""
     limits: dict[int, list[str]] = {}
     for topic in topics.ALL:
         limits.setdefault(topic.max_bytes, []).extend(topic.keys(plant))

@@ -1,7 +1,7 @@
-"""A client's way in by TLS: its own certificate, checked first, and why the router and it refuse each other.
+"""A client's TLS link: its certificate, checked first, and the reason if client and router refuse each other.
 
-Zenoh's client tries a refused link again for ever and keeps the reason to itself. So a TLS handshake of our own, beside
-it, finds the reason out.
+Zenoh's client retries a refused link without end and does not report the reason. A separate TLS handshake finds the
+reason.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from protocol.rights import role_of
 
 log = logging.getLogger(__name__)
 
-# Zenoh opens a link that is welcome within some ten milliseconds.
+# Zenoh opens an accepted link within about ten milliseconds.
 FIRST_HANDSHAKE_S = 0.5
 NEXT_HANDSHAKE_S = 3.0
 TIMEOUT_S = 2.0
-# In TLS 1.3 the client has finished before the server looks at its certificate.
+# In TLS 1.3 the client finishes before the server checks its certificate.
 VERDICT_S = 0.5
 CLOCK_CHECK_S = 3600.0
-"""Seconds between two looks at the clock, which may be set meanwhile."""
+"""Seconds between two checks of the clock, which may be set meanwhile."""
 
 _ALERTS = {
-    "UNKNOWN_CA": "it does not know the authority of our certificate: {folder} was made by another authority",
+    "UNKNOWN_CA": "it does not know the authority of our certificate: {folder} is from another authority",
     "CERTIFICATE_EXPIRED": "our certificate has expired by its clock",
-    "CERTIFICATE_REQUIRED": "it wants a certificate and got none",
-    "BAD_CERTIFICATE": "it takes our certificate for malformed",
+    "CERTIFICATE_REQUIRED": "it requires a certificate and received none",
+    "BAD_CERTIFICATE": "it considers our certificate malformed",
     "CERTIFICATE_UNKNOWN": "it does not accept our certificate",
-    "DECRYPT_ERROR": "our certificate was made by another authority of the same name",
+    "DECRYPT_ERROR": "our certificate is from another authority of the same name",
 }
-# Of OpenSSL's X509_V_ERR_*.
+# Values of OpenSSL's X509_V_ERR_*.
 _EXPIRED, _NOT_YET = 10, 9
 _HOSTNAME, _ADDRESS = 62, 64
 
 
 class TlsClient:
-    """One process that wants to reach a router by certificates.
+    """One process that connects to a router with a certificate.
 
     Raises:
-        ConfigError: the process's certificate cannot be used, and why.
+        ConfigError: the process's certificate cannot be used. The text says why.
     """
 
     def __init__(self, config: Config, process: str):
@@ -59,7 +59,7 @@ class TlsClient:
         left = self._credentials.days_left()
         if left < credentials.WARN_DAYS:
             log.warning(
-                "%s expires in %.0f days, and its links end then: `tandem keys renew --role %s`",
+                "%s expires in %.0f days, and its links will be closed then: renew it by `tandem keys renew --role %s`",
                 self._credentials.certificate,
                 left,
                 self._credentials.role,
@@ -67,11 +67,11 @@ class TlsClient:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """For Zenoh's configuration."""
+        """Settings for Zenoh's configuration."""
         return client_settings(self._credentials)
 
     def refused(self, waited_s: float) -> str | None:
-        """Why the router and we refuse each other, once that is known; asked again and again while we wait."""
+        """Return why router and client refuse each other, once it is known. Call it repeatedly while waiting."""
         if self._endpoint.startswith("tls/") and waited_s >= self._next:
             self._next = waited_s + NEXT_HANDSHAKE_S
             if self._trying is None or not self._trying.is_alive():
@@ -80,15 +80,17 @@ class TlsClient:
         return self._reason
 
     def watch(self, stop: threading.Event) -> None:
-        """Say it in the log when the certificate is over: the links end then, and Zenoh says nothing."""
+        """Log the expiry of the certificate, because Zenoh closes the links then without a message."""
 
         def look() -> None:
             while (reason := self._credentials.expired()) is None:
-                # A little later than that moment, so that it is over in any case.
+                # Wait slightly longer, so that the certificate certainly has expired.
                 left_s = self._credentials.days_left() * 86400.0
                 if stop.wait(min(CLOCK_CHECK_S, left_s + 0.1)):
                     return
-            log.error("%s; our links to %s end now. Start again with the new one", reason, self._endpoint)
+            log.error(
+                "%s; the links to %s are closed now. Restart with a new certificate", reason, self._endpoint
+            )
 
         threading.Thread(target=look, name="certificate", daemon=True).start()
 
@@ -97,9 +99,9 @@ class TlsClient:
 
 
 def refusal(endpoint: str, own: Credentials) -> str | None:
-    """Why the router at `tls/HOST:PORT` and we refuse each other, from the end of a TLS handshake.
+    """Find by a TLS handshake why the router at `tls/HOST:PORT` and this client refuse each other.
 
-    None when we do not, or nobody is there.
+    The result is None if they do not, or if there is no answer.
     """
     place = urlsplit(f"tls://{endpoint.partition('/')[2]}")
     host, port = place.hostname, place.port
@@ -119,7 +121,7 @@ def refusal(endpoint: str, own: Credentials) -> str | None:
         return _refused_by_us(error, host, own)
     except ssl.SSLError as error:
         return _refused_by_router(error.reason or str(error), own)
-    except OSError:  # nobody there, or nothing said within the time: no refusal
+    except OSError:  # no router, or no answer in time: not a refusal
         return None
     return None
 
@@ -134,7 +136,7 @@ def _refused_by_us(error: ssl.SSLCertVerificationError, host: str, own: Credenti
         )
     return (
         f"the router's certificate does not come from the authority in {own.authority} "
-        f"({error.verify_message}): it is another router, or its keys were made anew"
+        f"({error.verify_message}): it is another router, or its keys were replaced"
     )
 
 
@@ -143,5 +145,5 @@ def _refused_by_router(reason: str, own: Credentials) -> str:
         if alert in reason:
             return f"the router refused us: {text.format(folder=own.folder)} ({reason})"
     if reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNEXPECTED_EOF_WHILE_READING"):
-        return f"what listens there does not speak TLS ({reason}): is it the router's plain endpoint?"
+        return f"the other side does not use TLS ({reason}): is it the router's plain endpoint?"
     return f"the router refused us: {reason}"

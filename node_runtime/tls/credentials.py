@@ -1,7 +1,7 @@
-"""One process's certificate: where it lies, and whether it can be used, said before anybody is asked.
+"""The certificate of a process: its files, and whether it can be used, checked before connecting.
 
-A folder holds `certificate.pem`, its `key.pem`, and `authority.pem`, the certificate that others' are checked with.
-`tandem keys create` makes such a folder for every role.
+A folder contains `certificate.pem`, its `key.pem`, and `authority.pem`, the certificate for checking other processes.
+`tandem keys create` creates such a folder for every role.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ WARN_DAYS = 30
 
 @dataclass(frozen=True)
 class Credentials:
-    """A folder whose three files fit each other."""
+    """A folder with three files that belong together."""
 
     folder: Path
     name: str
-    """The certificate's common name: `trainer.jet1`."""
+    """The certificate's common name, such as `trainer.jet1`."""
     not_before: datetime
     not_after: datetime
 
@@ -49,21 +49,21 @@ class Credentials:
         return self.folder / AUTHORITY
 
     def days_left(self) -> float:
-        """Days until it expires, negative afterwards."""
+        """Return the days until it expires, negative afterwards."""
         return (self.not_after - datetime.now(UTC)).total_seconds() / 86400.0
 
     def expired(self) -> str | None:
-        """Why the certificate is not valid now, or None."""
+        """Return why the certificate is not valid now, or None."""
         now = datetime.now(UTC)
         if now > self.not_after:
             return (
                 f"{self.certificate}: expired on {self.not_after:%Y-%m-%d %H:%M} UTC. "
-                f"Make a new one: `tandem keys renew --role {self.role}` where the authority is, and copy its folder"
+                f"Renew it by `tandem keys renew --role {self.role}` at the authority, and copy its folder"
             )
         if now < self.not_before:
             return (
                 f"{self.certificate}: not valid before {self.not_before:%Y-%m-%d %H:%M} UTC; "
-                f"it is {now:%Y-%m-%d %H:%M} here. Is the clock right?"
+                f"it is {now:%Y-%m-%d %H:%M} here. Check the clock"
             )
         return None
 
@@ -73,11 +73,11 @@ class Credentials:
 
 
 def read(folder: str | Path) -> Credentials:
-    """The credentials in a folder, valid at this time or not.
+    """Read the credentials in a folder, whether they are valid at this time or not.
 
     Raises:
-        ConfigError: a file is missing, cannot be read, is none of these, or does not fit the others; or the key can
-            be read by others than its owner.
+        ConfigError: a file is missing, unreadable or of a wrong kind, or does not belong to the others; or the key is
+            readable by other users.
     """
     place = Path(folder).absolute()
     try:
@@ -86,7 +86,7 @@ def read(folder: str | Path) -> Credentials:
         raise ConfigError(f"bus.tls.keys = {str(folder)!r}: cannot be read: {error.strerror}") from error
     if not there:
         raise ConfigError(
-            f"bus.tls.keys = {str(folder)!r}: no such folder; `tandem keys create` makes one for every role"
+            f"bus.tls.keys = {str(folder)!r}: no such folder; `tandem keys create` creates one for every role"
         )
     certificate = load_certificate(place / CERTIFICATE)
     authority = load_certificate(place / AUTHORITY)
@@ -98,14 +98,14 @@ def read(folder: str | Path) -> Credentials:
     try:
         private = load_pem_private_key(pem, password=None)
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{key}: no private key in PEM without a password: {error}") from error
+        raise ConfigError(f"{key}: not a private key in PEM without a password: {error}") from error
     if private.public_key() != certificate.public_key():
-        raise ConfigError(f"{key}: is not the key of {CERTIFICATE} beside it")
+        raise ConfigError(f"{key}: it is not the key of {CERTIFICATE} in the same folder")
     try:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
         raise ConfigError(
-            f"{place / CERTIFICATE}: was not issued by the authority in {AUTHORITY} beside it; "
+            f"{place / CERTIFICATE}: was not issued by the authority in {AUTHORITY} in the same folder; "
             "copy a role's folder as a whole"
         ) from error
     return Credentials(
@@ -114,7 +114,7 @@ def read(folder: str | Path) -> Credentials:
 
 
 def of_process(folder: str | None, role: str, plant: str) -> Credentials:
-    """The credentials of a process, usable now. Raises `ConfigError`, which says why they are not.
+    """Return the credentials of a process if they are usable now. Raises `ConfigError` with the reason otherwise.
 
     folder: `bus.tls.keys`; role: one of `protocol.rights.ROLES`; plant: its name.
     """
@@ -126,8 +126,8 @@ def of_process(folder: str | None, role: str, plant: str) -> Credentials:
     credentials = read(folder)
     if credentials.name != wanted:
         raise ConfigError(
-            f"{credentials.certificate}: is the certificate of {credentials.name}, and this process is {wanted}: "
-            f"the router would deny it what it needs. Give bus.tls.keys the folder of {wanted}"
+            f"{credentials.certificate}: is the certificate of {credentials.name}, but this process is {wanted}, "
+            f"and the router would deny its messages. Set bus.tls.keys to the folder of {wanted}"
         )
     reason = credentials.expired()
     if reason is not None:
@@ -136,22 +136,22 @@ def of_process(folder: str | None, role: str, plant: str) -> Credentials:
 
 
 def load_certificate(path: Path) -> x509.Certificate:
-    """Raises `ConfigError` when it cannot be read, or is none."""
+    """Read a certificate. Raises `ConfigError` if it cannot be read or is not one."""
     pem = read_bytes(path)
     try:
         return x509.load_pem_x509_certificate(pem)
     except ValueError as error:
-        raise ConfigError(f"{path}: no certificate in PEM: {error}") from error
+        raise ConfigError(f"{path}: not a certificate in PEM: {error}") from error
 
 
 def name_of(certificate: x509.Certificate) -> str:
-    """The common name; "" when there is none."""
+    """Return the common name; "" if there is none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
 def read_bytes(path: Path) -> bytes:
-    """Raises `ConfigError` when the file cannot be read."""
+    """Read a file. Raises `ConfigError` if it cannot be read."""
     try:
         return read_regular(path)
     except OSError as error:

@@ -40,7 +40,7 @@ def read_run(path: str | Path) -> Run:
             case Attachment():
                 run.attachments[record.name] = record.data
             case Metadata():
-                _take_metadata(run, record)
+                take_metadata(run, record)
             case Channel():
                 names[record.id] = record.topic
             case Message():
@@ -57,16 +57,26 @@ def read_run(path: str | Path) -> Run:
         )
     elif run.continued is not None:
         run.note = f"{path} is part {run.part} of its log, which goes on in {run.continued}."
-    run.config = _config(path, run)
+    interpret(run)
+    return run
+
+
+def interpret(run: Run) -> None:
+    """Take the configuration and the plant from what was read so far.
+
+    Raises:
+        LogError: there is no usable configuration, or the plant's record cannot be used.
+    """
+    run.config = _config(run.path, run)
     if PLANT in run.attachments:
         try:
             run.plant, run.files = decode(run.attachments[PLANT])
         except PlantRecordError as error:
-            raise LogError(f"{path}: {PLANT}: {error}") from error
-    return run
+            raise LogError(f"{run.path}: {PLANT}: {error}") from error
 
 
-def _take_metadata(run: Run, record: Metadata) -> None:
+def take_metadata(run: Run, record: Metadata) -> None:
+    """Note in `run` what one metadata record says of its log."""
     if record.name == RECOVERED:
         run.recovered = True
     elif record.name == CONTINUED:

@@ -2,7 +2,7 @@
 
 - `raw/<topic>`: the exact bytes that travelled (msgpack), for replay. No schema in the channel: the
   attachment schemas.json has them all, and a generic msgpack reader needs none.
-- `view/<topic>`: the same message as plottable JSON with a JSON schema (`run_log.writing.views`).
+- `view/<topic>`: the same message as plottable JSON with a JSON schema (`run_log.views`).
 - attachments: config.json, config.toml, plant.json (what is known of the plant, as numbers), versions.json, seeds.json,
   units.json, schemas.json.
 """
@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,22 +17,18 @@ import msgspec
 
 from lbmpc.plants import Known, Plant
 from node_runtime import provenance
-from node_runtime.bus.inbox import Follower
 from node_runtime.config.loading import to_json, to_toml
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import readable
 from protocol import codec, topics
-from protocol.codec import Head
-from protocol.messages import Message
 from run_log.errors import LogError
-from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PLANT, PROFILE, RAW, VIEW
+from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PLANT, PROFILE, RAW
 from run_log.plant_record import encode
+from run_log.views.channel import Channel
+from run_log.views.views import Views
 from run_log.writing.durable_file import Sink, mcap_writer
-from run_log.writing.views import View, views
 
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
-COUNTED = ("controller/tick", "controller/result")
-"""Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
 MAX_STRANGERS = 100
 """Channels for keys that are in no topic table; whoever makes up more of them is not logged."""
 
@@ -72,17 +67,10 @@ class LogWriter:
         self.bad: dict[str, int] = {}
         """Known topics' payloads that are in the log as they came, but have no view: by reason."""
         self.last_bad: str | None = None
-        self.lost: dict[str, int] = {}
-        """By topic, messages that are missing between others: they never arrived here."""
         self.sink = Sink(path, patient=patient)
-        self._views = views(plant)
+        self._views = Views(config, plant)
         self._raw: dict[str, int] = {}
-        self._shown: dict[str, int] = {}
-        self._next_view: dict[str, int] = {}
-        """When, in ns, a topic's next view is due; what comes earlier has none."""
-        self._speakers = {name: Follower(config.bus.follow_silence) for name in COUNTED}
-        self._counted: dict[tuple[str, str], int] = {}
-        """The last number of each run on each of the topics `COUNTED`."""
+        self._shown: dict[Channel, int] = {}
         self._strangers = 0
         self._mcap = mcap_writer(self.sink, config.log.chunk_bytes)
         self._mcap.start(profile=PROFILE, library=LIBRARY)
@@ -92,6 +80,11 @@ class LogWriter:
         for name, kind, text in _attachments(config, plant, files or {}, versions):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """By topic, messages that are missing between others: they never arrived here."""
+        return self._views.lost
 
     def write(self, name: str, payload: bytes, log_time: int) -> None:
         """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
@@ -106,26 +99,15 @@ class LogWriter:
         if channel is None:
             self.counters["dropped"] += 1
             return
-        view = self._views.get(name)
-        shown: bytes | None = None
-        # Of a message between two views only who wrote it and its number are looked at.
-        head: Message | Head | None = None
-        if log_time < self._next_view.get(name, 0):
-            head = codec.head_of(payload)
-        if head is None and view is not None:
-            try:
-                head = message = codec.decode(view.topic, payload)
-                shown = view.render(message)
-                if math.isfinite(view.topic.view_hz):
-                    self._next_view[name] = log_time + int(1e9 / view.topic.view_hz)
-            except codec.BadMessage as error:
-                self._count_bad(error)
-        if head is not None and name in COUNTED:
-            self._count_lost(name, head, log_time)
-        sequence = max(head.seq, 0) & 0xFFFFFFFF if head is not None else 0
-        self._mcap.add_message(channel, log_time, payload, log_time, sequence)
-        if view is not None and shown is not None:
-            self._mcap.add_message(self._view_channel(view), log_time, shown, log_time, sequence)
+        seen = self._views.show(name, payload, log_time)
+        if seen.bad is not None:
+            self._count_bad(seen.bad)
+        sequence = seen.seq & 0xFFFFFFFF
+        self._mcap.add_message(channel, log_time, payload, seen.sent_ns, sequence)
+        for shown, text in seen.shown:
+            self._mcap.add_message(self._view_channel(shown), log_time, text, seen.sent_ns, sequence)
+        if self._views.lost:
+            self.counters["lost ticks"] = max(self._views.lost.values())
         self.counters["messages"] += 1
         self.counters["bytes"] += len(payload)
 
@@ -167,31 +149,11 @@ class LogWriter:
         self._raw[name] = self._mcap.register_channel(RAW + name, encoding, 0, {"type": kind})
         return self._raw[name]
 
-    def _view_channel(self, view: View) -> int:
-        name = view.topic.name
-        if name not in self._shown:
-            schema = self._mcap.register_schema(
-                f"tandem.view.{name.replace('/', '.')}", "jsonschema", msgspec.json.encode(view.schema)
-            )
-            self._shown[name] = self._mcap.register_channel(VIEW + name, "json", schema)
-        return self._shown[name]
-
-    def _count_lost(self, name: str, message: Message | Head, log_time: int) -> None:
-        """Ticks whose messages were made and never came here: cut links, full queues, whatever it was.
-
-        What is out of order, or of another run than the one that speaks, was sent again or by a stranger.
-        """
-        if self._speakers[name].accept(message.run_id, message.seq, log_time * 1e-9) != "ok":
-            return
-        key = (name, message.run_id)
-        last = self._counted.get(key)
-        if last is None and len(self._counted) >= MAX_STRANGERS:
-            return
-        self._counted[key] = message.seq
-        if last is not None and message.seq > last + 1:
-            missing = message.seq - last - 1
-            self.lost[name] = self.lost.get(name, 0) + missing
-            self.counters["lost ticks"] = max(self.lost.values())
+    def _view_channel(self, channel: Channel) -> int:
+        if channel not in self._shown:
+            schema = self._mcap.register_schema(channel.schema_name, "jsonschema", channel.schema_text)
+            self._shown[channel] = self._mcap.register_channel(channel.topic, "json", schema)
+        return self._shown[channel]
 
     def _count_bad(self, error: codec.BadMessage) -> None:
         key = f"bad {error.topic}: {error.reason}"

@@ -1,4 +1,4 @@
-"""`tandem architecture`: network architectures in files of one's own."""
+"""`tandem architecture`: network architectures in files of your own."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from tyro.conf import Positional, Suppress, arg, subcommand
 from tandem.commands.base import Command
 
 NETWORKS = 60
-"""Of random sizes. Most architectures take most of them."""
+"""Number of random sizes. Most architectures accept most of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArchitectureCheck(Command):
-    """Whether numpy, CasADi and torch compute the same network from your file, and phi is bounded by 1."""
+    """Check that numpy, CasADi and torch compute the same network from your file, and that phi is bounded by 1."""
 
     EXTRAS = "trainer"
 
     name: Annotated[Positional[str], arg(metavar="FILE:NAME")]
-    """As for network.architecture: gru.py:GRU, or one that comes with Tandem."""
+    """As for network.architecture: gru.py:GRU, or a shipped one."""
 
     def run(self) -> int:
-        """0 when they agree on networks of random sizes, as far as the architecture accepts them; 1 when not."""
+        """Return 0 if they agree on networks of random sizes, as far as the architecture accepts them, else 1."""
         import numpy as np
 
         from network_model.registry import register

@@ -1,7 +1,7 @@
-"""What every command of `tandem` has, and what every command with a configuration has.
+"""Base classes of the commands of `tandem`, and of those with a configuration.
 
-A command's file holds its arguments and what it does. Its imports stand in the functions that need them: all commands
-are loaded for `tandem --help`, and each process loads only what it needs.
+A command's file holds its arguments and its work. Imports are inside the functions that need them: `tandem
+--help` loads all commands, and each process loads only what it needs.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
-OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
-"""Those of the extras. Where one is missing, the command ends with a message."""
+OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2", "pyarrow", "rerun")
+"""Packages of the extras. If one is missing, the command ends with a message."""
 NO_SETS, INTERRUPTED = 3, 130
 """Exit codes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """What every command has."""
+    """Base class of every command."""
 
     EXTRAS: ClassVar[str] = ""
-    """What must be installed for it, as in pip install 'tandem-control[EXTRAS]'."""
+    """Extras that it needs, as in pip install 'tandem-control[EXTRAS]'."""
 
     json: bool = False
     """Print the result as one JSON object on standard output, and nothing else there."""
 
     def run(self) -> int:
-        """Do it; returns the exit code. Raises `ConfigError`, `LogError` or `Refused` for what cannot be done."""
+        """Run; return the exit code. Raises `ConfigError`, `LogError` or `Refused` if the request cannot be done."""
         raise NotImplementedError
 
     @cached_property
@@ -50,11 +50,11 @@ class Command:
         return terminal.console(self.json)
 
     def say(self, *lines: str, style: str | None = None) -> None:
-        """Lines for a person, as they are."""
+        """Print lines for a person, unchanged."""
         terminal.say(self.console, *lines, style=style)
 
     def emit(self, result: Mapping[str, Any]) -> None:
-        """The result as one JSON object, where `--json` asks for it."""
+        """Print the result as one JSON object, if `--json` is given."""
         if self.json:
             terminal.emit(result)
 
@@ -64,18 +64,18 @@ class Configured(Command):
     """A command that reads a configuration."""
 
     KEYS: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """(option, key of the configuration that it stands for). An option of None changes nothing."""
+    """(option, key of the configuration). An option of None changes nothing."""
 
     config: Annotated[Path | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: compressor)")] = (
         None
     )
-    """A shipped configuration (compressor, compressor-cheap, published), or your own in TOML; a file of that name comes
-    first. `tandem config show` prints one with all keys."""
+    """A shipped configuration (compressor, compressor-cheap, published), or your own TOML file. A file of that name has
+    precedence. `tandem config show` prints all keys."""
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Change one value of the configuration."""
 
     def resolve(self) -> tuple[Config, dict[str, Any]]:
-        """The configuration: file, then --set, then the command's options. And the tree as it was given."""
+        """Return the configuration (file, then --set, then the command's options) and the tree as it was given."""
         from node_runtime.config.loading import from_tree
         from node_runtime.config.shipped import config_file
         from node_runtime.config.strict import ConfigError, apply_override, load_tree
@@ -99,7 +99,7 @@ class Configured(Command):
         return from_tree(tree, str(self.config or "configuration"), origins, folder), tree
 
     def resolve_with_plant(self) -> tuple[Config, Description]:
-        """The configuration, and the plant that it names and fits."""
+        """Return the configuration and its plant, which fit each other."""
         from lbmpc.plants import get_plant
         from node_runtime.config.plant import plant_of
 
@@ -108,7 +108,7 @@ class Configured(Command):
 
 
 def require(*packages: str) -> None:
-    """Raises `ModuleNotFoundError` for a package that would be missed late, or in another process only."""
+    """Raise `ModuleNotFoundError` for a package that would be missed late, or in another process only."""
     for package in packages:
         if find_spec(package) is None:
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -1,4 +1,4 @@
-"""`tandem config`: the configuration as it is resolved."""
+"""`tandem config`: the resolved configuration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tandem.commands.base import Configured
 
 @dataclass(frozen=True, kw_only=True)
 class ConfigShow(Configured):
-    """Print the whole configuration as it is resolved: file, then --set, then the plant's own values and defaults."""
+    """Print the resolved configuration: file, then --set, then the plant's own values and defaults."""
 
     def run(self) -> int:
         from node_runtime.config.loading import to_toml, to_tree

@@ -1,4 +1,4 @@
-"""`tandem experiment`: which there are, and running one."""
+"""`tandem experiment`: list experiments and run one."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from tandem.terminal import Refused
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment(Command):
-    """Run an experiment, `paper` or a file of your own, and report it on one page; `list` says which there are."""
+    """Run an experiment, `paper` or a file of your own, and report it on one page; `list` names the shipped ones."""
 
     EXTRAS = "experiment"
 
     what: Annotated[Positional[str], arg(metavar="NAME|FILE.toml|list")]
     """A shipped experiment, your own file ("Experiments" in the documentation), or `list`."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(needed, except for list)")] = None
-    """Where the report goes. An experiment that was interrupted goes on from what lies there."""
+    """Folder of the report. An interrupted experiment continues from the files there."""
     quick: bool = False
-    """Few seeds, states and values: whether everything works, in minutes."""
+    """Only a few seeds, states and values: a check that everything works, in minutes."""
     jobs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
-    """Runs at the same time; the figures do not depend on it."""
+    """Number of simultaneous runs; the figures do not depend on it."""
     only: Annotated[str | None, arg(metavar="GROUP", help_behavior_hint="(default: all)")] = None
-    """One group of the experiment."""
+    """Only one group of the experiment."""
 
     def run(self) -> int:
         if self.what == "list":
@@ -117,14 +117,14 @@ class Experiment(Command):
 
 
 def _shipped_files() -> dict[str, Path]:
-    """The shipped experiments, by name."""
+    """Return the shipped experiments, by name."""
     from node_runtime.config.shipped import shipped
 
     return {path.stem: path for path in sorted(shipped("experiments").glob("*.toml"))}
 
 
 def _find(what: str) -> Path:
-    """A shipped name, or a file. Raises `Refused`."""
+    """Return a shipped experiment by name, or a file. Raises `Refused`."""
     from node_runtime.config.strict import did_you_mean
 
     files = _shipped_files()

@@ -1,4 +1,4 @@
-"""`tandem health`: how a process is, as it says itself on the bus. Light enough to run every few seconds."""
+"""`tandem health`: state of a process, as it reports itself on the bus. Light enough to run every few seconds."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ WELL = ("ready", "running")
 
 @dataclass(frozen=True, kw_only=True)
 class Health(Configured):
-    """Ask the bus how a process is: exit code 0 when it is ready or running, 1 when not. Made for health checks."""
+    """Ask the bus for the state of a process: exit code 0 if it is ready or running, else 1. For health checks."""
 
     process: Annotated[Positional[ProcessName], arg(metavar="|".join(get_args(ProcessName)))]
     """Which process."""
     seconds: Annotated[float, arg(metavar="S")] = 3.0
-    """How long to listen; a process speaks twice a second."""
+    """How long to listen; a process reports twice a second."""
 
     def run(self) -> int:
         config, _ = self.resolve()
@@ -34,7 +34,7 @@ class Health(Configured):
 
 
 def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
-    """Say how the process is; 0 when it is ready or running, 1 when it is not or says nothing."""
+    """Print the state of the process; return 0 if it is ready or running, 1 if it is not or does not report."""
     health = ask(config, process, seconds)
     if health is None:
         text = f"{process}: not heard of for {seconds:g} s at {config.bus.endpoint}"
@@ -52,7 +52,7 @@ def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
 
 
 def ask(config: Config, process: str, seconds: float) -> messages.Health | None:
-    """The next `Health` of a process; None when it says nothing for `seconds`, or no router answers.
+    """Return the next `Health` of a process; None if there is none for `seconds`, or no router answers.
 
     Raises:
         ConfigError: the endpoint is none.

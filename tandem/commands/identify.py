@@ -27,7 +27,7 @@ LEARNING = {"dnn", "l2nw", "perfect"}
 
 @dataclass(frozen=True, kw_only=True)
 class Identify(Command):
-    """A, B and W from the samples of logs by least squares, and how well they predict what they have not seen."""
+    """Fit A, B and W to the samples of logs by least squares, and check them on samples that were not fitted."""
 
     EXTRAS = "log"
 
@@ -40,10 +40,10 @@ class Identify(Command):
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the logs' numbers)")
     ] = None
-    """The plant file that the logs were made with, where they do not carry its numbers."""
+    """The plant file of the logs, if they do not carry its numbers."""
 
     def run(self) -> int:
-        """0, or 2 where the logs do not say what A and B are."""
+        """Return 0, or 2 if the logs do not determine A and B."""
         import numpy as np
 
         from lbmpc.identification import NotIdentifiable, Quality, Variables, identify
@@ -77,7 +77,7 @@ class Identify(Command):
         return ", ".join(file.name for file in self.files)
 
     def _read(self) -> tuple[Known, float, list[Observed]]:
-        """The plant as the first log has it, the period, and what each log saw."""
+        """Return the plant of the first log, the period, and the samples of each log."""
         from run_log.named_plant import name_plant
         from run_log.reading.reader import read_run
         from run_log.reading.transitions import observed
@@ -151,7 +151,7 @@ class Identify(Command):
 
 
 def _model_of(ran: Any) -> Model:
-    """Of the log's controllers. Raises `LogError`."""
+    """Oracles of the log's controllers. Raises `LogError`."""
     from lbmpc.model import ModelError, build_model
     from run_log.errors import LogError
     from run_log.run import plant_of
@@ -177,7 +177,7 @@ def _quality_table(known: Known, found: Identified, own: Quality) -> Table:
 
 
 def _result(known: Known, found: Identified, own: Quality) -> dict[str, Any]:
-    """What `--json` prints; matrices in the plant's units, residuals in half-widths per second."""
+    """Return what `--json` prints; matrices in the plant's units, residuals in half-widths per second."""
 
     def of(quality: Quality) -> dict[str, np.ndarray]:
         return {"rms": quality.rms, "largest": quality.largest}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tandem.certificate_authority import Issued
 
-ROLE = "router|plant|controller|trainer|recorder|operator|commander"
+ROLE = "router|plant|controller|trainer|recorder|viewer|commander"
 
 
 class Shows(Command):
@@ -53,16 +53,16 @@ class Shows(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class KeysCreate(Shows):
-    """Make a private authority for one plant, and with it one certificate a role."""
+    """Create a private authority for one plant, and one certificate for each role."""
 
     plant: Annotated[str, arg(metavar="NAME")]
     """The plant's name, as `name` in the configuration."""
     host: Annotated[UseAppendAction[list[str]], arg(metavar="NAME|IP")] = field(default_factory=list)
     """A name or address under which other machines reach the router. May be given several times."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: keys/NAME)")] = None
-    """Where they go; must not exist yet."""
+    """Folder for them; must not exist yet."""
     days: Annotated[int, arg(metavar="N")] = 365
-    """How long the roles' certificates are valid; the authority's is for ten years."""
+    """Validity of the roles' certificates in days; the authority's is ten years."""
 
     def run(self) -> int:
         from node_runtime.config.sections import PLANT_NAME
@@ -87,18 +87,18 @@ class KeysCreate(Shows):
 
 @dataclass(frozen=True, kw_only=True)
 class KeysRenew(Command):
-    """Make one role's key and certificate anew, from the authority that there is."""
+    """Create one role's key and certificate again, or for the first time, with the existing authority."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """The plant's folder: keys/NAME."""
     role: Annotated[UseAppendAction[list[str]], arg(metavar=ROLE)] = field(default_factory=list)
-    """Whose. May be given several times."""
+    """The role. May be given several times."""
     host: Annotated[UseAppendAction[list[str]], arg(metavar="NAME|IP")] = field(default_factory=list)
-    """A further name or address of the router."""
+    """Another name or address of the router."""
     authority: Annotated[
         Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: FOLDER/authority)")
     ] = None
-    """Where the authority's certificate and key are, if they are kept elsewhere."""
+    """Folder of the authority's certificate and key, if they are elsewhere."""
     days: Annotated[int, arg(metavar="N")] = 365
     """How long it is valid."""
 
@@ -116,9 +116,11 @@ class KeysRenew(Command):
             hosts = self.host if role == "router" or len(self.role) == 1 else []
             old, new = certificate_authority.renew(role, self.folder, hosts, self.days, self.authority)
             renewed.append(new)
+            was = "" if old is None else f", was {old.valid_until:%Y-%m-%d}"
+            still = "" if old is None else " The old certificate works until its end."
             self.say(
-                f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}, was {old.valid_until:%Y-%m-%d}. Copy the "
-                f"folder to the {role}'s machine and start the {role} again. The old certificate works until its end.",
+                f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}{was}. Copy the folder to the {role}'s machine "
+                f"and start the {role} again.{still}",
             )
         self.emit({"certificates": [_plain(one) for one in renewed]})
         return 0
@@ -126,13 +128,13 @@ class KeysRenew(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class KeysShow(Shows):
-    """Say what each certificate's holder may do, and until when. Exit code 1 when one has expired."""
+    """Print what each certificate's holder may do, and until when. Exit code 1 if one has expired."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("keys")
     """A role's folder, a plant's, or that of all plants."""
 
     def run(self) -> int:
-        """0, or 1 when one has expired."""
+        """Return 0, or 1 if one has expired."""
         from tandem import certificate_authority
 
         there = certificate_authority.found(self.folder)

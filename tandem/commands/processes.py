@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class PrintableLog(logging.Formatter):
-    """What strangers put into names and messages stays text, and within the lines that are about it."""
+    """Text of other processes in names and messages stays text, and within its lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record)).replace("\n", "\n    ")
@@ -41,7 +41,7 @@ class Process(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Router(Process):
-    """The Zenoh router that all processes are clients of."""
+    """The Zenoh router; all processes are its clients."""
 
     def run(self) -> int:
         config, _ = self.resolve()
@@ -52,7 +52,7 @@ class Router(Process):
 
 @dataclass(frozen=True, kw_only=True)
 class Controller(Process):
-    """The controller: one tick a period, latch, solve, command."""
+    """The controller: in each period it latches a tick, solves, and sends a command."""
 
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
@@ -63,12 +63,12 @@ class Controller(Process):
 
 @dataclass(frozen=True, kw_only=True)
 class Trainer(Process):
-    """The trainer: collects samples, trains the hidden layers, sends them. Needs torch, not CasADi."""
+    """The trainer: collects samples, trains the hidden layers, and sends them. Needs torch, not CasADi."""
 
     EXTRAS = "trainer"
 
     plants: str | None = None
-    """Train for all plants whose names match, e.g. 'jet*'; by default the one named in the configuration."""
+    """Train for all plants whose names match, e.g. 'jet*'; default: the one named in the configuration."""
 
     def run(self) -> int:
         config, _ = self.resolve()
@@ -79,7 +79,7 @@ class Trainer(Process):
 
 @dataclass(frozen=True, kw_only=True)
 class Plant(Process):
-    """The plant: integrates the truth in real time, applies commands as they arrive."""
+    """The simulated plant: integrates the true motion in real time and applies commands as they arrive."""
 
     def run(self) -> int:
         config, _ = self.resolve_with_plant()
@@ -90,7 +90,7 @@ class Plant(Process):
 
 @dataclass(frozen=True, kw_only=True)
 class Record(Process):
-    """The recorder: writes everything on the bus to a log."""
+    """The recorder: writes all messages on the bus to a log."""
 
     EXTRAS = "log"
     KEYS = (("log", "log.path"),)

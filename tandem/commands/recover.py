@@ -1,4 +1,4 @@
-"""`tandem recover`: a whole log beside the one that was cut short."""
+"""`tandem recover`: repair a log that was cut off."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from tandem.commands.base import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Recover(Command):
-    """Make a log whole whose recorder did not end cleanly."""
+    """Write a complete copy of a log whose recorder did not end cleanly."""
 
     EXTRAS = "log"
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The log; it stays as it is."""
+    """The log; it does not change."""
     output: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: NAME.recovered.mcap)")
     ] = None
-    """Where the whole log goes."""
+    """File of the complete log."""
 
     def run(self) -> int:
         import msgspec

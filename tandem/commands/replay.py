@@ -1,4 +1,4 @@
-"""`tandem replay`: a log's ticks once more, compared byte for byte."""
+"""`tandem replay`: run a log's ticks again and compare byte for byte."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tandem.commands.base import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Replay(Command):
-    """Give a log's ticks to a fresh controller and compare every command and keyframe, byte for byte."""
+    """Run a log's ticks through a fresh controller and compare every command and keyframe, byte for byte."""
 
     EXTRAS = "log"
 
@@ -25,15 +25,15 @@ class Replay(Command):
     set: Annotated[UseAppendAction[list[str]], arg(metavar="SECTION.KEY=VALUE")] = field(default_factory=list)
     """Replay with another value than the log's configuration has."""
     architecture: Annotated[str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: none)")] = None
-    """The file of the log's network, where its architecture is one of your own. A log's own word is never enough to
-    load code."""
+    """The file of the log's network, if its architecture is one of your own. Tandem never loads code only because a log
+    names it."""
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
     ] = None
-    """The plant file that the log was made with, where a replay needs equations: oracle perfect, certified sets."""
+    """The plant file of the log, if a replay needs equations: oracle perfect, certified sets."""
 
     def run(self) -> int:
-        """0 when all commands and keyframes equal to the byte; 1 when one differs, if only by rounding, or is lost."""
+        """Return 0 if all commands and keyframes are equal to the byte, 1 if one differs or is lost."""
         import msgspec
 
         from node_runtime.config.architecture import load_architecture

@@ -14,7 +14,7 @@ from tandem.commands.base import Command, require
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):
-    """Draw a run and tabulate it, from its log alone."""
+    """Plot and tabulate a run, from its log alone."""
 
     EXTRAS = "log"
 
@@ -26,10 +26,10 @@ class Report(Command):
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")
     ] = None
-    """The plant file whose equations moved in that run: without it, nothing is said of the motion between samples."""
+    """The plant file with the true equations of that run. Without it the report omits the motion between samples."""
 
     def run(self) -> int:
-        """0, or 1 when a picture cannot be drawn or written."""
+        """Return 0, or 1 if a picture cannot be drawn or written."""
         import msgspec
 
         from run_log.named_plant import name_truth

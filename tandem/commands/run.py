@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from tandem.live.supervisor import Wish
 
 USUAL_S, LONGEST_S = 20.0, 1e8
-"""The second: three years."""
+"""In seconds: three years."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run(Configured):
-    """Run router, recorder, trainer, plant and controller here, watch them, and leave a log and a picture."""
+    """Run router, recorder, trainer, plant and controller here, show them live, and leave a log and a picture."""
 
     EXTRAS = "trainer,log"
     KEYS = (
@@ -41,32 +41,32 @@ class Run(Configured):
     seconds: Annotated[
         float | None, arg(metavar="S", help_behavior_hint="(default: 20; with --no-plant until Ctrl-C)")
     ] = None
-    """How long, counted from the first command."""
+    """Seconds, counted from the first command."""
     oracle: Annotated[
         OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
     ] = None
-    """What the controller learns with."""
+    """Estimate of h."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
     """Samples a second."""
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
-    """Of everything random."""
+    """Seed of everything random."""
     noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint=FROM_CONFIG)] = None
-    """Noise in what is measured of every state, its standard deviation as a share of the half-width: 0.01."""
+    """Measurement noise of every state: its standard deviation as a share of the half-width, for example 0.01."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
-    """The log; a file of that name is moved aside, never overwritten. The picture lies beside it."""
+    """The log; an existing file of that name is moved aside. The picture is placed beside it."""
     no_trainer: bool = False
-    """Start no trainer here: it comes from another machine ("Put the trainer on another machine" in the
-    documentation), or not at all."""
+    """Start no trainer here: it runs on another machine ("Put the trainer on another machine" in the
+    documentation), or there is none."""
     no_plant: bool = False
     """Start no plant here, and wait for one: `tandem plant`, or the gateway of a machine ("The wire" in the
-    documentation). The router is at the configuration's endpoint then."""
+    documentation). The router is then at the configuration's endpoint."""
 
     def run(self) -> int:
         """Run everything for `seconds` from the first command."""
         config, given = self.resolve()
         seconds = self._seconds(config.period)
         path = Path(config.log.path).absolute()
-        # A file's name may be any bytes; but what moves the cursor is a trap for whoever lists the folder.
+        # A file name may be any bytes, but control characters would affect the terminal that lists the folder.
         shown = readable(str(path))
         if printable(shown) != shown:
             raise terminal.Refused(f"{path}: control characters in the name of the log or of its folders")
@@ -91,7 +91,7 @@ class Run(Configured):
             endpoint = config.bus.endpoint if known else _free_endpoint()
             bus = msgspec.structs.replace(config.bus, endpoint=endpoint)
             log = msgspec.structs.replace(config.log, path=str(files.log.absolute()))
-            # A run is a new experiment: it begins with what the configuration says and nothing else.
+            # A run is a new experiment: it begins with the configuration and no memory.
             controller = msgspec.structs.replace(config.controller, checkpoint="")
             resolved = msgspec.structs.replace(config, bus=bus, log=log, controller=controller)
             files.config.write_text(to_toml(resolved), encoding="utf-8")
@@ -113,7 +113,7 @@ class Run(Configured):
                 return INTERRUPTED
 
     def _seconds(self, period: float) -> float:
-        """How long to run, infinity where only the person ends it. Raises `Refused`."""
+        """Return the duration in seconds; infinity if only the person ends it. Raises `Refused`."""
         if self.seconds is None:
             return math.inf if self.no_plant else USUAL_S
         if not self.seconds > period:
@@ -122,14 +122,14 @@ class Run(Configured):
         return self.seconds
 
     def _elsewhere(self) -> list[str]:
-        """The processes that are not started here."""
+        """Names of the processes that are not started here."""
         absent = {"plant": self.no_plant, "trainer": self.no_trainer}
         return [name for name, is_absent in absent.items() if is_absent]
 
     def _supervise(
         self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
     ) -> tuple[str | None, bool]:
-        """Why the run ended badly, or None; and whether its log is whole."""
+        """Return why the run failed, or None; and whether its log is complete."""
         from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
         from tandem.live.screen import Screen
         from tandem.live.supervisor import Supervisor
@@ -152,7 +152,7 @@ class Run(Configured):
     def _conclude(
         self, config: Config, files: RunFiles, trouble: str | None, logged: bool, began: bool
     ) -> int:
-        """Figures and picture from the log, with the equations that `config` names if they moved here.
+        """Return figures and picture from the log, with the equations that `config` names if they moved here.
 
         Raises:
             Impatient: the figures are not waited for.
@@ -188,9 +188,9 @@ class Run(Configured):
         try:
             with self.console.status("reading the log"):
                 ran = read_run(parts[0] if parts else files.log)
-                # A file may have changed since, and then nothing is said of the motion between samples.
+                # A file may have changed since; then the motion between samples is left out.
                 with suppress(ConfigError):
-                    # What a machine does between them nobody knows.
+                    # The motion of a machine between samples is not known.
                     ran.truth = None if self.no_plant else true_plant_of(config, get_plant, get_truth)
                 summary = summarise(ran)
             result = summary_table.of(summary)
@@ -223,7 +223,7 @@ class Run(Configured):
 
 
 def _free_endpoint() -> str:
-    """A loopback port that nobody listens on at this moment."""
+    """Return a free loopback port."""
     import socket
 
     with socket.socket() as probe:
@@ -232,6 +232,6 @@ def _free_endpoint() -> str:
 
 
 def _near(path: Path) -> str:
-    """As short as it can be said from here."""
+    """Return the shortest form of the path from the present folder."""
     near = os.path.relpath(path)
     return near if not near.startswith("..") else str(path)

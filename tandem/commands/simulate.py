@@ -1,4 +1,4 @@
-"""`tandem simulate`: everything in lock-step in one process."""
+"""`tandem simulate`: controller, trainer and plant in lock-step in one process."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tandem.commands.base import FROM_CONFIG, Configured, require
 from tandem.terminal import Refused
 
 MOST_STEPS = 1_000_000
-"""All of them are in memory until the end."""
+"""All ticks are in memory until the end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Configured):
-    """Controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
+    """Run controller, trainer and plant in lock-step in one process: deterministic, faster than real time."""
 
     EXTRAS = "trainer,log"
     KEYS = (
@@ -30,32 +30,32 @@ class Simulate(Configured):
     oracle: Annotated[
         OracleName | None, arg(metavar="linear|constant|l2nw|dnn|perfect", help_behavior_hint=FROM_CONFIG)
     ] = None
-    """What the controller learns with."""
+    """Estimate of h."""
     steps: Annotated[int, arg(metavar="INT")] = 200
-    """How many ticks; of each episode."""
+    """Number of ticks of each episode."""
     episodes: Annotated[int, arg(metavar="INT")] = 1
-    """How often the plant starts again from x0; controller and trainer keep all they have learned."""
+    """Number of times that the plant starts from x0; controller and trainer keep all they have learned."""
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint=FROM_CONFIG)] = None
-    """Of everything random; the same seed gives the same run, bit for bit."""
+    """Seed of everything random; the same seed gives the same run, bit for bit."""
     tightening: Annotated[
         TighteningName | None,
         arg(metavar="none|first_step|tube|invariant", help_behavior_hint=FROM_CONFIG),
     ] = None
-    """How the nominal constraints are tightened."""
+    """Tightening of the nominal constraints."""
     adapt_only: bool = False
-    """Never train the hidden layers; adapt the last one only."""
+    """Never train the hidden layers; adapt the last layer only."""
     x0: Annotated[
         list[float] | None, arg(metavar="X...", help_behavior_hint="(default: the plant's own)")
     ] = None
     """Initial state, in the plant's own units."""
     noise: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint=FROM_CONFIG)] = None
-    """Noise in what is measured of every state, its standard deviation as a share of the half-width: 0.01."""
+    """Measurement noise of every state: its standard deviation as a share of the half-width, for example 0.01."""
     set_points: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: the configured reference)")
     ] = None
     """Set-points from the beginning of each episode on: a CSV file with the columns time and states."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none is written)")] = None
-    """Write the run's log too, in the format of a live run."""
+    """Also write the run's log, in the format of a live run."""
 
     def run(self) -> int:
         config, plant = self.resolve_with_plant()

@@ -1,1 +1,1 @@
-"""What a person says to a loop that runs: where to go, or the input by hand."""
+"""Commands of a person to a running loop: set-points, and manual inputs."""

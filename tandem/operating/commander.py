@@ -1,7 +1,7 @@
-"""Who says where the plant shall go, or takes it by hand: a place on the bus in the role `commander`.
+"""A client on the bus in the role `commander`: it gives set-points or drives the plant manually.
 
-With certificates that takes the commander's own. What is said travels on the control lane, where a message may be lost,
-so it is said again until an answer shows that it counts, and for as long as it shall.
+With certificates it needs the commander's own. Its messages travel on the control lane, where a message may be lost.
+It therefore repeats a message until an answer shows that it counts, and for as long as it shall hold.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ TOPICS = {m.Override: topics.OVERRIDE, m.Reference: topics.REFERENCE}
 ROUTER_S = 5.0
 """Seconds in which a router answers."""
 AGAIN_S = 0.25
-"""Seconds from one asking to the next."""
+"""Seconds between two attempts."""
 MOST_PERIODS = 3.0
-"""Of a slow loop, until it says what it made of a tick."""
+"""Ticks of a slow loop until it reports the result of a tick."""
 LAST_WORDS, APART_S = 3, 0.1
-"""How often what ends something is said, and how soon again: the control lane drops what finds no room."""
+"""Number of repetitions and their interval for a message that ends a session: the control lane may drop messages."""
 
 
 class Commander:
-    """Says things, each with the next number of one run, and hears what others say.
+    """Publish messages, numbered within one run, and receive those of other processes.
 
     Args:
         bus: open.
@@ -48,13 +48,13 @@ class Commander:
 
     @property
     def run_id(self) -> str:
-        """By which others know who said it."""
+        """Identifies the sender to other processes."""
         return self._bus.run_id
 
     def say(self, word: Word, again: bool = False) -> None:
-        """Once; its run_id and seq are put in here.
+        """Publish once; run_id and seq are filled in here.
 
-        again: by the number of what was said last, for who must not take it for another word.
+        again: repeat the number of the last message, so that receivers do not take it for another one.
         """
         if again:
             self._seq = max(0, self._seq - 1)
@@ -64,13 +64,13 @@ class Commander:
         self._seq += 1
 
     def say_last(self, word: Word) -> None:
-        """What ends something: more than once, in little time."""
+        """Publish a message that ends a session: several times, at short intervals."""
         for i in range(LAST_WORDS):
             self.say(word, again=i > 0)
             clock.sleep_until(clock.now() + APART_S)
 
     def hear(self, seconds: float) -> m.Message | None:
-        """The next of what it listens to; None: there was none for so long. What cannot be read is not heard."""
+        """Return the next message; None: there was none for so long. Unreadable messages are skipped."""
         assert self._mailbox is not None
         until = clock.now() + seconds
         while (left := until - clock.now()) > 0.0:
@@ -85,7 +85,7 @@ class Commander:
         return None
 
     def hear_until(self, done: Callable[[m.Message], bool], seconds: float) -> bool:
-        """Listen until it is done, which is asked of everything that is heard; False after so many seconds."""
+        """Receive until `done`, called with every message, returns True; return False after so many seconds."""
         until = clock.now() + seconds
         while (left := until - clock.now()) > 0.0:
             heard = self.hear(left)
@@ -96,13 +96,13 @@ class Commander:
     def keep_saying(
         self, word: Word, every: float, seconds: float, done: Callable[[m.Message], bool]
     ) -> bool:
-        """Say it every so often, in seconds, until it is done.
+        """Publish a message at an interval, in seconds, until it is done.
 
         Args:
-            word: what is said.
-            every: seconds from one time to the next.
-            seconds: for how long; infinite: until it is interrupted.
-            done: asked of everything that is heard meanwhile.
+            word: the message.
+            every: seconds between two repetitions.
+            seconds: longest duration; infinite: until it is interrupted.
+            done: called with every received message.
 
         Returns:
             Whether it was done; False after so many seconds.
@@ -117,7 +117,7 @@ class Commander:
 
 @contextmanager
 def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
-    """A commander on the bus of the configuration, who listens to these topics.
+    """Open a commander on the bus of the configuration that receives these topics.
 
     Raises:
         Refused: no router answers.
@@ -144,9 +144,9 @@ def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
 
 
 def ask(config: Config, reference: m.Reference, seconds: float) -> list[m.TickResult]:
-    """What the controller made of it: the result of the tick that latched it, and of the next; none: no answer.
+    """Return the controller's answer: the results of the tick that latched the message and of the next one, if any.
 
-    A tick that was prepared in the time before it still aims where it aimed then.
+    A tick that was prepared before still has the earlier target.
 
     Raises:
         Refused: no router answers.

@@ -1,4 +1,4 @@
-"""What a person says at the switch, and what the plant and others answer: pure, but for who calls it."""
+"""State of a session of manual control or set-points, from the messages of the plant and of others. Pure."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ LEASE_S, LEASE_PERIODS, LONGEST_LEASE_S = 1.0, 3.0, 60.0
 
 
 def lease_of(period: float) -> float:
-    """Seconds for which a word counts in a loop of this period, in seconds."""
+    """Seconds for which a message counts in a loop of this period, in seconds."""
     return min(max(LEASE_S, LEASE_PERIODS * period), LONGEST_LEASE_S)
 
 
 class Follower:
-    """What others say while a person commands.
+    """Messages of other processes while a person commands.
 
     Args:
-        run_id: of that person's words.
-        of: what they are, `Override` or `Reference`.
+        run_id: of that person's messages.
+        of: their type, `Override` or `Reference`.
     """
 
     def __init__(self, run_id: str, of: type[m.Override] | type[m.Reference]):
@@ -34,13 +34,13 @@ class Follower:
         self.state: m.PlantState | None = None
         """The newest."""
         self.begun = False
-        """Whether it was taken, by the plant or by its controller."""
+        """Whether the plant or its controller accepted the message."""
         self.mine = True
-        """Whether nobody else has ended it."""
+        """Whether no other sender has ended the session."""
         self.elsewhere = False
-        """Whether that was by another reference."""
+        """Whether another reference ended it."""
         self.told = ""
-        """Why nobody drives the plant by hand any more, as it says."""
+        """Why the plant is no longer driven manually, as it reports."""
 
     def said(self) -> None:
         """A word was sent."""
@@ -48,7 +48,7 @@ class Follower:
             self._said_at = -1 if self.state is None else self.state.seq
 
     def take(self, message: m.Message) -> str:
-        """Take note; why the person's word counts no more, or ""."""
+        """Process a message; return why the person's message counts no longer, or ""."""
         if message.run_id == self._run_id:
             return ""
         match message:
@@ -81,13 +81,13 @@ class Follower:
         by_hand = state.source == "manual"
         if self.begun and not by_hand:
             return "the plant is not driven by hand any more"
-        # What is said after one sample acts from the next one on, and the one behind that says so.
+        # A message after one sample acts from the next one on, and the sample after that reports it.
         self.begun = self.begun or (by_hand and state.seq > self._said_at + 1)
         return ""
 
 
 def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
-    """`u=1.2` and so on, by input. Raises `Refused`."""
+    """Parse `u=1.2` and so on, by input. Raises `Refused`."""
     given = from_words(texts)
     for name, value in given.items():
         if name not in plant.inputs:
@@ -97,7 +97,7 @@ def assignments(texts: Sequence[str], plant: Description) -> dict[str, float]:
 
 
 def completed(named: Mapping[str, float], plant: Description, acts: Sequence[float] | None) -> np.ndarray:
-    """The whole input, (m,), with those that are not named as they are. Raises `Refused`: that is not known."""
+    """Return the whole input, (m,); inputs without a name keep their value. Raises `Refused` if it is not known."""
     others = [name for name in plant.inputs if name not in named]
     if others and acts is None:
         raise Refused(f"it is not known what acts now: name {', '.join(others)} too")
@@ -111,7 +111,7 @@ def figures(names: Sequence[str], values: Sequence[float] | np.ndarray) -> str:
 
 
 def clipped(u: np.ndarray, plant: Description) -> str:
-    """Which of these inputs the gateway will bring within U, in words; empty where none."""
+    """Name the inputs that the gateway will clip to U; empty if none."""
     acts = np.clip(u, plant.u_min, plant.u_max)
     return "".join(
         f"; outside of U, {plant.inputs[i]} is clipped to {acts[i]:g}" for i in np.flatnonzero(acts != u)
@@ -119,7 +119,7 @@ def clipped(u: np.ndarray, plant: Description) -> str:
 
 
 def line(state: m.PlantState, plant: Description, seconds: float) -> str:
-    """What acts and where the plant is, for a person; the margin is to the nearest bound of X, in half-widths."""
+    """Describe the acting input and the state for a person; the margin is to the nearest bound of X, in half-widths."""
     x, acts = np.array(state.x), state.acting
     room = -plant.beyond_x(x)
     least = int(np.argmin(room))

@@ -1,4 +1,4 @@
-"""Set-points as a person writes them, to a `Reference`: "y=1.8", or a table of times and values."""
+"""Set-points as a person writes them, converted to a `Reference`: "y=1.8", or a table of times and values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocol import messages as m
 from tandem.terminal import Refused
 
 UNSAID = "unsaid"
-"""run_id of a message that nobody has said yet."""
+"""run_id of a message that was not sent yet."""
 TIME = "time"
 LARGEST = 1024 * 1024
 """Bytes of a table."""
@@ -22,7 +22,7 @@ LARGEST = 1024 * 1024
 def set_point(values: Mapping[str, float], over: float = 0.0, lease: float | None = None) -> m.Reference:
     """Values by the name of a state, plant units, reached in a straight line over so many seconds, or at once.
 
-    lease: seconds after which the configured reference is back; None: it stays.
+    lease: seconds after which the configured reference returns; None: never.
     """
     row = [float(value) for value in values.values()]
     return m.Reference(
@@ -33,7 +33,7 @@ def set_point(values: Mapping[str, float], over: float = 0.0, lease: float | Non
 def trajectory(
     times: Sequence[float], values: Mapping[str, Sequence[float]], lease: float | None = None
 ) -> m.Reference:
-    """Points in time, seconds from when it is taken on, and for each the values by the name of a state.
+    """Points in time, in seconds from acceptance, and for each the values by the name of a state.
 
     Straight lines lead from point to point; two points of one time are a step.
     """
@@ -44,7 +44,7 @@ def trajectory(
 
 
 def from_words(words: Sequence[str]) -> dict[str, float]:
-    """Of words like "y=1.8". Raises `Refused`."""
+    """Parse words such as "y=1.8". Raises `Refused`."""
     values: dict[str, float] = {}
     for word in words:
         name, equals, number = word.partition("=")
@@ -61,7 +61,7 @@ def from_words(words: Sequence[str]) -> dict[str, float]:
 
 
 def from_file(path: Path, lease: float | None = None) -> m.Reference:
-    """Of a CSV file, whose first line names its columns: time, and states. Raises `Refused`."""
+    """Read a CSV file whose first line names its columns: time, and states. Raises `Refused`."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file.read(LARGEST).splitlines()) if row]
@@ -88,7 +88,7 @@ def from_file(path: Path, lease: float | None = None) -> m.Reference:
 
 
 def require_fit(reference: m.Reference, plant: Description, period: float, where: str) -> None:
-    """Raises `Refused` for what a controller of this plant would refuse; the text begins with `where`."""
+    """Raise `Refused` if a controller of this plant would refuse the reference; the text begins with `where`."""
     try:
         change_of(reference, plant, period)
     except RefusedReference as error:

@@ -1,1 +1,1 @@
-"""Files that a person starts from. They are copied, and run as they are."""
+"""Files to start from. They are copied, and run without changes."""

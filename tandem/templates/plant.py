@@ -1,4 +1,4 @@
-"""A plant: a cart that is pushed along a rail. Change everything; this is a start that runs as it is.
+"""A plant: a cart on a rail. Change everything; this file runs without changes.
 
     tandem model check THIS_FILE:PLANT
     tandem run --set plant.model=THIS_FILE:PLANT
@@ -19,7 +19,7 @@ def equations(mass, friction, drag):
 
     def rhs(x, u):
         speed, force = x[1], u[0]
-        # Drag has no slope at rest: the linear model does not know it, and the network learns it.
+        # Drag has no slope at rest: the linear model does not contain it, and the network learns it.
         return [speed, (force - friction * speed - drag * speed * ca.fabs(speed)) / mass]
 
     return rhs
@@ -34,32 +34,32 @@ PLANT = Plant(
     rhs=equations(**PARAMETERS),
     equations=equations,
     parameters=PARAMETERS,
-    # Where the plant rests and is wanted: dx/dt = 0 there.
+    # The equilibrium, where the plant is wanted: dx/dt = 0 there.
     x_e=[0.0, 0.0],
     u_e=[0.0],
-    # Bounds that the controller keeps. Infinite where there is none: then scale={"speed": 1.0} says what counts as 1.
+    # Bounds that the controller keeps; infinite without a bound. Then scale={"speed": 1.0} says what counts as 1.
     x_min=[-1.0, -1.0],
     x_max=[1.0, 1.0],
     u_min=[-3.0],
     u_max=[3.0],
-    # What the linear model misses, per second, as half-widths of a box: `tandem model check` shows how large it is.
+    # What the linear model misses, per second, as half-widths of a box: `tandem model check` shows its size.
     W=[0.01, 0.1],
-    # Where a simulation starts.
+    # Initial state of a simulation.
     x0=[-0.8, 0.0],
-    # What the machine does by itself when nobody commands it. For a plant that this would not hold, also
+    # The machine's input without commands. If it does not hold the plant, also set
     # safe_gain=[[..]]: then safe_input + safe_gain (x - x_e).
     safe_input=[0.0],
-    # Seconds from when an input is written until the plant begins to answer. Time in a network or a computer before
+    # Seconds from writing an input until the plant begins to answer. Time in a network or a computer before
     # the input is written is measured, and not a part of this.
     dead_time=0.0,
-    # States that reports are about, by index; and what the kernel of the oracle l2nw sees.
+    # States for reports, by index; and the inputs of the kernel of the oracle l2nw.
     performance=[0],
     kernel=["speed", "force"],
 )
 
-# Where there are no equations: dx/dt = A x + B u in deviations from (x_e, u_e), or x+ = A x + B u with period=0.05.
-# What is not given has a default. `tandem identify LOG` finds A, B and W from a log. In a simulation the plant moves as
-# the matrices say, or as another one does:
+# Without equations: dx/dt = A x + B u in deviations from (x_e, u_e), or x+ = A x + B u with period=0.05.
+# All other arguments have defaults. `tandem identify LOG` finds A, B and W from a log. In a simulation the plant moves
+# by these matrices, or as another plant:
 #     tandem run --set plant.model=THIS_FILE:MATRICES --set plant.truth=THIS_FILE:PLANT
 MATRICES = Known.from_matrices(
     A=[[0.0, 1.0], [0.0, -0.4]],

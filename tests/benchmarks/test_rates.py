@@ -1,4 +1,4 @@
-"""The table of rates says what was measured, and goes nowhere but between its marks."""
+"""The table of rates has the measured figures and is written only between its marks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.live import rates
 from benchmarks.live.rates import COLUMNS, MARKS, Rates
 
 
-def test_a_document_without_marks_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_document_without_marks_does_not_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "rates.md"
     page.write_text("nothing here\n")
     assert rates.main(Rates(document=page)) == 2

@@ -1,4 +1,4 @@
-"""The benchmark's figures: their names, and that what it times is right. Times themselves are nobody's test."""
+"""The benchmark's figures: their names, and the correctness of the timed work. No test checks a time."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def report() -> Report:
     return measure(TINY)
 
 
-def test_rows_have_the_promised_keys(report: Report) -> None:
+def test_rows_have_the_documented_keys(report: Report) -> None:
     assert report.rows
     for row in report.rows:
         assert set(msgspec.to_builtins(row)) >= KEYS
         assert 0 < row.median_ms <= row.p99_ms <= row.max_ms
 
 
-def test_everything_is_there(report: Report) -> None:
+def test_every_candidate_has_rows(report: Report) -> None:
     for oracle in ("linear", "constant", "l2nw", "dnn"):
         for mode in ("converged", "preparation", "feedback", "tick", "real_time_tick"):
             assert report.find("tandem", mode, oracle, 10, 32 if oracle == "dnn" else None, False), (
@@ -63,7 +63,7 @@ def test_everything_is_there(report: Report) -> None:
     assert report.find("ipopt-hard", "converged", "linear", 10, None, False)
 
 
-def test_whatever_converges_agrees_on_the_optimum(report: Report) -> None:
+def test_converged_solvers_agree_on_the_optimum(report: Report) -> None:
     converged = [row for row in report.rows if row.mode in ("converged", "tick")]
     assert {row.solver for row in converged} >= {"tandem", "ipopt", "sqpmethod-daqp"}
     for row in converged:
@@ -71,7 +71,7 @@ def test_whatever_converges_agrees_on_the_optimum(report: Report) -> None:
         assert row.failures == 0, row
 
 
-def test_a_real_time_iteration_comes_close(report: Report) -> None:
+def test_a_real_time_iteration_is_close_to_the_optimum(report: Report) -> None:
     for oracle in ("linear", "dnn"):
         row = report.find("tandem", "feedback", oracle, 10, 32 if oracle == "dnn" else None, False)
         assert row is not None
@@ -79,7 +79,7 @@ def test_a_real_time_iteration_comes_close(report: Report) -> None:
         assert row.failures == 0
 
 
-def test_the_same_states_every_time() -> None:
+def test_the_recorded_states_are_reproducible() -> None:
     one, two = record(4), record(4)
     assert [x.tobytes() for x in one.x] == [x.tobytes() for x in two.x]
     cases = [build_case(recording, "dnn", 10, 16, lambda function: function) for recording in (one, two)]
@@ -96,7 +96,7 @@ def test_ratios_are_of_medians(report: Report) -> None:
     assert {"dnn / linear, converged", "dnn / linear, real-time iteration"} <= found.keys()
 
 
-def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Path) -> None:
+def test_text_outside_the_marks_does_not_change(report: Report, tmp_path: Path) -> None:
     path = tmp_path / "performance.md"
     path.write_text(f"before\n{reporting.MARKS.begin}\nlast year's\n{reporting.MARKS.end}\nafter\n")
     for _ in range(2):
@@ -109,7 +109,7 @@ def test_a_document_keeps_what_is_outside_the_marks(report: Report, tmp_path: Pa
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_document_without_marks_is_refused_before_anything_is_measured(
+def test_a_document_without_marks_is_refused_before_the_measurement(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("benchmarks.solver.__main__.measure", lambda *_: pytest.fail("measured all the same"))

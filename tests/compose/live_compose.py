@@ -335,7 +335,7 @@ def keys(gateway: str, tmp_path: Path) -> Path:
     """As `tandem keys create` makes them, then given to the containers' user; `mine` is a copy for this test."""
     made = tmp_path / "keys"
     certificate_authority.create("jet1", [gateway], made, days=2)
-    shutil.copytree(made / "operator", tmp_path / "mine")
+    shutil.copytree(made / "viewer", tmp_path / "mine")
     docker(
         "run", "--rm", "--network=none", "-v", f"{made}:/keys", BASE, "chown", "-R", "10001:10001", "/keys"
     )

@@ -46,7 +46,7 @@ def oracle_of(name: str, window: int | None = None, hidden: list[int] | None = N
 
 
 def somewhere(oracle: DnnOracle, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A state with a past, s (D,), and the parameters after some labels on the way there."""
+    """A state with a past, s (D,), and the parameters after some labels on the way to it."""
     state = oracle.begin(oracle.initial_state(rng), np.zeros(D), np.zeros(M))
     for _ in range(20):
         x = rng.uniform(-1, 1, D) * [0.4, 0.4, 0.5, 5.0]
@@ -59,7 +59,7 @@ def somewhere(oracle: DnnOracle, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 @pytest.mark.parametrize(("name", "window"), LOOKING_BACK)
-def test_the_optimum_is_that_of_ipopt(name: str, window: int) -> None:
+def test_optimum_matches_ipopt(name: str, window: int) -> None:
     rng = np.random.default_rng(7)
     oracle = oracle_of(name, window)
     problem = build_problem(MODEL, oracle, 12, "first_step")
@@ -73,14 +73,14 @@ def test_the_optimum_is_that_of_ipopt(name: str, window: int) -> None:
         assert theirs.status is Status.CONVERGED
         np.testing.assert_allclose(ours.v[0], theirs.v[0], atol=1e-6)
         active += bool(ours.slack) or bool(np.isin(ours.v, [MODEL.plant.u_min, MODEL.plant.u_max]).any())
-    # The model of the cost is exact: from nearby, steps shrink at Gauss-Newton's rate and not slower.
+    # The model of the cost is exact, so steps near the optimum shrink at Gauss-Newton's rate.
     again = solver.solve(s, theta, ours.c)
     assert again.iterations <= 3
 
 
 @pytest.mark.parametrize("name", ["rnn", "cnn"])
-def test_the_past_matters_to_the_plan_as_the_prepared_step_says(name: str) -> None:
-    """A prepared step corrects for another past too, to first order."""
+def test_a_prepared_step_corrects_for_a_different_past(name: str) -> None:
+    """A prepared step corrects for a different past to first order."""
     rng = np.random.default_rng(3)
     oracle = oracle_of(name)
     solver = Solver(build_problem(MODEL, oracle, 12), tolerance=1e-10, max_iterations=60)
@@ -124,7 +124,7 @@ def test_one_real_time_iteration_is_close_to_the_optimum_along_a_closed_loop(nam
 
 
 @pytest.mark.parametrize("name", ["rnn", "cnn"])
-def test_a_network_of_nonsense_is_set_aside(name: str) -> None:
+def test_a_network_with_nonfinite_weights_is_ignored(name: str) -> None:
     solver = Solver(build_problem(MODEL, oracle_of(name), 10))
     s = np.concatenate([0.3 * X0, np.zeros(4 * (D + M))])
     refused = solver.solve(s, np.full(solver.problem.oracle.parameters, np.nan), np.zeros((10, M)))
@@ -145,7 +145,7 @@ def test_weights_of_another_architecture_are_refused() -> None:
     after, verdict = rnn.adopt(state, HiddenSet(1, foreign, hash_layers(foreign), cnn.description.sha256()))
     assert verdict == Verdict("refused", "trained for another network description")
     assert after is state
-    # And one that lies about what it was trained for.
+    # The same weights with a false claim about the description that they were trained for.
     after, verdict = rnn.adopt(state, HiddenSet(1, foreign, hash_layers(foreign), rnn.description.sha256()))
     assert verdict.outcome == "refused"
     assert verdict.reason.startswith("shapes")
@@ -185,7 +185,7 @@ def test_every_field_is_in_the_hash() -> None:
         (["network.architecture=cnn", "network.options.kernel=9"], "covers 1 to 5 pairs"),
     ],
 )
-def test_a_wrong_setting_is_named(settings: list[str], said: str) -> None:
+def test_an_error_names_the_wrong_setting(settings: list[str], said: str) -> None:
     from controller_node.build import build_controller, build_model
 
     with pytest.raises(ConfigError, match=said):
@@ -193,7 +193,7 @@ def test_a_wrong_setting_is_named(settings: list[str], said: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "window"), [("rnn", 5), ("cnn", 5)])
-def test_the_gradient_for_training_is_that_of_a_difference(name: str, window: int) -> None:
+def test_training_gradient_matches_finite_differences(name: str, window: int) -> None:
     rng = np.random.default_rng(2)
     description = describe(MODEL, [6, 5], architecture=name, window=window)
     network = Network(description, torch.float64)
@@ -221,7 +221,7 @@ def test_the_gradient_for_training_is_that_of_a_difference(name: str, window: in
 
 @pytest.mark.parametrize("name", ["rnn", "cnn"])
 @pytest.mark.parametrize("mode", ["converged", "real_time"])
-def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) -> None:
+def test_a_run_replays_byte_for_byte_from_start_and_middle(name: str, mode: str) -> None:
     settings = [
         f"network.architecture={name}",
         f"controller.solver.mode={mode}",
@@ -233,7 +233,7 @@ def test_a_run_replays_byte_for_byte_also_from_the_middle(name: str, mode: str) 
     middle = replay(run, 45)
     assert middle.equal
     assert middle.first_tick == 40
-    # The window is what a keyframe would miss.
+    # A keyframe without the window would fail the replay from the middle.
     thawed = run.entries(topics.KEYFRAME)[2].message
     assert "oracle.past" in thawed.arrays
     # In a run without a gap the windows of the samples slide over the samples.

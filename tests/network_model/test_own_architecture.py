@@ -1,4 +1,4 @@
-"""An architecture in a file outside the package: the whole loop, its log, and what is never loaded."""
+"""An architecture in a file outside the package: the whole loop, its log, and the rule that logs load no files."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ QUICK = [
 
 @pytest.fixture(autouse=True)
 def nothing_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a process that has read no configuration yet."""
+    """Empty the registry, as in a process that has read no configuration."""
     monkeypatch.setattr(registry, "_given", {})
     monkeypatch.setattr(registry, "_names", {})
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """(the architecture's file, a log that was made with it)."""
+    """Return the architecture's file and a log made with it."""
     folder = tmp_path_factory.mktemp("own")
     file, log = folder / "gru.py", folder / "run.mcap"
     shutil.copy(EXAMPLE, file)
@@ -65,7 +65,7 @@ def log(recorded: tuple[Path, Path]) -> Run:
 
 
 def own(folder: Path, *changes: tuple[str, str]) -> str:
-    """A reference to a copy of the example with changes in its text."""
+    """Return a reference to a copy of the example with changes in its text."""
     text = EXAMPLE.read_text()
     for before, after in changes:
         assert before in text
@@ -74,12 +74,12 @@ def own(folder: Path, *changes: tuple[str, str]) -> str:
     return f"{folder / 'gru.py'}:GRU"
 
 
-def test_the_trainer_trains_it_and_the_controller_adopts_what_comes(log: Run) -> None:
+def test_the_trainer_trains_it_and_the_controller_adopts_its_weights(log: Run) -> None:
     assert sum(result.weights_outcome == "adopted" for result in log.results) >= 2
     assert log.run_infos[0].versions["architecture"].startswith("gru.py:GRU@")
 
 
-def test_a_replay_loads_nothing_that_the_log_names(
+def test_a_replay_loads_no_file_named_in_the_log(
     recorded: tuple[Path, Path], log: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("node_runtime.config.architecture.loaded", None)
@@ -87,15 +87,13 @@ def test_a_replay_loads_nothing_that_the_log_names(
         replay(log)
 
 
-def test_a_replay_with_the_file_is_equal_to_the_byte(recorded: tuple[Path, Path], log: Run) -> None:
+def test_a_replay_with_the_file_is_byte_equal(recorded: tuple[Path, Path], log: Run) -> None:
     found = replay(log, architecture=load_architecture(f"{recorded[0]}:GRU"))
     assert found.equal
     assert not any("text is another" in note for note in found.notes)
 
 
-def test_a_log_gives_no_file_the_name_of_a_shipped_architecture(
-    recorded: tuple[Path, Path], log: Run
-) -> None:
+def test_a_log_cannot_replace_a_shipped_architecture(recorded: tuple[Path, Path], log: Run) -> None:
     (entry,) = log.streams[topics.RUN_INFO["controller"].name]
     info = msgspec.structs.replace(entry.message, versions={**entry.message.versions, "architecture": "mlp"})
     log.streams[topics.RUN_INFO["controller"].name] = [replace(entry, message=info)]
@@ -104,20 +102,20 @@ def test_a_log_gives_no_file_the_name_of_a_shipped_architecture(
     assert list(registry._given) == [load_architecture(f"{recorded[0]}:GRU").name]
 
 
-def test_a_file_of_which_a_comment_changed_replays_and_the_change_is_said(tmp_path: Path, log: Run) -> None:
+def test_a_file_with_a_changed_comment_replays_with_a_note(tmp_path: Path, log: Run) -> None:
     found = replay(log, architecture=load_architecture(own(tmp_path, ("GRU = Gru()", "GRU = Gru()  # mine"))))
     assert found.equal
     assert any("replayed with gru.py:GRU@" in note and "text is another" in note for note in found.notes)
 
 
-def test_a_file_that_computes_something_else_is_said_and_differs(tmp_path: Path, log: Run) -> None:
+def test_a_file_with_a_changed_function_gives_a_note_and_a_difference(tmp_path: Path, log: Run) -> None:
     other = load_architecture(own(tmp_path, ("k * state + (1 - k) * new", "0.5 * state + 0.5 * new")))
     found = replay(log, architecture=other)
     assert not found.equal
     assert any("text is another" in note for note in found.notes)
 
 
-def test_a_replay_can_try_a_file_on_the_log_of_a_shipped_one(tmp_path: Path) -> None:
+def test_a_replay_can_use_a_file_on_the_log_of_a_shipped_architecture(tmp_path: Path) -> None:
     run = simulate(load(None, [*QUICK, "network.architecture=rnn"]), 25)
     with pytest.raises(LogError, match="its network is Tandem's own rnn"):
         replay(run, architecture=load_architecture(own(tmp_path)))
@@ -127,11 +125,11 @@ def test_a_replay_can_try_a_file_on_the_log_of_a_shipped_one(tmp_path: Path) -> 
 def test_a_report_needs_no_file(
     recorded: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # All of it is in the first picture.
+    # The whole report is in the first picture.
     monkeypatch.setattr("run_log.reporting.plots.pictures", lambda data: {})
     folder = tmp_path / "elsewhere"
     folder.mkdir()
-    # Away from the file, which must not be there.
+    # The report runs in a folder where the file does not exist.
     log = shutil.copy(recorded[1], folder / "run.mcap")
     aside = recorded[0].rename(tmp_path / "gru.away")
     try:
@@ -140,10 +138,10 @@ def test_a_report_needs_no_file(
         aside.rename(recorded[0])
 
 
-def test_a_description_of_a_file_that_this_process_was_not_given_is_refused(
+def test_a_description_of_a_file_that_was_not_loaded_is_refused(
     tmp_path: Path, recorded: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a trainer does with a controller's description, or anybody with what travels."""
+    """A trainer decodes a controller's description in this way, as does any other reader of the bus."""
     reference = f"{recorded[0]}:GRU"
     theirs = load_architecture(reference)
     registry.register(reference, *theirs)
@@ -160,11 +158,11 @@ def test_a_description_of_a_file_that_this_process_was_not_given_is_refused(
     sent = msgspec.json.encode(description)
     assert msgspec.json.decode(sent, type=NetworkDescription) == description
     forget(monkeypatch)
-    with pytest.raises(ValueError, match=r"a file that this process was not given: network\.architecture"):
+    with pytest.raises(ValueError, match=r"a file that this process did not load"):
         msgspec.json.decode(sent, type=NetworkDescription)
     mine = own(tmp_path, ("GRU = Gru()", "GRU = Gru()  # mine"))
     registry.register(mine, *load_architecture(mine))
-    with pytest.raises(ValueError, match=r"this process has gru\.py:GRU@\w+: the file's text is another"):
+    with pytest.raises(ValueError, match=r"this process has gru\.py:GRU@\w+: the texts of the files differ"):
         msgspec.json.decode(sent, type=NetworkDescription)
 
 
@@ -179,7 +177,7 @@ def test_a_description_of_a_file_that_this_process_was_not_given_is_refused(
         (("    window = 5", "    window = 5"), ["network.options.kernel=2"], "the options of gru.py:GRU"),
     ],
 )
-def test_what_is_wrong_with_it_is_said(
+def test_an_error_says_what_is_wrong_with_the_file(
     change: tuple[str, str] | None, settings: list[str], said: str, tmp_path: Path
 ) -> None:
     reference = f"{tmp_path / 'gru.py'}:GRU" if change is None else own(tmp_path, change)
@@ -188,8 +186,8 @@ def test_what_is_wrong_with_it_is_said(
 
 
 @pytest.mark.long
-def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compiled functions and CasADi's virtual machine round otherwise; far apart they are not."""
+def test_an_own_architecture_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled functions and CasADi's virtual machine round differently, so results agree to a tolerance only."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     small = [
         "controller.horizon=2",
@@ -206,7 +204,7 @@ def test_it_is_compiled_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("process", ["controller", "trainer", "run"])
-def test_a_process_that_needs_the_file_says_that_it_is_not_there(
+def test_a_process_reports_a_missing_architecture_file(
     process: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -220,7 +218,7 @@ def test_a_process_that_needs_the_file_says_that_it_is_not_there(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_experiment_runs_again_when_the_text_is_another(tmp_path: Path) -> None:
+def test_an_experiment_runs_again_after_a_change_of_the_file(tmp_path: Path) -> None:
     config = load(None, [f"network.architecture={own(tmp_path)}"])
     job = Job(config=config, steps=1, episodes=1, faults=Faults())
     before = job.key
@@ -231,7 +229,9 @@ def test_an_experiment_runs_again_when_the_text_is_another(tmp_path: Path) -> No
 # -- tandem architecture check ---------------------------------------------------------------------------------
 
 
-def test_the_check_agrees_and_skips_what_the_architecture_refuses(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_check_passes_and_skips_sizes_that_the_architecture_refuses(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["architecture", "check", f"{EXAMPLE}:GRU", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["holds"]
@@ -243,7 +243,7 @@ def test_the_check_agrees_and_skips_what_the_architecture_refuses(capsys: pytest
 @pytest.mark.parametrize(
     ("before", "after", "code", "said"),
     [
-        # phi that is not bounded, and one that is another function in torch: its values alone have a `dim`.
+        # phi is not bounded; or phi differs in torch, whose values are the only ones with a `dim`.
         ("        return dense(", "        return 2.0 * dense(", 1, "it must be bounded by 1"),
         (
             "        return dense(",
@@ -260,7 +260,7 @@ def test_the_check_agrees_and_skips_what_the_architecture_refuses(capsys: pytest
         ("if sizes.window < 2", "if sizes.window < 99", 2, "refuses all of 60 random sizes"),
     ],
 )
-def test_the_check_says_what_is_wrong(
+def test_the_check_reports_the_fault(
     before: str, after: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["architecture", "check", own(tmp_path, (before, after))]) == code
@@ -269,4 +269,4 @@ def test_the_check_says_what_is_wrong(
 
 
 def test_the_page_shows_the_example() -> None:
-    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "architectures.md").read_text()
+    assert f"```python\n{EXAMPLE.read_text()}```" in (DOCS / "tutorials/architectures.md").read_text()

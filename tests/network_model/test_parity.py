@@ -1,4 +1,4 @@
-"""Torch and CasADi compute one and the same network, and the controller has no torch."""
+"""Torch and CasADi compute the same network, and a controller does not import torch."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def descriptions(draw: st.DrawFn) -> NetworkDescription:
     try:
         return NetworkDescription(**fields)
     except ValueError:
-        reject()  # the architecture has no network of these sizes
+        reject()  # the architecture refuses these sizes
 
 
-def test_all_three_of_the_paper_are_there() -> None:
+def test_the_three_shipped_architectures_are_known() -> None:
     assert set(architecture_names()) >= {"mlp", "rnn", "cnn"}
     assert get_architecture("cnn").options == {"kernel": 3}
 
@@ -64,12 +64,12 @@ def test_torch_casadi_and_numpy_agree_to_1e_12_in_float64(
 
 
 def check_parity(description: NetworkDescription, seed: int, size: float = 1.0) -> None:
-    """The value, its slope along every entry of the window by CasADi and by torch, and the bound of phi."""
+    """Compare the value, its CasADi and torch slopes along every entry of the window, and the bound of phi."""
     found = parity(description, seed, size)
     assert found.holds, found
 
 
-def test_softplus_agrees_where_libraries_like_to_round_it_to_the_identity() -> None:
+def test_softplus_agrees_for_large_arguments() -> None:
     description = NetworkDescription(
         states=1,
         inputs=1,

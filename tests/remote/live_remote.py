@@ -1,4 +1,7 @@
-"""docs/remote.md to the letter: its four commands, run on two network namespaces. `make remote-test`; needs root."""
+"""The four commands of docs/tutorials/remote.md, run in two network namespaces.
+
+`make remote-test`; needs root.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from run_log.reading.reader import read_run
 from run_log.reporting.summary import summarise
 from tests.helpers.paths import DOCS
 
-PAGE = DOCS / "remote.md"
+PAGE = DOCS / "tutorials/remote.md"
 PLANT, TRAINER = "10.0.0.5", "10.0.0.6"
 SCP = f"""#!/bin/sh
 # In place of scp, for there is one file system: `scp -rp FOLDER {TRAINER}:NAME` is a copy into the trainer's home.
@@ -32,10 +35,11 @@ pytestmark = pytest.mark.skipif(
 
 
 def commands() -> list[str]:
-    """The page's first block of code, without its comments."""
-    block = re.search(r"(?ms)^```\n(.*?)^```", PAGE.read_text(encoding="utf-8"))
-    assert block is not None, f"no commands in {PAGE}"
-    return [line for line in block[1].splitlines() if line and not line.startswith("#")]
+    """The commands of the page's steps, without what they print."""
+    steps = PAGE.read_text(encoding="utf-8").split("\n## Steps\n", 1)[1].split("\n## ", 1)[0]
+    found = re.findall(r"^ *((?:tandem|scp) .*)$", steps, re.MULTILINE)
+    assert len(found) == 4, f"the steps of {PAGE} are four commands"
+    return found
 
 
 def ip(*words: str) -> None:

@@ -1,4 +1,4 @@
-"""A log from anybody: it runs no code, overwrites nothing and takes bounded memory (docs/security.md)."""
+"""A log from anybody: it runs no code, overwrites nothing and takes bounded memory (docs/how/security.md)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from lbmpc.plants import get_plant
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.topics import Topic
-from run_log.writing.views import LACKING, views
+from run_log.views.view import LACKING, views
 
 RECORDED = Path(__file__).with_name("views.jsonl")
 """A line for each of `messages`: topic, the JSON text of its view, the text of its schema."""
@@ -25,6 +25,8 @@ def messages() -> list[tuple[Topic, m.Message]]:
     who = {"run_id": "c-1", "seq": 7}
     x, u, K = [0.5, 1.25, -3e-9, 20.0], [1.5], m.Array.of(np.arange(12.0).reshape(3, 4))
     state = m.PlantState(**who, t=1e22, x=x, applied=u, source="command", command_seq=6)
+    pieces = [m.Piece(0.02, [1.0]), m.Piece(0.03, [2.0])]
+    two = m.PlantState(**who, t=1.0, x=x, applied=u, pieces=pieces, source="plan", command_seq=6)
     held = m.PlantState(**who, t=0.0, x=x, applied=None, source="hold", command_seq=-1, missing=["y"])
     weights = m.HiddenWeights(
         run_id="t-1", seq=3, for_run="c-1", trained_on=5, base_sha256="ab", samples=40, loss_before=0.1,
@@ -37,18 +39,19 @@ def messages() -> list[tuple[Topic, m.Message]]:
     result = m.TickResult(
         **who, x=x, u=u, mode="solver", status="converged", iterations=3, slack=0.25, slack_row="y at step 3", h=x,
         h_hat=x, prediction_error=1e-3, oracle_norms=x, hidden_version=3, hidden_sha256="ef", tick_crc32=9,
-        input_delay=0.0, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
-        target_status="nearest", target_x=x, target_u=u, target_distance=0.25,
+        input_delay=0.002, weights_verdict="refused: \"ü\"", set_margin=-0.5, set_piece=2,
         sensor_faults={"y": "stuck; what it measures is estimated from the others"},
+        reference={"y": 1.0}, reference_verdict="taken", reference_from="h-1", weights_rolled_back="worse",
         weight=[0.0, 1.0, 0.5, 0.25], constant_weight=x, deviation=x, noise=x,
     )  # fmt: skip
     absent = {"h": None, "h_hat": None, "prediction_error": None, "set_margin": None}
-    absent |= {"target_status": "none", "target_distance": None}
+    absent |= {"reference_verdict": "none"}
     absent |= {name: type(getattr(result, name))() for name in LACKING}
     replaced = msgspec.structs.replace
     return [
         (topics.PLANT_STATE, state),
         (topics.PLANT_STATE, held),
+        (topics.PLANT_STATE, two),
         (
             topics.COMMAND,
             m.Command(**who, state_run_id="p-1", state_seq=7, period=0.05, mode="solver", u=u, plan=[u] * 3),
@@ -63,6 +66,11 @@ def messages() -> list[tuple[Topic, m.Message]]:
         (topics.OUTPUT_WEIGHTS, m.OutputWeights(**who, hidden_version=3, hidden_sha256="ef", K=K)),
         (topics.HIDDEN_WEIGHTS, weights),
         (topics.HIDDEN_WEIGHTS, replaced(weights, newest=msgspec.UNSET)),
+        (
+            topics.REFERENCE,
+            m.Reference(run_id="h-1", seq=0, outputs=["r", "y"], times=[0.0, 2.0], values=[[1.0, 2.0], [3.0, 4.0]]),
+        ),
+        (topics.REFERENCE, m.Reference(run_id="h-1", seq=1, kind="hold", lease=1.5)),
         (topics.OVERRIDE, m.Override(run_id="h-1", seq=0, mode="manual", u=u, lease=1.5)),
         (topics.OVERRIDE, m.Override(run_id="h-1", seq=1, mode="auto")),
         (topics.SETS, m.CertifiedSets(**who, kind="invariant", sha256="01", content=b"x")),
@@ -86,8 +94,8 @@ def test_views_and_their_schemas_are_the_recorded_ones() -> None:
     for (topic, message), (name, text, schema) in zip(said, recorded, strict=True):
         view = VIEWS[topic.name]
         assert topic.name == name
-        assert view.render(message).decode() == text
-        assert msgspec.json.encode(view.schema).decode() == schema
+        assert view.render(message).data.decode() == text
+        assert view.channel.schema_text.decode() == schema
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (3, 5), (0, 0), (2, 3, 4)])

@@ -22,7 +22,7 @@ from tandem.experiments.simulation.lockstep import simulate
 from tests.helpers.interpreter import imported
 from tests.helpers.paths import DOCS
 
-PAGE = DOCS / "python.md"
+PAGE = DOCS / "tutorials/python.md"
 PLANT = get_plant("moore_greitzer")
 QUICK: dict[str, Any] = {
     "oracle": "dnn",
@@ -185,7 +185,7 @@ def test_a_plant_that_was_lost_can_be_started_again() -> None:
 
 
 def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
-    # The plant of docs/python.md.
+    # The plant of docs/tutorials/python.md.
     (block,) = re.findall(r"matrices\n\n```python\n(.*?)result = Loop\(cart", PAGE.read_text(), re.DOTALL)
     names: dict[str, Any] = {}
     exec(block, names)

@@ -1,4 +1,4 @@
-"""What the fault suite could have seen of a run in which all is well."""
+"""Facts of a run without a fault."""
 
 from __future__ import annotations
 

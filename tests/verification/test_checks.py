@@ -1,4 +1,4 @@
-"""What the fault suite sees: its checks of the facts, and what the facts are taken from."""
+"""The checks of the fault suite, and the computation of the facts."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ from verification.faults.facts import Replayed
         (holds.as_good, {"J": 25.3}),
     ],
 )
-def test_every_check_can_fail(check: holds.Held, bad: dict[str, Any]) -> None:
+def test_every_check_fails_on_a_bad_run(check: holds.Held, bad: dict[str, Any]) -> None:
     assert check(seen(**bad), CALM)
 
 
-def test_every_check_can_hold() -> None:
+def test_every_check_passes_on_a_good_run() -> None:
     good = seen(
         late=2,
         late_by_machine=2,
@@ -94,7 +94,7 @@ def test_every_check_can_hold() -> None:
     assert holds.view_says(seen(view_at_end="recorder silent"), CALM) is None
 
 
-def test_control_is_back_with_the_first_fresh_command_that_is_followed_by_no_outage() -> None:
+def test_control_returns_with_the_first_fresh_command_after_the_last_outage() -> None:
     sources = (
         ["command"] * 3
         + ["plan", "safe", "command", "plan", "command", "command"]
@@ -110,7 +110,7 @@ def test_control_is_back_with_the_first_fresh_command_that_is_followed_by_no_out
 
 
 def began(run_id: str, *times: float) -> list[m.Tick]:
-    """Ticks that began then, each as late as it is after the first."""
+    """Ticks that begin at these times, each late as given."""
     return [
         m.Tick(
             run_id=run_id,
@@ -128,14 +128,14 @@ def began(run_id: str, *times: float) -> list[m.Tick]:
     ]
 
 
-def test_a_burst_is_what_one_controller_begins_within_a_period() -> None:
+def test_a_burst_counts_the_steps_of_one_controller_within_a_period() -> None:
     assert measured._burst(began("controller-1", 0.0, 0.05, 0.1, 0.101, 0.102, 0.15), 0.05) == 3
     one, other = began("controller-1", 0.0, 0.05, 0.075), began("controller-2", 0.0, 0.05, 0.1)
     assert measured._burst(one + other, 0.05) == 2
     assert measured._burst([], 0.05) == 0
 
 
-def test_a_stall_excuses_what_it_overlaps(tmp_path: Path) -> None:
+def test_a_stall_excuses_the_late_ticks_that_it_overlaps(tmp_path: Path) -> None:
     path = tmp_path / "stalls.txt"
     path.write_text("10.0 0.02\n5.0 0.5\n11.")
     noted = stalls.read(path)

@@ -1,4 +1,4 @@
-"""The fault suite itself: moments, results, table, that it goes on where it stopped; three faults on real processes."""
+"""The fault suite itself: moments, results, table and continuation; three faults on real processes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def outcome(index: int, facts: Facts | None = CALM, **more: Any) -> Outcome:
     )
 
 
-def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_an_interrupted_suite_continues(tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
 
     def find() -> Outcome | None:
@@ -51,7 +51,7 @@ def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
     for made in (outcome(0, None, error="the machine was too slow"), outcome(0, CALM)):
         Results(path).put(made)
         assert find() == made
-    # A line that was being written when the suite was killed.
+    # A line that was unfinished when the suite was killed.
     path.write_bytes(path.read_bytes() + b'{"fault": "kil')
     assert find() == outcome(0, CALM)
     path.write_bytes(b'{"fault": "of another version"}\n')
@@ -61,7 +61,7 @@ def test_a_suite_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 @pytest.mark.live
 @pytest.mark.skipif(not link.available(), reason="links to network namespaces need root")
-def test_a_suite_that_is_told_to_stop_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_stopped_suite_removes_its_processes_and_mounts(tmp_path: Path) -> None:
     words = ["--runs", "1", "--only", "SIGSTOP of the controller", "--jobs", "2", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "verification.faults", *words]
     with subprocess.Popen(
@@ -82,7 +82,7 @@ def test_a_suite_that_is_told_to_stop_leaves_nothing_behind(tmp_path: Path) -> N
 
 
 def of_runs_in(folder: Path) -> list[str]:
-    """The command lines of the processes whose configuration lies below this folder."""
+    """Return the command lines of the processes whose configuration is below this folder."""
     found = []
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
@@ -92,15 +92,15 @@ def of_runs_in(folder: Path) -> list[str]:
     return found
 
 
-def test_the_table_names_what_did_not_hold(tmp_path: Path) -> None:
+def test_the_table_names_the_failed_checks(tmp_path: Path) -> None:
     good = suite.judged(outcome(0), ALL[0], CALM)
     bad = suite.judged(outcome(1, seen(violations=2, deepest=0.03)), ALL[0], CALM)
     dead = suite.judged(outcome(2, None, error="no first command"), ALL[0], CALM)
     text = table.markdown({ALL[0].name: [table.Pair(one, CALM) for one in (good, bad, dead)]}, ALL, ["head"])
     row = next(line for line in text.splitlines() if line.startswith(f"| {ALL[0].name}"))
     assert row.split(" | ")[1:5] == ["3", "1", "2, 0", "3.0, 0.0"]
-    assert "run 1 at 1.00 s: 2 samples outside, 0 without the fault" in text
-    assert "run 2 at 1.00 s: no first command" in text
+    assert "| 1 | 1.00 | 2 samples outside, 0 without the fault |" in text
+    assert "| 2 | 1.00 | no first command |" in text
     document = tmp_path / "faults.md"
     document.write_text(f"before\n{table.MARKS.begin}\nold\n{table.MARKS.end}\nbehind\n")
     table.MARKS.put(document, text)
@@ -113,7 +113,7 @@ def test_the_table_names_what_did_not_hold(tmp_path: Path) -> None:
 
 
 def newest(rig: Rig, topic: topics.Topic, since: float) -> m.Message | None:
-    """The last message of a process of the run heard after `since`; strangers' are left out."""
+    """Return the last message of a process of the run after `since`; strangers' messages are left out."""
     for heard in reversed(rig.heard):
         if heard.at <= since:
             return None
@@ -128,7 +128,7 @@ def newest(rig: Rig, topic: topics.Topic, since: float) -> m.Message | None:
 
 
 def ignored(rig: Rig, topic: str) -> int:
-    """How many messages of a topic the controller says that it did not obey."""
+    """Return how many messages of a topic the controller reports as refused."""
     health = newest(rig, topics.HEALTH["controller"], 0.0)
     assert isinstance(health, m.Health)
     names = (f"bad {topic}:", f"overflow {topic}")
@@ -136,7 +136,7 @@ def ignored(rig: Rig, topic: str) -> int:
 
 
 def driven_since(rig: Rig, moment: float | None) -> bool:
-    """Whether the plant says that a fresh command drives it, and has said so since then."""
+    """Return whether the plant reports that a fresh command drives it, after `since`."""
     state = None if moment is None else newest(rig, topics.PLANT_STATE, moment)
     return isinstance(state, m.PlantState) and state.source == "command"
 
@@ -144,12 +144,12 @@ def driven_since(rig: Rig, moment: float | None) -> bool:
 @pytest.mark.live
 @pytest.mark.long
 def test_three_faults_on_real_processes(tmp_path: Path) -> None:
-    """A quick run of what `make faults` does at length: a frozen controller, garbage, a killed controller."""
+    """A short version of `make faults`: a frozen controller, garbage, a killed controller."""
 
     def inflict(rig: Rig, seed: int) -> dict[str, float]:
         rig.freeze("controller", 0.5)
         sent = rig.attack("garbage", 500.0, 0.5, seed)
-        # A killed process tells no more of what it has counted.
+        # The counters of a killed process are lost.
         bad = sent["sent plant/state"]
         rig.wait(lambda: ignored(rig, "plant/state") >= bad, HANG_S, "the controller's count of bad states")
         rig.kill("controller")
@@ -161,7 +161,7 @@ def test_three_faults_on_real_processes(tmp_path: Path) -> None:
     at_rest = f"plant.x0={get_plant('moore_greitzer').x_e.tolist()}"
     settings = (at_rest, "network.hidden=[6]", "controller.horizon=20", "controller.solver.compile=never")
     stage = Stage("quick", plant="loopback", settings=settings, seconds=1.0)
-    # How soon control is back is for `make faults`.
+    # `make faults` checks how soon control is back.
     checks = (holds.no_burst, holds.none_obeyed, holds.all_counted, holds.replays)
     fault = Fault("three in turn", "quick", inflict, checks, stage, after=0.5)
     ran = suite.run(stage, fault, 0, 1, tmp_path / "run", [])

@@ -1,4 +1,4 @@
-"""Bytes that nobody should send: accepted, or refused as declared, by everything that reads bytes."""
+"""Bad bytes for every reader of bytes: accepted, or refused as declared."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_twenty_thousand_bad_payloads(tmp_path: Path) -> None:
         ("plant of a log, its model", 200),
     ],
 )
-def test_what_somebody_made_up_is_refused_or_borne(readers: dict[str, Target], name: str, count: int) -> None:
+def test_forged_input_is_refused_or_handled(readers: dict[str, Target], name: str, count: int) -> None:
     reader = readers[name]
     kinds = {reader.read(reader.make()) for _ in range(count)}
     assert len(kinds) > 1
@@ -75,12 +75,12 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
         ("B", [], r"the model's B has shape \(0,\)"),
         ("X", ([1.0], [2.0]), r"the model's X has shape \(2, 1\), not \(2, 4\)"),
         ("g", [1.0], "G has shape"),
-        ("u_upper", [5.0], "not in order, or outside of U"),
-        ("u_upper", [-0.9], "not in order, or outside of U"),
-        ("u_lower", [-5.0], "not in order, or outside of U"),
+        ("u_upper", [5.0], "not in order, or outside U"),
+        ("u_upper", [-0.9], "not in order, or outside U"),
+        ("u_lower", [-5.0], "not in order, or outside U"),
     ],
 )
-def test_forged_sets_are_refused_by_what_is_wrong(part: str, value: Any, says: str) -> None:
+def test_forged_sets_are_refused_with_the_reason(part: str, value: Any, says: str) -> None:
     sets = small_sets()
     if part in sets.model.__struct_fields__:
         sets = msgspec.structs.replace(sets, model=msgspec.structs.replace(sets.model, **{part: value}))
@@ -92,7 +92,9 @@ def test_forged_sets_are_refused_by_what_is_wrong(part: str, value: Any, says: s
         CertifiedSets.from_bytes(CertifiedSets.of(sets, Found(0.5, 0.1, True, 1.0)).to_bytes())
 
 
-def test_what_a_reader_does_not_declare_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_undeclared_exception_of_a_reader_is_a_finding(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from verification.fuzz import work
 
     class BusListener:
@@ -126,7 +128,7 @@ def test_the_same_seed_makes_the_same_payloads(payloads: dict[str, list[bytes]])
 
 @pytest.mark.parametrize("array", mutate.ARRAYS)
 def test_an_array_that_numpy_cannot_hold_is_malformed(payloads: dict[str, list[bytes]], array: dict) -> None:
-    """Once the controller died of such hidden weights: their shape fits their data, and yet there is no such array."""
+    """The controller died of such hidden weights: their shape fits their data, but no such array exists."""
     tree = msgspec.msgpack.decode(payloads[WEIGHTS.name][0])
     tree["layers"][0] = array
     try:
@@ -139,14 +141,14 @@ def test_an_array_that_numpy_cannot_hold_is_malformed(payloads: dict[str, list[b
 
 @pytest.mark.parametrize("seq", [2**63, 2**64 - 1, -2])
 def test_a_number_that_no_memory_holds_is_malformed(payloads: dict[str, list[bytes]], seq: int) -> None:
-    """Once the controller died of it: its memory has 64 bits for a version, and one for the sign."""
+    """The controller died of it: its memory has 64 bits for a version, including the sign."""
     tree = msgspec.msgpack.decode(payloads[WEIGHTS.name][0])
     tree["seq"] = seq
     with pytest.raises(BadMessage, match="malformed"):
         codec.decode(WEIGHTS, msgspec.msgpack.encode(tree))
 
 
-def test_bytes_that_are_no_text_are_no_certificate() -> None:
+def test_a_certificate_file_with_invalid_utf_8_is_refused() -> None:
     with pytest.raises(CertificateError):
         CertifiedSets.from_bytes(b'{"sha256": "\x93"}')
 
@@ -174,8 +176,10 @@ def _changes(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_any_value_in_any_place(payloads: dict[str, list[bytes]], data: st.DataObject) -> None:
-    """Structured: a message of any topic in which one value is any other."""
+def test_any_value_in_any_field_is_refused_or_handled(
+    payloads: dict[str, list[bytes]], data: st.DataObject
+) -> None:
+    """Structured: a message of any topic with any other value in one field."""
     topic = data.draw(st.sampled_from(topics.ALL))
     tree = msgspec.msgpack.decode(payloads[topic.name][0])
     path = data.draw(st.sampled_from(_changes(tree)))
@@ -192,10 +196,10 @@ def test_any_value_in_any_place(payloads: dict[str, list[bytes]], data: st.DataO
     assert codec.decode(topic, codec.encode(message)) == message
 
 
-def test_messages_of_the_control_lane_are_seen_to_be_finite_at_a_glance(
+def test_control_messages_are_checked_for_finite_numbers_by_their_sum(
     payloads: dict[str, list[bytes]],
 ) -> None:
-    """Fields that are unset send none of them the long way, which names the field; only arrays do."""
+    """Unset fields do not need the slow check, which names the field; only arrays do."""
     for topic in (topics.PLANT_STATE, topics.COMMAND, topics.BACKUP, topics.TICK, topics.RESULT):
         for payload in payloads[topic.name]:
             message = codec.decode(topic, payload)
@@ -204,7 +208,7 @@ def test_messages_of_the_control_lane_are_seen_to_be_finite_at_a_glance(
 
 
 @pytest.mark.parametrize("mutation", mutate.BINARY, ids=lambda one: one.__name__)
-def test_mutations_bear_whatever_they_are_given(mutation: Callable[..., bytes]) -> None:
+def test_mutations_accept_any_bytes(mutation: Callable[..., bytes]) -> None:
     rng = random.Random(1)
     for payload in (b"", b"\x00", b"\xcb", b"\xcb" * 9, rng.randbytes(50)):
         for _ in range(50):

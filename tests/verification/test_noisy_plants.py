@@ -1,4 +1,4 @@
-"""The tables of noisy plants: what they ask of the network, and that a run is of the noise that it says."""
+"""The tables of noisy plants: requirements on the network, and the noise of a run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rows(dnn: list[float], outside: int = 0, lost: int = 0) -> dict[str, Row]:
         (rows([1.0, 1.0, 1.0], outside=13), "13 samples outside X, 10 at most otherwise"),
     ],
 )
-def test_what_is_asked_of_the_network(found: dict[str, Row], what: str | None) -> None:
+def test_requirements_on_the_network(found: dict[str, Row], what: str | None) -> None:
     assert (what is None) == (not failures(found))
     assert what is None or any(what in one for one in failures(found))
 
@@ -49,7 +49,7 @@ def test_what_is_asked_of_the_network(found: dict[str, Row], what: str | None) -
         (lambda dnn: dnn, None),
     ],
 )
-def test_what_is_asked_without_noise_and_of_later_episodes(
+def test_requirements_without_noise_and_on_later_episodes(
     change: Callable[[Row], Row], what: str | None
 ) -> None:
     of = rows([1.0] * 3)
@@ -60,16 +60,16 @@ def test_what_is_asked_without_noise_and_of_later_episodes(
     assert found == [] if what is None else what in found[0]
 
 
-def test_a_level_is_the_sensors_noise_and_the_estimators() -> None:
+def test_a_level_sets_the_noise_of_sensors_and_estimator() -> None:
     noisy, exact = (job(Case("tanks", level, "constant 0.5"), 3, 2, []) for level in ("0.01", "none"))
     assert noisy.config.plant.sensors.noise == noisy.config.estimator.noise == 0.01
     assert (noisy.config.estimator.kind, exact.config.estimator.kind) == ("kalman", "none")
-    # Nothing is drawn without noise: all seeds are one run.
+    # Without noise nothing is random: all seeds are one run.
     assert (noisy.config.seed, exact.config.seed, noisy.episodes) == (3, 0, 2)
     assert noisy.config.constant.gain == 0.5
 
 
-def test_the_table_says_what_is_not_met_and_what_stays_of_the_gain() -> None:
+def test_the_table_has_unmet_requirements_and_the_remaining_gain() -> None:
     found = {
         Case("tanks", level, oracle): one
         for level in ("none", "0.01")

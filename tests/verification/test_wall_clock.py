@@ -1,4 +1,4 @@
-"""Who reads the wall clock."""
+"""Modules that read the wall clock."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ MAY_READ_IT = {
 }
 
 
-def test_nothing_but_these_reads_the_wall_clock() -> None:
-    """So a step of it can change nothing else; `make faults` steps it, and this says why that holds."""
+def test_only_the_listed_modules_read_the_wall_clock() -> None:
+    """A step of the clock can change nothing else; `make faults` steps it."""
     found = set()
     for package in INSTALLED:
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -44,7 +44,7 @@ def test_a_wire_delays_drops_and_cuts() -> None:
                 turns = itertools.count()
 
                 def answered(count: int, wait: float) -> list[float]:
-                    """After how long each answer came; what comes late from an earlier turn is none."""
+                    """Return the delay of each answer; late answers from an earlier turn do not count."""
                     turn, begin, times = next(turns), clock.now(), []
                     sent = {b"%d %d" % (turn, number) for number in range(count)}
                     for word in sorted(sent):
@@ -60,7 +60,7 @@ def test_a_wire_delays_drops_and_cuts() -> None:
 
                 wait_for(lambda: len(answered(5, 1.0)) == 5)
                 wire.shape(link.Shape(delay=0.1))
-                # The new shape is known to the wire's process when it says so by what it does.
+                # The behaviour of the wire's process shows that it received the new shape.
                 wait_for(lambda: min(answered(3, 1.0), default=0.0) >= 0.2)
                 wire.shape(link.Shape(loss=0.5))
                 wait_for(lambda: 20 < len(answered(200, 0.5)) < 100)
@@ -87,8 +87,8 @@ with Bus(from_json(sys.argv[1]), "plant", "plant-far") as bus:
 
 @pytest.mark.live
 @pytest.mark.skipif(not link.available(), reason="links to network namespaces need root")
-def test_a_client_that_vanishes_does_not_stop_the_router() -> None:
-    """Zenoh closed its two links in its only two receiving threads, which waited up to 10 s in that."""
+def test_a_vanished_client_does_not_stop_the_router() -> None:
+    """Zenoh closed its two links in its only two receiving threads, which waited up to 10 s."""
     local = live_config("bus.lease_ms=400")
     port = local.bus.endpoint.rpartition(":")[2]
     listening = override(local, [f'bus.endpoint="tcp/0.0.0.0:{port}"', "bus.insecure=true"])
@@ -121,7 +121,7 @@ def test_a_client_that_vanishes_does_not_stop_the_router() -> None:
                     plant.publish(topics.PLANT_STATE, sampled("hold", 0.05 * seq).state)
                     clock.sleep_until(clock.now() + 0.05)
                 wait_for(lambda: len(heard) == len(sent))
-                # A router that waits does so for 10 s from a lease after the cut.
+                # A waiting router waits for 10 s from a lease after the cut.
                 under_way = [d.received_ns * 1e-9 - at for d, at in zip(heard.drain(), sent, strict=True)]
                 assert max(under_way) < LINGER_S / 2
             finally:

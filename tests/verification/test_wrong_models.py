@@ -1,4 +1,4 @@
-"""The tables of wrong models: what they ask of the network, and that a run is of the plant that it says."""
+"""The tables of wrong models: requirements on the network, and the plant of a run."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def row(oracle: str, first: float, later: float, violations: int = 0, lost: str 
         ((1.09, 1.01), (1.2, 1.2), (1.0, 1.0), True),
         ((1.11, 1.01), (1.2, 1.2), (1.0, 1.0), False),
         ((1.05, 1.03), (1.2, 1.2), (1.0, 1.0), False),
-        # The constant is the better one here, and what is asked follows it.
+        # The constant is the better one here, and the requirement follows it.
         ((1.09, 1.01), (0.9, 1.2), (1.0, 1.0), False),
         ((1.09, 1.01), (1.2, 0.95), (1.0, 1.0), False),
     ],
 )
-def test_what_is_asked_of_the_network(
+def test_requirements_on_the_network(
     dnn: tuple[float, float], constant: tuple[float, float], perfect: tuple[float, float], expected: bool
 ) -> None:
     rows = [row("dnn", *dnn), row("constant 0.2", 9.0, 9.0), row("constant 1", *constant)]
@@ -35,14 +35,14 @@ def test_what_is_asked_of_the_network(
     assert words.startswith("met" if expected else "NOT met")
 
 
-def test_nothing_is_asked_where_perfect_does_not_keep_X() -> None:
+def test_there_is_no_requirement_if_perfect_leaves_X() -> None:
     rows = [row("dnn", 9.0, 9.0), row("constant 1", 1.0, 1.0)]
     assert verdict([*rows, row("perfect", 1.0, 1.0, violations=1)])[0]
     assert verdict([*rows, row("perfect", 1.0, 1.0, lost="far out")])[0]
     assert not verdict([*rows, row("perfect", 1.0, 1.0)])[0]
 
 
-def test_a_run_is_of_the_true_plant_in_episodes_that_begin_alike() -> None:
+def test_a_run_simulates_the_true_plant_in_episodes_from_the_same_state() -> None:
     more = ["controller.solver.compile=never"]
     costs = {oracle: run_one("tanks", 0.25, oracle, 2, more).J for oracle in ("linear", "perfect")}
     assert costs["linear"][0] == pytest.approx(costs["linear"][1], rel=1e-9)

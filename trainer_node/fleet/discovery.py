@@ -1,4 +1,4 @@
-"""How the plants of a fleet are found: by name or by a pattern behind one router, or each behind its own."""
+"""Finds the plants of a fleet: by name or pattern behind one router, or each behind a router of its own."""
 
 from __future__ import annotations
 
@@ -24,46 +24,46 @@ from protocol.topics import Topic
 log = logging.getLogger(__name__)
 
 SILENT_S = 10.0
-"""Seconds without a word of its controller after which a plant is dropped; it may come back at any time."""
+"""Seconds without a message from its controller after which a plant is dropped; it may return at any time."""
 MOST_PLANTS = 1024
-"""Plants followed at once: a stranger who invents names must not fill the memory."""
+"""Largest number of plants at once, because a foreign sender may invent names."""
 TRY_AGAIN_S = 10.0
-"""Seconds after which a router that refused us is tried again: a certificate may have been renewed."""
+"""Seconds between attempts to reach a router that refused the trainer; its certificate may have been renewed."""
 LET_GO_S = 1.0
 """Seconds from the end of a certificate until its lanes are closed."""
 NAME = re.compile(PLANT_NAME)
 FOUND_BY = (topics.SAMPLES, topics.OUTPUT_WEIGHTS, topics.RUN_INFO["controller"], topics.HEALTH["controller"])
 READABLE = (topics.SAMPLES, topics.OUTPUT_WEIGHTS)
-"""Of these, what a trainer's certificate may read."""
+"""Topics among these that a trainer's certificate may read."""
 
 
 class PlantFinder(Protocol):
-    """Which plants are there, and how they are reached. Entered before it is asked."""
+    """Finds the present plants and their addresses. Enter it before use."""
 
     many: bool
-    """The trainer is that of a fleet, and not of one plant whose controller may share its machine."""
+    """True for the trainer of a fleet; False for that of one plant, whose controller may share the machine."""
     looks_for: str
-    """In words, for the log."""
+    """Description of the plants, for the log."""
 
     def __enter__(self) -> object: ...
 
     def __exit__(self, *_: object) -> None: ...
 
     def present(self, now: float) -> Sequence[str]:
-        """Names of the plants that are there, sorted; `now` on the monotonic clock."""
+        """Return the names of the present plants, sorted; `now` on the monotonic clock."""
         ...
 
     def config(self, plant: str) -> Config:
-        """With the plant's name, and the address under which it is reached."""
+        """Return the configuration with the plant's name and address."""
         ...
 
     def lanes(self, plant: str) -> Lanes:
-        """Where it is reached."""
+        """Return the lanes to the plant's router."""
         ...
 
 
 class LastHeard:
-    """Which plants were heard of last when; any thread may write."""
+    """The time of the last message of each plant. Any thread may write."""
 
     def __init__(self, plants: str):
         self._plants = plants
@@ -71,7 +71,7 @@ class LastHeard:
         self._lock = threading.Lock()
 
     def note(self, key: str, now: float) -> None:
-        """A message arrived at this key. Names that do not match, and those beyond `MOST_PLANTS`, are ignored."""
+        """Record a message at this key. Names that do not match, and those beyond `MOST_PLANTS`, are ignored."""
         name = key.split("/", 2)[1]
         with self._lock:
             if name in self._at or (
@@ -82,13 +82,13 @@ class LastHeard:
                 self._at[name] = now
 
     def present(self, now: float) -> list[str]:
-        """Names heard of within `SILENT_S`, sorted; the others are forgotten."""
+        """Return the names with messages within `SILENT_S`, sorted, and forget the others."""
         with self._lock:
             self._at = {name: at for name, at in self._at.items() if now - at <= SILENT_S}
             return sorted(self._at)
 
     def listen(self, session: zenoh.Session, plant: str, to: Iterable[Topic]) -> list[zenoh.Subscriber[None]]:
-        """Note what arrives for this plant, `*` for any."""
+        """Subscribe to the messages of this plant, `*` for any plant."""
 
         def arrived(sample: zenoh.Sample) -> None:
             self.note(str(sample.key_expr), clock.now())
@@ -98,10 +98,10 @@ class LastHeard:
 
 
 class SharedRouter:
-    """Plants behind the router of the configuration: one, followed from the start, or all that match a pattern."""
+    """Plants behind the configured router: one, followed from the start, or all that match a pattern."""
 
     def __init__(self, config: Config, plants: str, lanes: Lanes):
-        """`plants`: a pattern as of fnmatch, or one name."""
+        """`plants`: a pattern for fnmatch, or one name."""
         self._config, self._lanes = config, lanes
         self._named = [plants] if NAME.fullmatch(plants) else []
         self.many, self.looks_for = not self._named, f"a plant that matches {plants!r}"
@@ -127,9 +127,9 @@ class SharedRouter:
 
 
 class RouterPerPlant:
-    """Plants with a router each, by the list `trainer.fleet`; one that cannot be reached holds up no other.
+    """Plants with a router each, from the list `trainer.fleet`. A router that cannot be reached delays no other.
 
-    Each link has its plant's own certificate, so who takes one of them has one plant's trainer and nothing else.
+    Each link uses its plant's own certificate, so a stolen certificate gives access to one plant's trainer only.
     """
 
     many = True
@@ -141,7 +141,7 @@ class RouterPerPlant:
         self._heard = LastHeard("*")
         self._lock = threading.Lock()
         self._reached: dict[str, Lanes] = {}
-        """The latest of each plant, whether they are open still or not."""
+        """The latest lanes of each plant, open or closed."""
         self._open: set[str] = set()
         self._leaving = threading.Event()
         self._threads = [
@@ -167,7 +167,7 @@ class RouterPerPlant:
         place, bus = self._places[plant], self._config.bus
         tls = msgspec.structs.replace(bus.tls, keys=place.keys or bus.tls.keys)
         bus = msgspec.structs.replace(bus, endpoint=place.endpoint, tls=tls)
-        # The other plants are none of its business.
+        # The list of the other plants is removed, because it is not needed.
         trainer = msgspec.structs.replace(self._config.trainer, fleet=[])
         return msgspec.structs.replace(self._config, name=plant, bus=bus, trainer=trainer)
 
@@ -175,7 +175,7 @@ class RouterPerPlant:
         return self._reached[plant]
 
     def _reach(self, name: str) -> None:
-        """In a thread of its own: keep the plant's lanes open, anew with a new certificate when one is over."""
+        """Keep a plant's lanes open, in a thread of its own, and reopen them with a new certificate."""
         config = self.config(name)
         while not self._leaving.is_set():
             try:
@@ -190,23 +190,23 @@ class RouterPerPlant:
                     with self._lock:
                         self._open.discard(name)
                     _undeclare(subscribers)
-                    # The fleet lets go of the plant first, and says a last word for it.
+                    # The fleet drops the plant first and publishes its last health.
                     self._leaving.wait(LET_GO_S)
             except OpenInterrupted:
                 return
             except (ConfigError, zenoh.ZError) as error:
-                log.error("%s: %s; trying again every %g s", name, error, TRY_AGAIN_S)
+                log.error("%s: %s; retrying every %g s", name, error, TRY_AGAIN_S)
                 self._leaving.wait(TRY_AGAIN_S)
             except Exception:
-                log.exception("%s: trying again every %g s", name, TRY_AGAIN_S)
+                log.exception("%s: retrying every %g s", name, TRY_AGAIN_S)
                 self._leaving.wait(TRY_AGAIN_S)
 
 
 def _valid_s(config: Config) -> float | None:
-    """For how many seconds the certificate for this address is valid, and a moment more; None: it needs none."""
+    """Return the seconds for which the certificate is valid, plus a moment; None if the address needs none."""
     if not secure(config.bus.endpoint):
         return None
-    # Only here, for a machine that needs no certificates loads nothing for them.
+    # Imported here, so that a machine without certificates imports nothing for them.
     from node_runtime.tls import credentials
 
     own = credentials.of_process(config.bus.tls.keys, "trainer", config.name)
@@ -215,6 +215,6 @@ def _valid_s(config: Config) -> float | None:
 
 def _undeclare(subscribers: Iterable[zenoh.Subscriber[None]]) -> None:
     for subscriber in subscribers:
-        # The session may be gone already.
+        # The session may be closed already.
         with contextlib.suppress(zenoh.ZError):
             subscriber.undeclare()

@@ -1,1 +1,1 @@
-"""The fault suite: real processes, one fault at a random moment, and what held. `make faults ARGS=--help`."""
+"""The fault suite: real processes, one fault at a random moment of each run. `make faults ARGS=--help`."""

@@ -1,6 +1,6 @@
-"""`make faults`: run every fault many times, print what held, and put the table into the document.
+"""`make faults`: run every fault many times, print the outcome, and write the table into the document.
 
-python -m verification.faults --runs 20 --document docs/faults.md
+python -m verification.faults --runs 20 --document docs/results/faults.md
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from benchmarks.document_block import DocumentError
+from benchmarks.document_block import DocumentError, conditions
 from node_runtime import provenance
 from verification.faults import table
 from verification.faults.catalogue import ALL, Fault, Stage
@@ -36,37 +36,37 @@ from verification.faults.table import Pair
 from verification.faults.workers import Task, workers
 
 START_AND_STOP_S = 8.0
-"""Of a run, beside its seconds: processes start and stop, the log is replayed."""
+"""Seconds of a run beside its own length: processes start and stop, and the log is replayed."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Real processes, one fault at a random moment of each run, and what held. Goes on where it was interrupted."""
+    """Run real processes with one fault at a random moment of each run. An interrupted suite continues."""
 
     runs: int = 20
     """Of each fault."""
     jobs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
-    """At a time. Each takes about one core at its busiest, and what they cost each other is in their figures."""
+    """Runs at a time. Each run uses up to one core, and simultaneous runs affect each other's figures."""
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
-    """Faults whose name contains one of these; all by default."""
+    """Only faults whose name contains one of these; default: all."""
     seconds: float | None = None
-    """How long a run is, counted from the first command; by default as each fault needs it."""
+    """Length of a run, counted from the first command; default: as each fault needs."""
     seed: int = 0
-    """Of the moments; the runs' own seeds count up from it."""
+    """Seed of the moments of the faults; the runs' own seeds count up from it."""
     out: Path = Path("runs/faults")
-    """Results, and the folders of the runs in which something did not hold."""
+    """Folder for results and for the files of runs in which a check failed."""
     document: Path | None = None
-    """Where the table goes between its two marks."""
+    """Document that receives the table between its two marks."""
     fresh: bool = False
-    """Begin again: forget the results that are in --out."""
+    """Start again: ignore the results in --out."""
     show: Annotated[bool, tyro.conf.arg(name="list")] = False
-    """Name the faults and how long they take, and run nothing."""
+    """List the faults and their durations, and run nothing."""
     set: list[str] = field(default_factory=list)
     """More section.key=value for all runs."""
 
 
 def main(settings: Suite) -> int:
-    """0 when everything held, 1 when not, 2 when it cannot be done."""
+    """Return 0 if every check passed, 1 if one failed, 2 if the suite cannot run."""
     console = Console(stderr=True)
     chosen = [
         fault for fault in ALL if not settings.only or any(text in fault.name for text in settings.only)
@@ -94,7 +94,7 @@ def main(settings: Suite) -> int:
         if settings.fresh:
             shutil.rmtree(settings.out, ignore_errors=True)
         results = Results(settings.out / "results.jsonl")
-        # Ended politely by whatever way: namespaces, mounts and processes must not stay behind.
+        # However the suite ends, it must remove its namespaces, mounts and processes.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         pairs = _measure(settings, chosen, results, console)
         text = table.markdown(pairs, chosen, _head(settings))
@@ -110,12 +110,12 @@ def main(settings: Suite) -> int:
 
 
 def seconds(fault: Fault) -> float:
-    """About how long one run takes."""
+    """Return the approximate duration of one run, in seconds."""
     return max(fault.stage.seconds, 2.0 + fault.span + fault.after) + START_AND_STOP_S
 
 
 def total(faults: list[Fault], runs: int) -> float:
-    """About how long all take, in seconds, the runs without a fault included."""
+    """Return the approximate duration of all runs, those without a fault included, in seconds."""
     stages = {fault.stage for fault in faults}
     return runs * (sum(map(seconds, faults)) + sum(stage.seconds + START_AND_STOP_S for stage in stages))
 
@@ -125,7 +125,7 @@ def minutes(duration: float) -> str:
 
 
 def _plan(faults: list[Fault], runs: int) -> Iterator[tuple[int, Fault | None, Stage]]:
-    """Round by round, so that runs that are compared lie close together, and every fault has some runs early."""
+    """Order runs in rounds, so that compared runs are close in time and every fault has some runs early."""
     stages = list(dict.fromkeys(fault.stage for fault in faults))
     for index in range(runs):
         for stage in stages:
@@ -156,7 +156,7 @@ def _measure(
             name = "" if fault is None else fault.name
             known = results.find(name, stage.name, index, settings.seed)
             wanted = Task(name, stage, index, settings.seed, settings.out, tuple(settings.set))
-            # A run without facts is made again.
+            # A run without facts is repeated.
             begun.append(known if known is not None and known.facts is not None else crew.begin(wanted))
         for (_index, fault, stage), made in zip(plan, begun, strict=True):
             bar.update(task, description=("no fault, " + stage.name if fault is None else fault.name)[:40])
@@ -182,12 +182,8 @@ def _say(bar: Progress, outcome: Outcome, why: list[str]) -> None:
 
 
 def _head(settings: Suite) -> list[str]:
-    facts = provenance.describe()
     command = shlex.join(["python", "-m", "verification.faults", *sys.argv[1:]])
-    return [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}. "
-        f"Load at the end: {provenance.load():.1f}.",
-    ]
+    return conditions(command, f"Load at the end: {provenance.load():.1f}.")
 
 
 if __name__ == "__main__":

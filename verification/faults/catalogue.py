@@ -1,4 +1,4 @@
-"""The faults: what is done to a run, and what must hold. A row of the table each; a new one needs nothing else."""
+"""The catalogue of faults: what each does to a run, and which checks must pass. Each fault is one row of the table."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ ATTACK_RATE, WEIGHTS_RATE = 1000.0, 4.0
 """Messages a second."""
 ATTACK_S, KNOCKS_S = 4.0, 2.0
 RESTART_PATIENCE_S = 20.0
-"""A busy machine takes long to start a process; what is measured begins when it has started."""
+"""Seconds. A busy machine takes long to start a process; measurements begin after the start."""
 Inflict = Callable[[Rig, int], dict[str, float] | None]
-"""Does the damage, from the moment it is called; with the run's seed. It may let the run go on meanwhile."""
+"""Injects the fault when it is called, with the run's seed. It may let the run continue meanwhile."""
 LINK = "plant's link"
 KILLABLE = ("trainer", "recorder", "router", "controller", LINK)
 
 
 @dataclass(frozen=True)
 class Stage:
-    """How the processes stand before anything happens. Runs with and without a fault are compared on the same one."""
+    """The scene of a run. Runs with and without a fault are compared in the same scene."""
 
     name: str
     plant: Place = "veth"
     trainer: Place = "loopback"
     settings: tuple[str, ...] = ()
     seconds: float = 10.0
-    """How long a run is, counted from the first command."""
+    """Length of a run, counted from the first command, in seconds."""
     set_points: tuple[tuple[float, float], ...] = ()
-    """Where y shall go, from the first command on: seconds, and plant units."""
+    """Set-points of y from the first command on: seconds, and plant units."""
 
 
 USUAL = Stage("usual")
@@ -51,16 +51,16 @@ class Fault:
 
     name: str
     group: str
-    """Which row of the specification it belongs to."""
+    """Row of the specification to which the fault belongs."""
     inflict: Inflict
     holds: tuple[Held, ...]
     stage: Stage = USUAL
     span: float = 0.0
-    """How long the fault itself takes."""
+    """Duration of the fault, in seconds."""
     after: float = 4.5
-    """How long the run goes on when it is over."""
+    """Duration of the run after the fault, in seconds."""
     scene: Scene = scenes.nothing
-    """What surrounds the run."""
+    """Environment of the run."""
 
 
 def _kill(*names: str) -> Inflict:
@@ -69,7 +69,7 @@ def _kill(*names: str) -> Inflict:
         if processes:
             rig.kill(*processes)
         if len(processes) < len(names):
-            # Longer than the lease: the router takes the plant for gone, and both must find each other again.
+            # Longer than the lease: the router drops the plant's link, and both must connect again.
             rig.shape("plant", Shape(cut=True), 2.0)
         rig.await_restarted(RESTART_PATIENCE_S)
 
@@ -89,7 +89,7 @@ def _kill_row(*names: str) -> Fault:
 
 
 def _led_row() -> Fault:
-    """The controller is away while the reference moves; it goes on along it."""
+    """The controller is down while the reference moves; afterwards it continues along the reference."""
     row = _kill_row("controller")
     return replace(row, name=f"{row.name}, moving reference", holds=(*row.holds, holds.still_led), stage=LED)
 

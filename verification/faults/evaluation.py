@@ -1,4 +1,4 @@
-"""From a run to its figures, by three witnesses: the plant's own trace, what was heard on the bus, and the log."""
+"""Compute the figures of a run from three sources: the plant's own trace, the messages on the bus, and the log."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ OTHERWISE = ("plan", "safe")
 COMMANDING = ("router", "controller")
 APART_S = 0.5
 SETTLE_S = 0.25
-"""After control is back the process that was hurt may still be late for this long."""
+"""Seconds. After control is back, the process that was hurt may still be late for this long."""
 
 
 def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
-    """The figures of a run that has ended; its first `seconds` count for J."""
+    """Return the figures of a run that has ended; its first `seconds` count for J."""
     config, plant, witness = rig.config, get_plant(rig.config.plant.model), Witness(rig)
     traced = read(rig.trace)
     sampled = [one for one in traced if isinstance(one, Sampled) and one.state.t < rig.ended_at]
@@ -47,7 +47,7 @@ def evaluate(rig: Rig, seconds: float, extra: dict[str, float]) -> Facts:
         raise RigError("the plant never moved")
     fault_at = rig.events[0].at if rig.events else math.inf
     after = [one for one in moving if one.state.t > fault_at]
-    # What a late command did before the fault, the fault has not done.
+    # The fault did not cause a late command that came before it.
     judged = after or moving
     known = motion([[one.state for one in judged]], plant, config.period)
     every = motion([[one.state for one in moving]], plant, config.period)
@@ -112,9 +112,9 @@ def _deepest(x: np.ndarray, applied: np.ndarray, plant: Description) -> float:
 
 
 def _back_at(rig: Rig, fault_at: float) -> float | None:
-    """When the last of what was hurt was there again: a new process's first word, a link, a continued process.
+    """When the last hurt part was back: a new process's first message, a link, a continued process.
 
-    Commands do not wait for a trainer, so beside others it does not count.
+    Commands do not wait for a trainer, so it does not count beside other processes.
     """
     killed = [name for name in RESTARTED if rig.processes[name].killed]
     moments = [rig.back_at(name) for name in killed if name in COMMANDING or len(killed) == 1]
@@ -124,14 +124,14 @@ def _back_at(rig: Rig, fault_at: float) -> float | None:
 
 
 def _control_at(moving: list[Sampled], fault_at: float, back_at: float | None) -> float | None:
-    """When fresh commands drove the plant again; the fault's own moment when they never ceased."""
+    """When fresh commands drove the plant again; the moment of the fault if they never ceased."""
     ceased = [one.state.t for one in moving if one.state.t > fault_at and one.state.source in OTHERWISE]
     if not ceased or ceased[0] - fault_at > APART_S:
-        # What ceases long after the fault is a late tick, and counts as such.
+        # A gap that begins long after the fault is a late tick and counts as one.
         return fault_at
     end = ceased[0]
     for before, after in pairwise(ceased):
-        # A single sample without a fresh command, long after, is a late tick and counts as such.
+        # A single sample without a fresh command, long after the fault, is a late tick and counts as one.
         if after - before > APART_S and (back_at is None or after > back_at):
             break
         end = after
@@ -142,7 +142,7 @@ def _control_at(moving: list[Sampled], fault_at: float, back_at: float | None) -
 def _burst(ticks: list[m.Tick], period: float) -> int:
     most = 0
     for run_id in {tick.run_id for tick in ticks}:
-        # Each run counts from its own beginning.
+        # Runs are aligned at their own beginning.
         times = np.sort([tick.t + tick.lateness for tick in ticks if tick.run_id == run_id])
         within = np.searchsorted(times, times + 0.9 * period) - np.arange(len(times))
         most = max(most, int(within.max()))
@@ -164,7 +164,7 @@ def _foreign_states(witness: Witness, plants: set[str]) -> int:
 def _late(
     rig: Rig, witness: Witness, sampled: list[Sampled], fault_at: float, control_at: float | None
 ) -> tuple[int, int]:
-    """Late or skipped: how many, and how many of them while the machine itself stood still."""
+    """Count late or skipped ticks, and how many of them occurred while the machine itself stalled."""
     period, share = rig.config.period, rig.config.controller.late_fraction
     noted = stalls.read(rig.folder / "stalls.txt")
     hurt = any("controller" in event.concerns for event in rig.events)
@@ -204,7 +204,7 @@ def _tick_p99(rig: Rig, witness: Witness) -> float | None:
 
 
 def _samples(witness: Witness) -> tuple[int, int | None]:
-    """How many samples the last controller made, and how many of them its trainer held in the end."""
+    """Count the samples that the last controller made, and those that its trainer held in the end."""
     results = witness.messages(topics.RESULT)
     made = sum(r.h is not None for r in results if r.run_id == results[-1].run_id)
     held = [health.counters.get("buffer") for _, health in witness.health("trainer")]
@@ -220,7 +220,7 @@ def _forged_adopted(witness: Witness) -> int:
 
 
 def _short(verdict: str) -> str:
-    """Without the figures, so that equal ones can be counted."""
+    """Remove the figures from a note, so that equal notes can be counted."""
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", verdict)
 
 
@@ -246,13 +246,13 @@ def _log(rig: Rig) -> tuple[Run | None, Replayed]:
 
 
 def _recorder_hurt(rig: Rig) -> float:
-    """When its process or its disk was; infinite when never."""
+    """Return when its process or its disk was hurt; infinity if never."""
     moments = [event.at for event in rig.events if "disk" in event.concerns]
     return min([*moments, *rig.processes["recorder"].killed], default=math.inf)
 
 
 def _log_time_off(log: Run | None) -> float | None:
-    """A wall clock that was stepped must not show in the log."""
+    """Check that a stepped wall clock does not show in the log."""
     if log is None or not log.ticks:
         return None
     entries = log.entries(topics.TICK)
@@ -262,7 +262,7 @@ def _log_time_off(log: Run | None) -> float | None:
 
 
 def _readable_gap(rig: Rig, witness: Witness, log: Run | None) -> float | None:
-    """From the last state in the log to the last one before the recorder was hurt, as the suite heard them."""
+    """Time from the last state in the log to the last one that the suite heard before the recorder was hurt."""
     hurt = _recorder_hurt(rig)
     if not math.isfinite(hurt) or log is None:
         return None
@@ -273,7 +273,7 @@ def _readable_gap(rig: Rig, witness: Witness, log: Run | None) -> float | None:
 
 
 def _missing(rig: Rig, witness: Witness, log: Run | None) -> int:
-    """Ticks heard here, before the recorder was hurt, that the log lacks."""
+    """Count the ticks that the suite heard before the recorder was hurt and that the log lacks."""
     if log is None:
         return 0
     until = min(_recorder_hurt(rig), rig.ended_at) - 1.0
@@ -285,7 +285,7 @@ def _missing(rig: Rig, witness: Witness, log: Run | None) -> int:
 
 
 def _counted(witness: Witness) -> dict[str, int]:
-    """The last counters of each process incarnation: what was not obeyed, what overflowed."""
+    """Return the last counters of each process: refused messages and overflows."""
     last: dict[str, m.Health] = {}
     for process in topics.PROCESSES:
         for _, health in witness.health(process):
@@ -300,7 +300,7 @@ def _counted(witness: Witness) -> dict[str, int]:
 
 
 def _view(rig: Rig) -> str:
-    """What `tandem run` would have shown of the recorder when the run ended."""
+    """Return what `tandem run` would have shown of the recorder when the run ended."""
     monitor = Monitor(rig.config, get_plant(rig.config.plant.model), 1.0)
     prefix = topics.everything(rig.config.name).removesuffix("**")
     for heard in rig.heard:

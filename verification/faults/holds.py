@@ -1,4 +1,4 @@
-"""What must hold: each check looks at a run, and at one without the fault, and says what does not, or None."""
+"""Checks of a run against one without the fault. Each returns what failed, or None."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Callable
 from verification.faults.facts import Facts
 
 Held = Callable[[Facts, Facts], str | None]
-"""(the run, the run with the same seed and no fault) -> why it does not hold."""
+"""(the run, the run with the same seed and no fault) -> what failed, or None."""
 
 CONTROL_BACK_S = 1.0
 READABLE_S = 0.6
-"""Half a second between flushes, a state every 50 ms, and the time a flush takes."""
+"""Half a second between flushes, a state every 50 ms, and the time of a flush."""
 COST_SHARE = 0.05
 PREDICTS_SHARE, PREDICTS_FLOOR = 1.5, 3e-5
 """Two runs without an attack differ too. The floor is that of the trial: 0.003 of the output scale."""
@@ -28,7 +28,7 @@ OBEYED = {
     "controller/output_weights": "trainer",
     "trainer/hidden_weights": "controller",
 }
-"""Topics that somebody acts on, and who does. The others are only shown and logged, as they come."""
+"""Topics that a process acts on, and that process. Other topics are only shown and logged."""
 
 
 def constraints(run: Facts, calm: Facts) -> str | None:
@@ -39,16 +39,16 @@ def constraints(run: Facts, calm: Facts) -> str | None:
 
 
 def control_back(run: Facts, calm: Facts) -> str | None:
-    """Fresh commands drive the plant within a second of the process or the link being back."""
+    """Fresh commands drive the plant within a second after the process or the link is back."""
     if run.control_after is None:
         return "control did not come back"
     if run.control_after > CONTROL_BACK_S:
-        return f"control came back {run.control_after:.2f} s after what was hurt"
+        return f"control came back {run.control_after:.2f} s after the process or link"
     return None
 
 
 def punctual(run: Facts, calm: Facts) -> str | None:
-    """No late tick in what was not hurt, but for those in which the machine itself stood still."""
+    """No tick is late in an unhurt process, except while the machine itself stalled."""
     late = run.late - run.late_by_machine
     return f"{late} late" if late > 0 else None
 
@@ -59,12 +59,12 @@ def still_led(run: Facts, calm: Facts) -> str | None:
 
 
 def no_burst(run: Facts, calm: Facts) -> str | None:
-    """Two steps within a period at most: the one that was late, and the next."""
+    """At most two steps begin within a period: the late one and the next."""
     return f"{run.burst} steps of the controller within a period" if run.burst > 2 else None
 
 
 def plan_then_safe(run: Facts, calm: Facts) -> str | None:
-    """The plant follows the rest of the plan, then its safe input, and nothing in another order."""
+    """The plant follows the rest of the plan, then its safe input, in this order."""
     order = [source for source in run.sources if source != "command"]
     first = order[: order.index("safe") + 1] if "safe" in order else order[:1]
     return None if first in ([], ["plan"], ["plan", "safe"]) else f"driven by {', '.join(run.sources)}"
@@ -80,14 +80,14 @@ def merged(run: Facts, calm: Facts) -> str | None:
 
 
 def control_kept(run: Facts, calm: Facts) -> str | None:
-    """The loop goes on: fresh commands never ceased, as far as the machine itself did not stand still."""
+    """The loop continues: fresh commands never ceased, except while the machine itself stalled."""
     if run.plan_s and not run.late_by_machine:
         return f"no fresh command for {run.plan_s:.2f} s"
     return None
 
 
 def readable(run: Facts, calm: Facts) -> str | None:
-    """All but the last half second of the log can be read, and what can be read replays."""
+    """All but the last half second of the log is readable, and the readable part replays."""
     if run.readable_gap is None:
         return "the log cannot be read"
     if run.readable_gap > READABLE_S:
@@ -98,7 +98,7 @@ def readable(run: Facts, calm: Facts) -> str | None:
 
 
 def replays(run: Facts, calm: Facts) -> str | None:
-    """The log gives back every command, byte for byte."""
+    """The log reproduces every command, byte for byte."""
     return None if run.replay.verdict in EXACT else run.replay.reason
 
 
@@ -110,7 +110,7 @@ def none_obeyed(run: Facts, calm: Facts) -> str | None:
 
 
 def all_counted(run: Facts, calm: Facts) -> str | None:
-    """Each that went to a process that obeys its topic is in that process's counters, and nothing else is."""
+    """Each message to a process that obeys its topic is in that process's counters, and no other message is."""
     for topic, process in OBEYED.items():
         sent = int(run.extra.get(f"sent {topic}", 0))
         found = {name: count for name, count in run.counted.items() if name.startswith(f"{process} ")}
@@ -120,11 +120,11 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
             if name.startswith(f"{process} bad {topic}:")
         }
         bad = sum(reasons.values())
-        # What the run's own trainer sent may be refused too, or give way to a stranger's. And the controller's first
-        # command may come before it has heard the plant.
+        # Messages of the run's own trainer may be refused too. The controller's first
+        # command may come before it has received a state.
         own = ("refused", "for another run", "superseded", "answers no sample")
         surely = bad - sum(reasons.get(reason, 0) for reason in own)
-        # A flood makes room in a full mailbox by dropping the oldest, whosever it was.
+        # A full mailbox drops its oldest message, from any sender.
         dropped = found.get(f"{process} overflow {topic}", 0)
         if not surely <= sent <= bad + dropped:
             return f"{sent} sent to {topic}, {bad} counted by the {process}, {dropped} dropped"
@@ -132,7 +132,7 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
 
 
 def refused_on_both_sides(run: Facts, calm: Facts) -> str | None:
-    """Nobody came in, or got further than its role; the stranger was told why, and the router counts it."""
+    """No stranger connected or exceeded its role; the stranger was told why, and the router counts it."""
     tries, refused = run.extra.get("tries", 0), run.extra.get("refused", 0)
     if not tries or refused < tries:
         return f"{tries - refused:g} of {tries:g} tries were let in"
@@ -146,10 +146,10 @@ def refused_on_both_sides(run: Facts, calm: Facts) -> str | None:
 
 
 def weights_refused(run: Facts, calm: Facts) -> str | None:
-    """Whatever was forged was refused, or rolled back soon after, or predicts as well as what the trainer sends.
+    """Every forged set was refused, was rolled back soon, or predicts as well as the trainer's sets.
 
-    The trial lets in what predicts the controller's own samples no worse. So what is in force after that must predict
-    what comes no worse than without the attack.
+    The trial admits a set that predicts the controller's own samples no worse. The set in force after that must
+    predict later samples no worse than without the attack.
     """
     if not run.extra.get("sent trainer/hidden_weights"):
         return "nothing was forged"
@@ -188,7 +188,7 @@ def view_said(run: Facts, calm: Facts) -> str | None:
 
 
 def log_time(run: Facts, calm: Facts) -> str | None:
-    """The log's own times go on as if nothing had happened."""
+    """The log's own times continue unchanged."""
     if run.log_time_off is None or abs(run.log_time_off) > 1.0:
         return f"the log's times are {run.log_time_off} s off"
     return None

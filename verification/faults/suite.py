@@ -1,4 +1,4 @@
-"""Runs faults: which moment, which seed, what is kept. One run is one line of a file, so that a suite can go on."""
+"""Run faults: choose moment and seed, and keep the outcomes. One run is one line of a file, so a suite can continue."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from verification.faults.processes.rig import Place, Rig, RigError
 from verification.faults.processes.scenes import nothing
 
 EARLIEST_S = 0.3
-"""After the first command; what comes before concerns no run."""
+"""Seconds after the first command; earlier samples do not count."""
 LED_S = 60.0
-"""In which a controller answers who says where to go."""
+"""Seconds in which a controller must answer a reference."""
 SETTLED_S = 4.0
-"""The fault comes within so many seconds of the beginning, where the plant moves most."""
+"""The fault comes within so many seconds after the beginning, where the plant moves most."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, as it stands in the file."""
+    """One run, as stored in the file."""
 
     fault: str
     """Empty: without one."""
@@ -39,31 +39,31 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     index: int
     seed: int
     at: float
-    """When, in seconds after the first command."""
+    """Moment of the fault, in seconds after the first command."""
     wall_s: float
     facts: Facts | None
     error: str = ""
-    """Why there are no facts."""
+    """Reason why there are no facts."""
     not_held: list[str] = []
 
     def folder(self, out: Path) -> Path:
-        """Where its run's files are, below the suite's folder."""
+        """Folder of the run's files, below the suite's folder."""
         return folder_of(out, self.fault or self.stage, self.index)
 
 
 def moment(fault: Fault, index: int, seed: int) -> float:
-    """When the fault comes in its `index`-th run, seconds after the first command."""
+    """Return the moment of the fault in its `index`-th run, in seconds after the first command."""
     rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode()), index])
     return float(rng.uniform(EARLIEST_S, SETTLED_S))
 
 
 def folder_of(out: Path, name: str, index: int) -> Path:
-    """The folder of one run of a fault or, without one, of a stage."""
+    """Return the folder of one run of a fault or, without a fault, of a scene."""
     return out / f"{name}-{index}".replace(" ", "-").replace("/", "-").replace(":", "")
 
 
 def run(stage: Stage, fault: Fault | None, index: int, seed: int, out: Path, settings: list[str]) -> Outcome:
-    """One run with a fault, or one without, in a folder of its own below `out`."""
+    """Make one run, with or without a fault, in a folder of its own below `out`."""
     folder = folder_of(out, stage.name if fault is None else fault.name, index)
     began = clock.now()
     at = 0.0 if fault is None else moment(fault, index, seed)
@@ -94,12 +94,12 @@ def _live(stage: Stage, fault: Fault | None, at: float, config: Config, folder: 
         rig = Rig(folder, config, places, around=around, seed=config.seed)
         with punctual(min(READER_PRIORITY, config.realtime.priority), silent=True):
             extra = _hurt(rig, stage, fault, at)
-        # While the log's disk is still there.
+        # While the log's disk still exists.
         return evaluate(rig, stage.seconds, extra)
 
 
 def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, float]:
-    """The run itself, from the start of its processes to their end; what the fault measured."""
+    """Make the run itself, from the start of its processes to their end; return what the fault measured."""
     extra: dict[str, float] = {}
     with rig:
         assert rig.first_command is not None
@@ -117,7 +117,7 @@ def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, f
 
 
 def judged(outcome: Outcome, fault: Fault, calm: Facts) -> Outcome:
-    """With what did not hold."""
+    """The outcome with the checks that failed."""
     if outcome.facts is None:
         return msgspec.structs.replace(outcome, not_held=[outcome.error])
     found = [why for held in fault.holds if (why := held(outcome.facts, calm)) is not None]
@@ -125,11 +125,11 @@ def judged(outcome: Outcome, fault: Fault, calm: Facts) -> Outcome:
 
 
 class ResultsError(Exception):
-    """The results of an earlier run cannot be gone on from; the text says why and what to do."""
+    """The results of an earlier run cannot be continued; the text says why and what to do."""
 
 
 class Results:
-    """The file of outcomes; what is in it is not run again."""
+    """The file of outcomes; runs in it are not repeated."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -154,7 +154,7 @@ class Results:
         return None
 
     def put(self, made: Outcome) -> None:
-        """In the file from now on, in the place of an earlier one of the same run."""
+        """Store the outcome in the file, in place of an earlier one of the same run."""
         self.outcomes.append(made)
         with self.path.open("ab") as file:
             file.write(msgspec.json.encode(made) + b"\n")

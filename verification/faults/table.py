@@ -1,4 +1,4 @@
-"""The suite's outcomes as a Markdown table, and into the document between its two marks."""
+"""Write the suite's outcomes as a Markdown table into the document between its two marks."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ COLUMNS = (
 
 
 class Pair(msgspec.Struct, frozen=True):
-    """A run and the one without the fault, same seed."""
+    """A run and the one without the fault, with the same seed."""
 
     outcome: Outcome
     calm: Facts
 
 
 def rows(pairs: dict[str, list[Pair]], faults: Sequence[Fault]) -> Iterator[list[str]]:
-    """The cells of each fault that was run."""
+    """Return the cells of each fault that was run."""
     for fault in faults:
         found = pairs.get(fault.name, [])
         if not found:
@@ -70,7 +70,7 @@ def _figures(fault: Fault, ran: list[tuple[Facts, Facts]]) -> list[str]:
 
 
 def _most(values: list[float | None]) -> str:
-    """Median and largest; what never came is said."""
+    """Format median and largest; say so if a value never came."""
     known = [value for value in values if value is not None]
     if not known:
         return ""
@@ -87,11 +87,11 @@ def _replays(replays: list[Replayed]) -> str:
 
 
 def reasons(pairs: dict[str, list[Pair]]) -> Iterator[str]:
-    """What did not hold, by fault."""
+    """Return the table rows of the failed checks, by fault."""
     for name, found in pairs.items():
         for pair in found:
             for why in pair.outcome.not_held:
-                yield f"- {name}, run {pair.outcome.index} at {pair.outcome.at:.2f} s: {why.splitlines()[0][:200]}"
+                yield f"| {name} | {pair.outcome.index} | {pair.outcome.at:.2f} | {why.splitlines()[0][:200]} |"
 
 
 def markdown(pairs: dict[str, list[Pair]], faults: Sequence[Fault], head: list[str]) -> str:
@@ -100,5 +100,14 @@ def markdown(pairs: dict[str, list[Pair]], faults: Sequence[Fault], head: list[s
     rule = ["---", *["---:"] * (len(COLUMNS) - 2), "---"]
     lines = [*head, "", *(f"| {' | '.join(row)} |" for row in (list(COLUMNS), rule, *cells))]
     failed = list(reasons(pairs))
-    lines += ["", "What did not hold:" if failed else "Everything held.", *([""] if failed else []), *failed]
+    if not failed:
+        return "\n".join([*lines, "", "All checks passed."])
+    lines += [
+        "",
+        "Checks that failed:",
+        "",
+        "| fault | run | fault at, s | check |",
+        "| --- | ---: | ---: | --- |",
+    ]
+    lines += failed
     return "\n".join(lines)

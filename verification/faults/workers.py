@@ -1,4 +1,4 @@
-"""Runs in processes of their own, several at a time."""
+"""Make several runs at a time, in processes of their own."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from verification.faults.suite import Outcome, run
 
 @dataclass(frozen=True)
 class Task:
-    """One run that is to be made."""
+    """One planned run."""
 
     fault: str
-    """Its name; empty: without one."""
+    """Name of the fault; empty for a run without one."""
     stage: Stage
     index: int
     seed: int
@@ -30,13 +30,13 @@ class Task:
 
 
 class Workers:
-    """Makes runs, `jobs` at a time, in the order in which they were given."""
+    """Make runs, `jobs` at a time, in the given order."""
 
     def __init__(self, pool: ProcessPoolExecutor, keep: Callable[[Outcome], None]):
         self._pool, self._keep = pool, keep
 
     def begin(self, task: Task) -> Future[Outcome]:
-        """The run's outcome, when there is one; it is kept then, whoever waits for it."""
+        """Wait for the run's outcome and store it."""
         future = self._pool.submit(_make, task)
         future.add_done_callback(self._done)
         return future
@@ -48,7 +48,7 @@ class Workers:
 
 @contextmanager
 def workers(jobs: int, keep: Callable[[Outcome], None]) -> Iterator[Workers]:
-    """`jobs` processes for the length of a `with`; when it is left early, each first clears away its run."""
+    """Run `jobs` processes for the length of a `with`; on an early exit each first cleans up its run."""
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, context, _prepare)
     try:
@@ -62,8 +62,8 @@ def workers(jobs: int, keep: Callable[[Outcome], None]) -> Iterator[Workers]:
 
 
 def _prepare() -> None:
-    """In the worker. Ctrl-C reaches it, too, and must not come again while it clears away."""
-    # What the run's own bus has to say of dead routers and bad messages is no news here.
+    """Handle Ctrl-C in the worker; it must not interrupt the clean-up."""
+    # Log lines of the run's own bus about dead routers and bad messages are expected here.
     logging.disable(logging.WARNING)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupted)

@@ -1,1 +1,1 @@
-"""Bytes that nobody should send, given to everything that reads bytes: `make fuzz`."""
+"""Bad bytes for every reader of bytes: `make fuzz`."""

@@ -1,6 +1,6 @@
-"""`make fuzz`: millions of bad payloads through every reader; nothing may crash, hang or grow.
+"""`make fuzz`: send millions of bad payloads through every reader; none may crash, hang or grow.
 
-python -m verification.fuzz --payloads 10000000 --document docs/faults.md
+python -m verification.fuzz --payloads 10000000 --document docs/results/faults.md
 """
 
 from __future__ import annotations
@@ -20,19 +20,18 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from benchmarks.document_block import DocumentError, Marks
-from node_runtime import provenance
+from benchmarks.document_block import DocumentError, Marks, conditions
 from verification.fuzz.targets import ACCEPTED
 from verification.fuzz.work import Finding, Report, Work, merge
 
 MARKS = Marks.of("fuzz", "make fuzz")
 GROWTH_KB = 8 * 1024
-"""What a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
+"""kB that a process may grow after its first tenth: caches of the allocator, not a leak of millions of payloads."""
 
 
 @dataclass(frozen=True)
 class Fuzz:
-    """Bad payloads through everything that reads bytes from outside."""
+    """Send bad payloads through every reader of bytes from outside."""
 
     payloads: int = 10_000_000
     """In all."""
@@ -40,13 +39,13 @@ class Fuzz:
     """Processes."""
     seed: int = 0
     out: Path = Path("runs/fuzz")
-    """Where the figures go, and payloads that were not dealt with."""
+    """Folder of the figures, and of payloads that caused a failure."""
     document: Path | None = None
-    """Where the table goes between its two marks."""
+    """Document that receives the table between its two marks."""
 
 
 def main(settings: Fuzz) -> int:
-    """0 when nothing crashed, hung or grew; 1 when something did; 2 when the document lacks the marks."""
+    """Return 0 if nothing crashed, hung or grew, 1 if something did, 2 if the document lacks the marks."""
     console = Console(stderr=True)
     try:
         MARKS.check(settings.document)
@@ -66,7 +65,7 @@ def main(settings: Fuzz) -> int:
 
 
 def measure(settings: Fuzz, console: Console) -> list[Report]:
-    """One report a process; what a process that hung or died had done until then is in its own."""
+    """One report a process; the work of a process that hung or died is in its own report."""
     share = settings.payloads // settings.jobs
     context = multiprocessing.get_context("spawn")
     latest: dict[Connection, Report] = {}
@@ -98,20 +97,19 @@ def measure(settings: Fuzz, console: Console) -> list[Report]:
 
 
 def growth(report: Report) -> int:
-    """kB from after the first tenth to the end."""
+    """Growth in kB from after the first tenth to the end."""
     kept = report.rss_kb[max(1, len(report.rss_kb) // 10) :]
     return kept[-1] - kept[0] if len(kept) > 1 else 0
 
 
 def table(reports: list[Report], settings: Fuzz) -> list[str]:
-    """The figures as Markdown."""
-    facts = provenance.describe()
+    """Return the figures as Markdown."""
     command = shlex.join(["python", "-m", "verification.fuzz", *sys.argv[1:]])
     found = merge(reports)
+    payloads = sum(report.payloads for report in reports)
+    seconds = max((report.seconds for report in reports), default=0.0)
     lines = [
-        f"`{command}`, on {facts['processor']}, {facts['cores']} cores, {facts['system']}: "
-        f"{sum(report.payloads for report in reports):,} payloads in {settings.jobs} processes, "
-        f"{max((report.seconds for report in reports), default=0.0):.0f} s.",
+        *conditions(command, f"{payloads:,} payloads in {settings.jobs} processes, {seconds:.0f} s."),
         "",
         "| reader | payloads | accepted | refused | slowest, ms | crashed |",
         "| --- | ---: | ---: | --- | ---: | ---: |",
@@ -132,9 +130,9 @@ def table(reports: list[Report], settings: Fuzz) -> list[str]:
             else []
         )
         after = f"{growth(report) / 1024:+.1f} MB after its first tenth"
-        lines.append(f"Memory of a process, first and last: {' and '.join(rss)} MB, {after}.")
+        lines.append(f"- Memory of a process, first and last: {' and '.join(rss)} MB, {after}.")
         if not report.ended:
-            lines.append("A process did not end: it hung or died.")
+            lines.append("- A process did not end: it hung or died.")
     return lines
 
 

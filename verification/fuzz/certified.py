@@ -1,6 +1,6 @@
-"""Certified sets that somebody made up, with a right hash; and the states that a guard is asked about.
+"""Forged certified sets with a right hash, and the states that a guard is asked about.
 
-A log holds its sets, and a replay believes their hash at most: what is in them must be refused, or borne.
+A log holds its sets, and a replay checks their hash at most. Their content must be refused or handled.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PERIOD = 0.05
 
 
 def small_sets() -> Certificate:
-    """One small set of those that are shipped, said to lead to itself."""
+    """One small shipped set, changed to lead to itself."""
     shipped = read_sets(min(SHIPPED.glob("*.json*"), key=lambda path: path.stat().st_size)).certificate
     last = min(shipped.pieces, key=lambda piece: len(piece.g))
     return msgspec.structs.replace(shipped, pieces=[msgspec.structs.replace(last, target=0)])
@@ -53,7 +53,7 @@ def forged(certificate: Certificate) -> Callable[[bytes], str]:
             require_match(sets.certificate, model)
         except CertificateError:
             return "refused"
-        # Numbers at the end of what a float holds overflow; that is their matter.
+        # Numbers at the end of the range of a float overflow; this is expected.
         with np.errstate(all="ignore"):
             verdict = check(sets.certificate)
             if sets.certificate.certified:
@@ -94,7 +94,7 @@ def asked(certificate: Certificate) -> Callable[[bytes], str]:
 
 
 class States:
-    """Endless states, inputs and delays: plausible, and in part strange."""
+    """Endless states, inputs and delays: plausible, and partly extreme."""
 
     def __init__(self, certificate: Certificate, seed: int):
         self._rng = random.Random(seed)

@@ -1,4 +1,4 @@
-"""Valid bytes made bad, quickly: a few microseconds each, and the same ones for the same seed."""
+"""Make valid bytes bad, quickly: a few microseconds each, and the same ones for the same seed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARKERS = (
     b"\xd3\x80" + b"\x00" * 7,
     b"\xc7\x08\x01" + b"\x00" * 8,  # an extension type
     b"\xd6\xff" + b"\xff" * 4,  # a time stamp
-    b"\xa2\xff\xfe",  # a text that is none
+    b"\xa2\xff\xfe",  # a text with invalid UTF-8
     b"\x91" * 2000,  # lists in lists
     b"\x81\xa1a" * 1000,  # maps in maps
     b"\xc0",
@@ -66,13 +66,13 @@ ARRAYS: tuple[Any, ...] = tuple(
         ([0], b""),
     )
 )
-"""Where an array is expected: shapes that numpy cannot hold, and values that no computation bears."""
+"""Shapes that numpy cannot hold, and values that no computation accepts, in place of an array."""
 
 Mutation = Callable[[bytes, Sequence[bytes], random.Random], bytes]
 
 
 def flip(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """One to four bytes are others."""
+    """Replace one to four bytes."""
     if not payload:
         return b"\x00"
     changed = bytearray(payload)
@@ -93,26 +93,26 @@ def drop(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
 
 
 def double(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """A stretch is there twice."""
+    """Repeat a stretch."""
     at = int(rng.random() * len(payload))
     return payload[: at + 1 + int(32 * rng.random())] + payload[at:]
 
 
 def splice(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """The beginning of one and the end of another message."""
+    """Join the beginning of one message and the end of another."""
     other = others[int(rng.random() * len(others))]
     return payload[: int(rng.random() * len(payload))] + other[int(rng.random() * len(other)) :]
 
 
 def mark(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """Something that means much stands in the middle."""
+    """Insert bytes with a special meaning in the middle."""
     marker = MARKERS[int(rng.random() * len(MARKERS))]
     at = int(rng.random() * len(payload))
     return payload[:at] + marker + payload[at + len(marker) * (rng.random() < 0.5) :]
 
 
 def number(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """One of its floating-point numbers is a strange one."""
+    """Replace one of its floating-point numbers by an extreme one."""
     strange = NUMBERS[int(rng.random() * len(NUMBERS))]
     at = payload.find(b"\xcb", int(rng.random() * len(payload)))
     return payload[:at] + strange + payload[at + 9 :] if at >= 0 else flip(payload, others, rng)
@@ -124,19 +124,19 @@ def noise(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
 
 
 def whole(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """Nothing is wrong with it."""
+    """Change nothing."""
     return payload
 
 
 def text(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """A word that means much to a reader of texts stands in the middle."""
+    """Insert a word with a special meaning for readers of texts."""
     word = TEXTS[int(rng.random() * len(TEXTS))]
     at = int(rng.random() * len(payload))
     return payload[:at] + word + payload[at + int(8 * rng.random()) :]
 
 
 def rebuild(payload: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """Well-formed msgpack, in which one value is another: what a schema alone must refuse, or a reader bear."""
+    """Well-formed msgpack with one changed value: a schema must refuse it, or a reader handle it."""
     try:
         tree = msgspec.msgpack.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -186,7 +186,7 @@ class Mutator:
     def __init__(
         self, seeds: Sequence[bytes], others: Sequence[bytes], mutations: Sequence[Mutation], seed: int
     ):
-        """`others`: what is spliced in."""
+        """`others`: messages for splicing."""
         self._seeds, self._others, self._mutations = seeds, others, mutations
         self._rng = random.Random(seed)
 
@@ -203,12 +203,12 @@ STRANGE: tuple[Any, ...] = (
     *(0, -1, 1, 0.5, -0.0, 1e-300, 5e-324, 1e-9, 1e9, 1e150, 1e308, -1e308, 2**62, 2**70),
     *(True, None, "", "x", "../x", "/dev/null", "\u001b[2J", [], [[]], [0.0], [[0.0]], {}, "x" * 5000),
 )
-"""Anything that JSON holds, where something else is expected."""
+"""Any JSON value in place of another."""
 NUMBERS_IN_STRANGE = 14
 
 
 class Reteller:
-    """Endless JSON, well-formed, in which a few values are others."""
+    """Endless well-formed JSON with a few changed values."""
 
     def __init__(self, text: bytes, seed: int):
         self._text, self._rng = text, random.Random(seed)

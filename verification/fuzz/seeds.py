@@ -1,4 +1,4 @@
-"""One or more valid messages of every topic, from a controller and a plant that run a few steps: what is mutated."""
+"""Valid messages of every topic, from a controller and a plant that run a few steps: the input of the mutations."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ ANSWERS = (HIDDEN_ANSWER, SAMPLES_ANSWER)
 
 
 def config() -> Config:
-    """Of the controller that the messages come from."""
+    """Configuration of the controller that sends the messages."""
     return override(Config(), SETTINGS)
 
 
 def seeds() -> dict[str, list[bytes]]:
-    """By topic or answer, payloads that every reader accepts."""
+    """Payloads that every reader accepts, by topic or answer."""
     settings = config()
     core = ControllerCore(settings, "controller-1")
     true = get_plant(settings.plant.model)
@@ -79,7 +79,7 @@ def seeds() -> dict[str, list[bytes]]:
             reference=asked.get(step, UNSET),
         )
         outputs = core.step(tick)
-        # Acting a little after the sample, so that there are pieces in the next state.
+        # Acts a little after the sample, so that the next state has pieces.
         plant.command(outputs.command, step * settings.period + 0.003)
         said(topics.PLANT_STATE, state)
         said(topics.COMMAND, outputs.command)

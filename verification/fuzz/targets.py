@@ -1,4 +1,4 @@
-"""Everything that reads bytes from outside, as one function each: it accepts, or raises what it declares."""
+"""Every reader of bytes from outside, as one function each: it accepts, or raises what it declares."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from verification.fuzz.mutate import Mutator, Reteller
 from verification.fuzz.seeds import ANSWERS, config, seeds
 
 SHARE_OF_SLOW = 0.01
-"""Of the payloads, for readers of whole files: a thousand times slower than a message."""
+"""Share of the payloads for readers of whole files, which are a thousand times slower than messages."""
 
 LIBRARY = "kernel-0123456789ab.so"
 
 ACCEPTED = ("accepted", "accepted, cut short")
 Read = Callable[[bytes], str]
-"""Reads; what became of it, one of `ACCEPTED` or why not, in a few words that can be counted."""
+"""Read; return the outcome, one of `ACCEPTED` or the reason, in a few words that can be counted."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Target:
     read: Read
     make: Callable[[], bytes]
     weight: float
-    """Of the payloads, as a share relative to the others'."""
+    """Share of the payloads, relative to the others."""
 
 
 def targets(seed: int, folder: Path) -> list[Target]:
-    """All of them. folder: where those that read files may put one."""
+    """Return all targets. folder: place for files of targets that read files."""
     payloads = seeds()
     everything = [payload for known in payloads.values() for payload in known]
     found: list[Target] = []
@@ -188,7 +188,7 @@ def _driving(core: ControllerCore) -> Read:
 
 
 def _aiming(core: ControllerCore) -> Read:
-    """From the bus to where the plan leads, in this tick and after its lease."""
+    """From the bus to the reference in force, in this tick and after its lease."""
     before, aims = core.memory.state, core.controller.aims
     theta = core.controller.oracle.theta(before.oracle)
     tick = codec.decode(topics.TICK, seeds()[topics.TICK.name][0])
@@ -223,7 +223,7 @@ def _restoring(core: ControllerCore) -> Read:
             return error.reason
         assert isinstance(keyframe, m.Keyframe)
         try:
-            # Weights that no float32 holds are infinite in a hash of float32; numpy says so, and it is no mistake.
+            # Weights that no float32 holds are infinite in a hash of float32; numpy warns, which is expected.
             with np.errstate(over="ignore"):
                 core.memory.restore(keyframe)
         except ValueError:
@@ -277,7 +277,7 @@ def _reconfiguring(payload: bytes) -> str:
 
 
 def _building(payload: bytes) -> str:
-    """As far as a replay goes: the controller of a recorded configuration, where that is a small one."""
+    """As far as a replay: the controller of a recorded configuration, if that is a small one."""
     try:
         said = from_json(payload.decode(errors="replace"))
         given = given_plant(Run(Path("fuzzed.mcap"), said), said, set())
@@ -299,7 +299,7 @@ def _knowing(payload: bytes) -> str:
 
 
 def _modelling(payload: bytes) -> str:
-    """As far as the model of the numbers that a log holds."""
+    """As far as the model of the numbers in a log."""
     try:
         known, _files = plant_record.decode(payload)
         nominal_model(known, 0.05)
@@ -319,7 +319,7 @@ def _certifying(payload: bytes) -> str:
 
 
 def _loading(payload: bytes) -> str:
-    """Nothing is ever loaded here: a library is accepted that is, byte for byte, what was written for its name."""
+    """Nothing is loaded: a library is accepted only if it equals, byte for byte, what was written for its name."""
     if not is_sealed(payload, LIBRARY):
         return "refused"
     content = payload.rpartition(SEAL)[0]
@@ -345,7 +345,7 @@ def _kind(reason: str) -> str:
 
 
 def _sets() -> bytes:
-    """A small file of certified sets, of those that are shipped."""
+    """A small file of certified sets, from the shipped ones."""
     from controller_node.certified_sets import SHIPPED
 
     path = min(SHIPPED.glob("*.json*"), key=lambda path: path.stat().st_size)

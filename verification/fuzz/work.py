@@ -1,4 +1,4 @@
-"""What one process of the fuzzer does."""
+"""The work of one process of the fuzzer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import msgspec
 from verification.fuzz.targets import targets
 
 HANG_S = 20.0
-"""A thousand payloads take some ten milliseconds; a reader that takes this long for them never ends."""
+"""Seconds. A thousand payloads take some ten milliseconds; a reader that takes this long hangs."""
 BLOCK = 1000
 REPORT_EVERY = 20
 """Blocks."""
@@ -49,7 +49,7 @@ class Figures(msgspec.Struct):
 
 
 class Report(msgspec.Struct):
-    """Of one process, so far."""
+    """Figures of one process, so far."""
 
     payloads: int = 0
     seconds: float = 0.0
@@ -61,14 +61,14 @@ class Report(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Work:
-    """A share of the payloads."""
+    """Process a share of the payloads."""
 
     payloads: int
     seed: int
     folder: str
 
     def run(self, to: Connection) -> None:
-        """Report now and then to the one who started this process; a hang ends it with a traceback."""
+        """Report at intervals to the parent process; a hang ends with a traceback."""
         logging.disable()
         report = Report()
         known = targets(self.seed, Path(self.folder))
@@ -85,7 +85,7 @@ class Work:
                 before = time.perf_counter_ns()
                 try:
                     kind = target.read(payload)
-                except Exception as error:  # noqa: BLE001 - whatever it is, it is what is looked for
+                except Exception as error:  # noqa: BLE001 - any other exception is a finding
                     figures.crashed += 1
                     if len(report.findings) < KEPT:
                         place = traceback.extract_tb(error.__traceback__)[-1]

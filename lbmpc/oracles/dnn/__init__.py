@@ -1,1 +1,1 @@
-"""The network oracle: its expressions, its law of adaptation, and what new hidden layers must show."""
+"""The network oracle: its expressions, its adaptation law, and the trial of new hidden layers."""

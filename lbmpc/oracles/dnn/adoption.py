@@ -1,4 +1,4 @@
-"""Adoption of hidden layers from a trainer: what refuses a set, what becomes of K, and what is rolled back."""
+"""Adoption of hidden layers from a trainer: checks, refit of K, and rollback."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from lbmpc.oracles.dnn.trial import Finding, Trial, had, newest, tried
 from network_model.description import hash_layers, why_unacceptable
 
 IN_USE, NEWEST = 0, 1
-"""Entries of `version`: that of the hidden layers in use, and the highest that was ever adopted."""
+"""Entries of `version`: the version in use, and the highest version adopted so far."""
 LEAP = 10**9
-"""By which a version may rise at once: after the largest number that there is nobody's weights would be newer."""
+"""Largest increase of the version at once. Without a limit the largest integer would block all later weights."""
 Network = tuple[list[np.ndarray], np.ndarray]
-"""W_1..W_{L-1} and K."""
+"""Hidden layers W_1..W_{L-1} and K."""
 
 
 @dataclass(frozen=True)
 class Refit:
-    """At an adoption K is fitted to the newest samples under the new features; see `adaptation_law.refit`."""
+    """Settings for fitting K to the newest samples under new features; see `adaptation_law.refit`."""
 
     window: int
-    """Samples remembered for it."""
+    """Number of stored samples."""
     ridge: float
 
 
 @dataclass(frozen=True, eq=False)
 class Adoption:
-    """What hidden layers on offer must show, before and after they are adopted."""
+    """Checks offered hidden layers before and after their adoption."""
 
     net: NetworkExpressions
     bounds: np.ndarray
-    """On the norm of each column of K, (d,), scaled."""
+    """Bounds on the norm of each column of K, (d,), scaled."""
     refit: Refit | None
-    """What happens to K when hidden layers are adopted; None: it is kept."""
+    """Settings for a refit of K after an adoption; None keeps K."""
     trial: Trial | None
-    """What hidden layers must show before and after they are adopted; None: nothing."""
+    """Settings of the trial before and after an adoption; None for no trial."""
 
     def adopt(self, state: OracleState, offered: HiddenSet) -> tuple[OracleState, Verdict]:
-        """Swap in a new set of hidden layers; K is kept, or refitted to the samples remembered.
+        """Adopt a new set of hidden layers. K is kept, or refitted to the stored samples.
 
         Returns:
-            The state and "adopted", or the state as it was, but for the memory of trials, and why it was refused.
+            The state and "adopted", or the previous state with an updated memory of trials and the reason.
         """
-        reason = self._why_not_of_this_network(state, offered)
+        reason = self._reason_to_refuse(state, offered)
         if reason is not None:
             return state, Verdict("refused", reason)
-        # What the hash is of.
+        # The hash covers float32 values.
         hidden = [layer.astype(np.float32).astype(float) for layer in offered.layers]
         K = self._K_under(hidden, state)
         watched: OracleState = {}
@@ -64,7 +64,7 @@ class Adoption:
                 return state, Verdict("refused", "stale: these layers were in use or on trial before")
             state = {**state, **had(state, offered.sha256)}
             in_use = self.net.hidden(state)
-            # What a set was trained on it predicts in any case. Who says nothing of that has the first trial alone.
+            # A set always predicts its training samples well. If their age is unknown, only the first trial runs.
             later = self._later(state, offered)
             for tried_on in (samples, later) if len(later) else (samples,):
                 found = self._compare(tried_on, (hidden, K), (in_use, state["K"]))
@@ -75,10 +75,10 @@ class Adoption:
         return {**state, **self.net.named(hidden), "version": version, **watched, "K": K}, Verdict("adopted")
 
     def confirm(self, state: OracleState) -> tuple[OracleState, str]:
-        """After a sample was learned: whether the set that was adopted last holds what its trial promised.
+        """Check after a new sample whether the last adopted set is as good as its trial predicted.
 
         Returns:
-            The state and "", or the state with the network from before, and a text that says why.
+            The state and "", or the state with the previous network and the reason.
         """
         if self.trial is None or not rollback.due(self.trial, state):
             return state, ""
@@ -99,15 +99,15 @@ class Adoption:
         return (state if not rollback.ends(state) else {**state, **rollback.over(state)}), ""
 
     def _later(self, state: OracleState, offered: HiddenSet) -> np.ndarray:
-        """Samples that came after the last one that the set was trained on, (n, row); none where they are too few."""
+        """Return the samples after the last training sample, (n, row); none if they are too few."""
         assert self.trial is not None
         if offered.later is None:
             return state["recent"][:0]
         later = newest(self.trial, state, int(state["seen"][0]) - offered.later)
         return later if len(later) >= self.trial.least else later[:0]
 
-    def _why_not_of_this_network(self, state: OracleState, offered: HiddenSet) -> str | None:
-        """What is wrong with a set before anybody asks how well it predicts, or None."""
+    def _reason_to_refuse(self, state: OracleState, offered: HiddenSet) -> str | None:
+        """Return the reason why a set does not belong to this network, or None."""
         known, version = int(state["version"][NEWEST]), offered.version
         if version <= known:
             return f"version {version} is not newer than {known}"
@@ -121,8 +121,8 @@ class Adoption:
         return reason
 
     def _compare(self, samples: np.ndarray, new: Network, old: Network) -> Finding:
-        """Two networks, each hidden layers and K, on the same samples, (n, row)."""
-        windows, h = self._taken_apart(samples)
+        """Compare two networks (hidden layers and K) on the same samples, (n, row)."""
+        windows, h = self._windows_and_labels(samples)
 
         def error(hidden: list[np.ndarray], K: np.ndarray) -> float:
             missed = self.net.features_of(hidden, windows) @ K - h
@@ -131,16 +131,16 @@ class Adoption:
         return Finding(error(*new), error(*old), len(samples))
 
     def _K_under(self, hidden: list[np.ndarray], state: OracleState) -> np.ndarray:
-        """K for new hidden layers, scaled, (1 + n_L, d)."""
+        """Return K for new hidden layers, scaled, (1 + n_L, d)."""
         if self.refit is None:
             return state["K"]
         known = state["samples"][: int(state["sampled"][0])]
         if not len(known):
             return state["K"]
-        windows, h = self._taken_apart(known)
+        windows, h = self._windows_and_labels(known)
         return refit(state["K"], self.net.features_of(hidden, windows), h, self.refit.ridge, self.bounds)
 
-    def _taken_apart(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Windows of pairs, (n, k, d + m), and labels, (n, d), of remembered samples, (n, row)."""
+    def _windows_and_labels(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the windows of pairs, (n, k, d + m), and the labels, (n, d), of stored samples, (n, row)."""
         d, m = self.net.d, self.net.m
         return samples[:, :-d].reshape(len(samples), self.net.pairs, d + m), samples[:, -d:]

@@ -1,4 +1,4 @@
-"""The operations of `network_model.operations`, in CasADi for the solver and in numpy for the adaptation."""
+"""The operations of `network_model.operations` in CasADi, for the solver, and in numpy, for adaptation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ACTIVATIONS: dict[Activation, _Activation] = {
 
 
 class Symbols:
-    """CasADi: a value is (n, points), a layer the pair of its bias (n,) and its weights transposed (n, n_a)."""
+    """CasADi operations. A value is (n, points); a layer is its bias (n,) and its transposed weights (n, n_a)."""
 
     def affine(self, layer: tuple[ca.MX, ca.MX], a: ca.MX) -> ca.MX:
         bias, weights = layer
@@ -54,7 +54,7 @@ class Symbols:
 
 
 class Numbers:
-    """numpy: a value is (n,), or (points, n) for many; a layer is (1 + n_a, n), its bias first."""
+    """numpy operations. A value is (n,), or (points, n) for several; a layer is (1 + n_a, n) with the bias first."""
 
     def affine(self, layer: np.ndarray, a: np.ndarray) -> np.ndarray:
         return layer[0] + a @ layer[1:]

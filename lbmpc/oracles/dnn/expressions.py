@@ -2,8 +2,8 @@
 
     h_hat(x, u) = s * K' phi_j(x, u),    phi_j = (1, psi_L[W_{L-1}' (1, psi_{L-1}[ ... (1, (x, u) / scale)])])
 
-(e:NN_structure), or another architecture on a window of the last k pairs. `network_model.description` describes it;
-the trainer builds the same function in torch.
+This is (e:NN_structure), or another architecture on a window of the last k pairs. `network_model.description` describes
+the network, and the trainer builds the same function in torch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SYMBOLS, NUMBERS = Symbols(), Numbers()
 
 
 class NetworkExpressions(Oracle):
-    """The half of the network oracle that has no memory.
+    """The part of the network oracle that has no memory.
 
     Args:
         description: sizes, activations and scaling.
@@ -45,7 +45,7 @@ class NetworkExpressions(Oracle):
     def split(self, theta: ca.MX) -> list[ca.MX]:
         parts, start = [], 0
         for rows, columns in self.shapes:
-            # theta holds each matrix row by row, CasADi reshapes column by column: this is W', biases first.
+            # theta is row-major and CasADi reshapes column-major, so this is W' with the biases first.
             transposed = ca.reshape(theta[start : start + rows * columns], columns, rows)
             parts += [transposed[:, 0], transposed[:, 1:]]
             start += rows * columns
@@ -55,7 +55,7 @@ class NetworkExpressions(Oracle):
         return SYMBOLS.affine((parts[-2], parts[-1]), self.activation(su, parts)) * self.output_scale
 
     def activation(self, su: ca.MX, parts: list[ca.MX]) -> ca.MX:
-        """phi without its leading 1, (n_L, n), of n points (s, u) at once, (D + m, n)."""
+        """Return phi without its leading 1, (n_L, n), for n points (s, u) at once, (D + m, n)."""
         layers = list(zip(parts[:-2:2], parts[1:-2:2], strict=True))
         return self._architecture.forward(SYMBOLS, self._sizes, layers, self._window(su))
 
@@ -63,14 +63,14 @@ class NetworkExpressions(Oracle):
         return self._forward_mode(su, parts) if self._dense else self._reverse_mode(su, parts)
 
     def _window(self, su: ca.MX) -> list[ca.MX]:
-        """The network's input pair by pair, scaled, from points (s, u), (D + m, n)."""
+        """Return the network's scaled input, pair by pair, from points (s, u), (D + m, n)."""
         start = self.d + remembered(self)
         ordered = ca.vertcat(su[self.d : start, :], su[: self.d, :], su[start:, :]) if self.pairs > 1 else su
         scaled = ordered / np.tile(self.input_scale, self.pairs)
         return ca.vertsplit(scaled, self.d + self.m) if self.pairs > 1 else [scaled]
 
     def _reverse_mode(self, su: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        """Any architecture: one sweep back for each entry of h_hat, for all points at once."""
+        """Compute the Jacobians for any architecture, with one reverse sweep per entry of h_hat for all points."""
         rows, points = su.shape
         symbols = [ca.MX.sym("su", rows, points), *(ca.MX.sym("part", *part.shape) for part in parts)]
         h = self.value(symbols[0], symbols[1:])
@@ -80,10 +80,10 @@ class NetworkExpressions(Oracle):
         return [ca.reshape(column, rows, self.d).T for column in ca.horzsplit(gradients)]
 
     def _forward_mode(self, xu: ca.MX, parts: list[ca.MX]) -> list[ca.MX]:
-        """Dense layers on one pair, where (x, u) is hardly longer than h: the fewest products of all."""
+        """Compute the Jacobians for dense layers on one pair. (x, u) is short then, so this is cheapest."""
         points, variables = xu.shape[1], self.d + self.m
         activation = xu / self.input_scale
-        # All directions and all points side by side: each layer is one matrix product.
+        # All directions and points side by side make each layer a single matrix product.
         tangent: ca.MX | None = None
         psis = [ACTIVATIONS[name] for name in self.description.activations]
         for bias, weights, psi in zip(parts[:-2:2], parts[1:-2:2], psis, strict=True):
@@ -99,19 +99,19 @@ class NetworkExpressions(Oracle):
         return by_point(ca.horzsplit(parts[-1] @ tangent * self.output_scale, points))
 
     def hidden(self, state: OracleState) -> list[np.ndarray]:
-        """W_1..W_{L-1} of an oracle's state."""
+        """Return W_1..W_{L-1} of an oracle's state."""
         return [state[name] for name in self._hidden]
 
     def named(self, hidden: Sequence[np.ndarray]) -> OracleState:
-        """Hidden layers as entries of an oracle's state."""
+        """Return hidden layers as entries of an oracle's state."""
         return dict(zip(self._hidden, hidden, strict=True))
 
     def pack(self, hidden: list[np.ndarray], K: np.ndarray) -> np.ndarray:
-        """theta from hidden layers and scaled output weights K, (1 + n_L, d)."""
+        """Return theta for hidden layers and scaled output weights K, (1 + n_L, d)."""
         return np.concatenate([matrix.ravel() for matrix in (*hidden, K)])
 
     def features_of(self, hidden: Sequence[np.ndarray], window: np.ndarray) -> np.ndarray:
-        """phi of a window, (k, d + m), oldest pair first, under hidden layers; or of many, (points, k, d + m)."""
+        """Return phi of a window, (k, d + m), oldest pair first, or of many windows, (points, k, d + m)."""
         pairs = list(np.moveaxis(window / self.input_scale, -2, 0))
         activation = self._architecture.forward(NUMBERS, self._sizes, hidden, pairs)
         return np.concatenate([np.ones((*activation.shape[:-1], 1)), activation], axis=-1)

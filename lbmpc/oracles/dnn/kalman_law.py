@@ -1,18 +1,18 @@
 """The last layer as Bayesian linear regression: a Kalman filter for its weights, projected in its own norm.
 
-Every label is h = K' phi with an error of variance r, in units of the output scale; that is the same for all columns of
-K, so they share one covariance Sigma. r is the configured variance, for what the features cannot explain, and the
-largest of those that come with the label: r_t below is at least r.
+Every label is h = K' phi with an error of variance r, in units of the output scale. The variance is the same for all
+columns of K, so they share one covariance Sigma. r_t below is the configured variance r, which covers the error of the
+features, plus the largest variance of the label; it is at least r.
 
     s_t = r_t + phi' Sigma_t phi
     Kbar_{t+1} = K_t - Sigma_t phi xtilde_{t+1}' / s_t,    Sigmabar_{t+1} = Sigma_t - Sigma_t phi phi' Sigma_t / s_t
     Sigma_{t+1} = a Sigmabar_{t+1} + (1 - a) p I,          Sigma_0 = p I
     K_{t+1}^(i) = argmin (k - Kbar^(i))' Sigma_{t+1}^-1 (k - Kbar^(i))   over   |k| <= Wbar_i
 
-What is known fades towards the prior p I, with a < 1, so that a plant or features that change are followed. It also
-keeps Sigma above (1 - a) p I: rounding cannot make it indefinite.
+Past information decays towards the prior p I, with a < 1, so that changes of the plant or of the features are followed.
+The decay also keeps Sigma above (1 - a) p I, so rounding cannot make it indefinite.
 
-**Counterpart of Lemma 1.** For any W* with |W*^(i)| <= Wbar_i and any features, those of changing hidden layers too,
+**Counterpart of Lemma 1.** For any W* with |W*^(i)| <= Wbar_i and any features, also those of changing hidden layers,
 let eps_t = h(x_t, u_t) - W*' phi and V_t = trace (K_t - W*)' Sigma_t^-1 (K_t - W*). Then
 
     (i)    s_t <= r_t + p |phi|^2
@@ -23,11 +23,12 @@ Proof. Completing the square in k, with Sigmabar^-1 = Sigma_t^-1 + phi phi' / r_
 
     (k - k_t)' Sigma_t^-1 (k - k_t) + (h - k' phi)^2 / r_t  =  (k - kbar)' Sigmabar^-1 (k - kbar) + xtilde^2 / s_t.
 
-At k = W* the first term is V_t, the second |eps|^2 / r_t, the third V of Kbar in the norm of Sigmabar^-1. From
-Sigmabar <= Sigma_t <= p I follows Sigmabar <= Sigma_{t+1} <= p I: (i), and the norm of Sigma_{t+1}^-1 is not larger. In
-that norm the projection onto a convex set which contains W* brings nothing farther from W*: (ii). The sum is (iii).
+At k = W* the first term is V_t, the second |eps|^2 / r_t, and the third V of Kbar in the norm of Sigmabar^-1. From
+Sigmabar <= Sigma_t <= p I follows Sigmabar <= Sigma_{t+1} <= p I, hence (i), and the norm of Sigma_{t+1}^-1 is not
+larger. In that norm, projection onto a convex set that contains W* does not increase the distance from W*, hence (ii).
+The sum over t is (iii).
 
-It stays true where hidden layers are adopted, under which K and Sigma are kept.
+The result remains true when hidden layers are adopted, because K and Sigma are kept.
 """
 
 from __future__ import annotations
@@ -46,19 +47,19 @@ NEWTON, CLOSE = 100, 1e-13
 
 @dataclass(frozen=True)
 class Kalman:
-    """The filter's numbers; variances in units of the output scale squared."""
+    """The filter's numbers. Variances are in units of the output scale squared."""
 
     prior_variance: float
-    """p, of each entry of K before the first sample."""
+    """p, the variance of each entry of K before the first sample."""
     label_variance: float
-    """r, of each entry of a label, besides what comes with it."""
+    """r, the variance of each entry of a label in addition to the label's own variance."""
     kept: float
-    """a, the share of what is known that one sample later still counts, 0 < a < 1."""
+    """a, the share of past information that is kept per sample, 0 < a < 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class KalmanLaw(AdaptationLaw):
-    """Sigma, (f, f), is remembered beside K."""
+    """The Kalman law. Its memory beside K is Sigma, (f, f)."""
 
     filter: Kalman
     bounds: np.ndarray
@@ -89,7 +90,7 @@ class KalmanLaw(AdaptationLaw):
         Sigma = memory["Sigma"]
         along = Sigma @ phi
         s = settings["label_variance"] + ca.mmax(variance) + ca.dot(phi, along)
-        # The product of one vector with itself is symmetric to the last bit, and so is Sigma for ever.
+        # The product of a vector with itself is exactly symmetric, so Sigma stays exactly symmetric.
         root = along / ca.sqrt(s)
         less = settings["kept"] * (Sigma - root @ root.T)
         return {
@@ -105,15 +106,17 @@ class KalmanLaw(AdaptationLaw):
 
 
 def nearest_within(K: np.ndarray, Sigma: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Every column of K, (f, d), that exceeds its bound, (d,), brought onto it, nearest in the norm of Sigma^-1.
+    """Project every column of K, (f, d), onto its bound, (d,), in the norm of Sigma^-1.
 
         k = (I + lambda Sigma)^-1 kbar,    |k| = bound
 
-    The equation for lambda > 0 is that of a trust region (Moré and Sorensen 1983): Newton's method on 1 / |k| comes
-    from the left and never passes the root.
+    The equation for lambda > 0 is that of a trust region (Moré and Sorensen 1983). Newton's method on 1 / |k|
+    approaches the root from the left and does not pass it.
 
     Args:
+        K: columns within their bounds are not changed.
         Sigma: symmetric and positive definite, (f, f).
+        bounds: Wbar_i, (d,).
     """
     variances, axes = np.linalg.eigh(Sigma)
     variances = np.maximum(variances, np.finfo(float).eps * variances[-1])
@@ -127,6 +130,6 @@ def nearest_within(K: np.ndarray, Sigma: np.ndarray, bounds: np.ndarray) -> np.n
                 break
             slope = shrunk @ (shrunk * variances / (1.0 + multiplier * variances))
             multiplier += (norm / bound - 1.0) * norm**2 / slope
-        # What is left is rounding.
+        # The remaining difference is rounding.
         nearest[:, i] = axes @ shrunk * min(1.0, bound / norm)
     return nearest

@@ -1,6 +1,6 @@
-"""The network's two calls in every tick beside the solver's, as CasADi functions: estimate h, and learn one sample.
+"""The network's two functions in every tick beside the solver's, in CasADi: estimate h, and learn one sample.
 
-They could be compiled, and then cost a fifth of what numpy takes for so few numbers.
+They can be compiled. A compiled call takes a fifth of the time of numpy on arrays this small.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from lbmpc.oracles.dnn.expressions import NetworkExpressions
 
 
 class LastLayer:
-    """h_hat = s * K' phi and a law of adaptation, on arrays that stay in place.
+    """h_hat = s * K' phi and an adaptation law, on fixed arrays.
 
     Args:
         net: the network.
-        law: how K learns.
+        law: the adaptation law of K.
         realise: may compile the functions.
     """
 
@@ -37,7 +37,7 @@ class LastLayer:
     def estimate(
         self, hidden: Sequence[np.ndarray], K: np.ndarray, x: np.ndarray, past: np.ndarray, u: np.ndarray
     ) -> np.ndarray:
-        """h_hat, (d,), in units of h, at x (d,) and u (m,), after the pairs `past`, ((k - 1) (d + m),)."""
+        """Return h_hat, (d,), in units of h, at x (d,) and u (m,) with the past pairs `past`, ((k - 1) (d + m),)."""
         self._load(self._estimate, hidden, K, x, past, u)
         self._estimate()
         return self._estimate.outputs["h_hat"][:, 0].copy()
@@ -52,9 +52,9 @@ class LastLayer:
         h: np.ndarray,
         variance: Variance = 0.0,
     ) -> OracleState:
-        """K, (1 + n_L, d), and what the law remembers beside it, after the label h (d,) of the same, with its variance.
+        """Return K, (1 + n_L, d), and the law's memory after the label h, (d,), with its variance.
 
-        state: has both from before.
+        state: contains K and the law's memory before the label.
         """
         self._load(self._learn, hidden, state["K"], x, past, u)
         self._learn.inputs["h"][:, 0] = h
@@ -65,7 +65,7 @@ class LastLayer:
         after = self._learn.outputs
         learned: OracleState = {"K": after["K_next"].T.copy()}
         for name in self._law.remembers:
-            # Symmetric, so that rows may stand for columns: a keyframe holds arrays row by row.
+            # The arrays are symmetric, so the transpose gives row-major arrays for a keyframe.
             learned[name] = after[f"{name}_next"].T.copy()
         return self._law.bounded(learned)
 
@@ -78,7 +78,7 @@ class LastLayer:
         past: np.ndarray,
         u: np.ndarray,
     ) -> None:
-        # They change at an adoption and are never written to, so the same arrays are the same numbers.
+        # Layers change at an adoption only and are never written to, so identical arrays have identical values.
         if len(self._hidden) != len(hidden) or not all(map(is_, self._hidden, hidden)):
             packed = np.concatenate([layer.ravel() for layer in hidden])
             for each in (self._estimate, self._learn):
@@ -92,9 +92,9 @@ class LastLayer:
 
 
 def build_last_layer(net: NetworkExpressions, law: AdaptationLaw) -> tuple[ca.Function, ca.Function]:
-    """`estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, variance, the law's) -> K_next and the law's.
+    """Build `estimate` (su, hidden, K) -> h_hat and `learn` (su, hidden, K, h, variance, ...) -> (K_next, ...).
 
-    K is (d, 1 + n_L) there.
+    The dots stand for the law's settings and memory. K has the shape (d, 1 + n_L) here.
     """
     features, d = net.description.features, net.d
     su = ca.MX.sym("su", d + (net.pairs - 1) * (d + net.m) + net.m)

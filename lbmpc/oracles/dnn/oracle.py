@@ -1,4 +1,4 @@
-"""The network oracle: hidden layers from the trainer, last layer adapted at every sample."""
+"""The network oracle: the trainer sends the hidden layers, and the last layer is adapted at every sample."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lbmpc.oracles.dnn.trial import Trial, empty, only, remember
 from network_model.description import NetworkDescription, hash_layers, initial_hidden
 
 Start = Literal["random", "zero", "pretrained"]
-"""K_0: drawn with `initial_scale`; all zero; or drawn, then fitted to h = 0, the middle of W, all over X x U."""
+"""Kinds of K_0: random with `initial_scale`; zero; or random and then fitted to h = 0 over X x U."""
 PRETRAINING, PRETRAINING_RIDGE = 2000, 1e-4
 NOTHING = np.zeros(0)
 
@@ -29,15 +29,15 @@ class DnnOracle(NetworkExpressions):
 
     Args:
         description: sizes, activations and scaling.
-        gamma: learning rate of the last layer under the gradient law; 0: it stays as it is.
-        column_bound: Wbar_i, (d,), in units of h; a number counts for every column.
+        gamma: learning rate of the last layer under the gradient law; 0 keeps it constant.
+        column_bound: Wbar_i, (d,), in units of h, or one number for every column.
         initial_scale: standard deviation of the entries of each column of K_0, likewise.
-        start: how K_0 comes about.
-        refit: what happens to K when hidden layers are adopted; None: it is kept.
-        trial: what hidden layers must show before and after they are adopted; None: nothing.
-        kalman: the last layer learns by this filter; None: by the gradient law.
-        evidence: what is learned weighs in the prediction as much as noisy labels bear out, and this filters the
-            constant beside the network; None: the network alone counts, and whole, as exact labels let it.
+        start: kind of K_0.
+        refit: settings for the fit of K when hidden layers are adopted; None keeps K.
+        trial: settings of the trial of hidden layers before and after their adoption; None for no trial.
+        kalman: the filter by which the last layer learns; None for the gradient law.
+        evidence: the filter of the constant beside the network, for noisy labels. Network and constant are then
+            weighted by how well labels confirm them. With None, as for exact labels, the network alone counts.
     """
 
     name = "dnn"
@@ -87,7 +87,7 @@ class DnnOracle(NetworkExpressions):
         return state
 
     def _first_K(self, hidden: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-        """K_0, scaled, (1 + n_L, d)."""
+        """Return K_0, scaled, (1 + n_L, d)."""
         drawn = rng.standard_normal(self.shapes[-1]) * (self.initial_scale / self.output_scale)
         if self.start == "zero":
             return np.zeros_like(drawn)
@@ -114,7 +114,7 @@ class DnnOracle(NetworkExpressions):
         return self.pack(self.hidden(state), self._counting(state))
 
     def compile(self, realise: Realise) -> None:
-        """Let `realise` turn what every tick calls into something faster; the virtual machine runs it otherwise."""
+        """Replace the functions that every tick calls by `realise` of them; CasADi interprets them otherwise."""
         self._last_layer = LastLayer(self, self.law, realise)
 
     def estimate(self, state: OracleState, x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ class DnnOracle(NetworkExpressions):
         return super().weights(state) if self.evidence is None else weights(state)
 
     def _counting(self, state: OracleState) -> np.ndarray:
-        """K as it counts in the prediction, (1 + n_L, d)."""
+        """Return K with its weight in the prediction, (1 + n_L, d)."""
         return state["K"] if self.evidence is None else counting(state, state["K"], self.output_scale)
 
     def _every_tick(self) -> LastLayer:
@@ -165,5 +165,5 @@ class DnnOracle(NetworkExpressions):
         return self._last_layer
 
     def _before(self, state: OracleState) -> np.ndarray:
-        """The pairs before the present one, one after the other, ((k - 1) (d + m),)."""
+        """Return the pairs before the present one as one vector, ((k - 1) (d + m),)."""
         return state["past"].ravel() if self.pairs > 1 else NOTHING

@@ -1,8 +1,8 @@
-"""The network that an adopted set replaced, kept until the set is confirmed: part of an oracle's state.
+"""The reference network for a rollback: the network before an adoption. It is part of an oracle's state.
 
-A set that is adopted while another one is still watched does not take that one's place as the reference, or a row of
-sets, each a little worse than the one before, would be compared with its like only. The reference moves on when it is a
-whole window old and what is in use has been in use for a part of one.
+A set adopted while another one is still under observation does not turn that one into the reference. Otherwise, in a
+sequence of sets that each are slightly worse than the last, every set would be compared with a similar one. The
+reference changes when it is a whole window old and the set in use has been in use for part of a window.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import numpy as np
 from lbmpc.oracles.dnn.trial import State, Trial
 
 SETTLED = 0.35
-"""Share of a window for which a set must have been in use to become the reference: a trainer sends two or three sets in
-that time, whoever sends more is measured against what was there before them."""
-# Entries of `watch`, in samples seen: 1 while it is on; when the reference was left; when the set in use was adopted;
-# when it is confirmed; the reference's version.
+"""Share of a window for which a set must be in use to become the reference. A trainer sends two or three sets in that
+time. More frequent sets are compared with the network before them."""
+# Entries of `watch`, in samples seen: 1 while a set is under observation; end of the reference's use; adoption of the
+# set in use; time of its confirmation; version of the reference.
 ON, SINCE, ADOPTED, UNTIL, VERSION = range(5)
 
 
 def nothing(hidden: list[np.ndarray], last: State) -> State:
-    """Nothing to be confirmed; last: K and what its law remembers beside it."""
+    """Return the entries without a reference; `last` is K and the law's memory."""
     entries: State = {f"before.W{i + 1}": np.zeros(layer.shape, np.float32) for i, layer in enumerate(hidden)}
     entries |= {f"before.{name}": np.zeros(array.shape) for name, array in last.items()}
     entries["adopted.K"] = np.zeros(last["K"].shape)
@@ -29,13 +29,13 @@ def nothing(hidden: list[np.ndarray], last: State) -> State:
 
 
 def adopted(trial: Trial, state: State, hidden: list[np.ndarray], K: np.ndarray) -> State:
-    """What an adoption changes; `state`, `hidden`: from before it, K: what the new set begins with."""
+    """Return the changes by an adoption; `state` and `hidden` are from before it, K is the initial K of the new set."""
     on, left, since_when, _until, version = (int(value) for value in state["watch"])
     now = int(state["seen"][0])
     settled = now - left >= trial.window and now - since_when >= SETTLED * trial.window
     changed: State = {"adopted.K": K}
     if not on or settled:
-        # Hidden layers are float32 values.
+        # Hidden layers have float32 values.
         changed |= {f"before.W{i + 1}": layer.astype(np.float32) for i, layer in enumerate(hidden)}
         changed |= {f"before.{name}": state[name] for name in _last(state)}
         left, version = now, int(state["version"][0])
@@ -44,7 +44,7 @@ def adopted(trial: Trial, state: State, hidden: list[np.ndarray], K: np.ndarray)
 
 
 def due(trial: Trial, state: State) -> bool:
-    """Whether it is time to judge the set in use."""
+    """Return whether the set in use must be judged now."""
     watched = state["watch"].tolist()
     if not watched[ON]:
         return False
@@ -53,38 +53,38 @@ def due(trial: Trial, state: State) -> bool:
 
 
 def ends(state: State) -> bool:
-    """Whether the set in use is confirmed once it has been judged now."""
+    """Return whether the set in use is confirmed after the present judgement."""
     return bool(state["seen"][0] >= state["watch"][UNTIL])
 
 
 def over(state: State) -> State:
-    """What the end of a watch changes."""
+    """Return the changes at the end of an observation."""
     layers = [array for name, array in state.items() if name.startswith("before.W")]
     return nothing(layers, _last(state))
 
 
 def since(state: State) -> int:
-    """Number of the first sample after the reference was left."""
+    """Return the number of the first sample after the reference went out of use."""
     return int(state["watch"][SINCE])
 
 
 def version(state: State) -> int:
-    """The reference's."""
+    """Return the version of the reference."""
     return int(state["watch"][VERSION])
 
 
 def before(state: State, layers: int) -> tuple[list[np.ndarray], State]:
-    """The reference: hidden layers, and the last one with what its law remembered, as they were."""
+    """Return the reference: hidden layers, and the last layer with the law's memory."""
     hidden = [state[f"before.W{i + 1}"].astype(float) for i in range(layers)]
     return hidden, {name: state[f"before.{name}"] for name in _last(state)}
 
 
 def K_adopted(state: State) -> np.ndarray:
-    """K with which the set in use began."""
+    """Return the initial K of the set in use."""
     return state["adopted.K"]
 
 
 def _last(state: State) -> State:
-    """K and what its law remembers beside it: what a reference holds besides hidden layers."""
+    """Return K and the law's memory: the entries of a reference besides the hidden layers."""
     names = [name.removeprefix("before.") for name in state if name.startswith("before.")]
     return {name: state[name] for name in names if not name.startswith("W")}

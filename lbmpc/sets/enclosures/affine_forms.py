@@ -1,6 +1,6 @@
-"""The disturbance of a known plant as an affine form over each of many boxes.
+"""The disturbance of a plant given by equations, as an affine form over each of many boxes.
 
-Each box p = (x, u) in c +- r has the form h(p) in g + G (p - c) with intervals g and G from a validated integration.
+On each box p = (x, u) in c +- r the form is h(p) in g + G (p - c), with intervals g and G from a validated integration.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lbmpc.sets.enclosures.interval import Interval, matrix_product, up
 
 
 class DisturbanceError(ValueError):
-    """The disturbance cannot be bounded as asked; the text says what, where, and what to do."""
+    """The disturbance cannot be bounded as requested. The text says what, where, and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class AffineForms:
 
 
 class Disturbance:
-    """h of one model, over batches of boxes."""
+    """h of one model, evaluated over batches of boxes."""
 
     def __init__(self, model: Model):
         self.model = model
@@ -79,7 +79,7 @@ class Disturbance:
         self.AB = Interval.of(np.hstack([model.A, model.B]))
 
     def forms(self, lower: np.ndarray, upper: np.ndarray) -> AffineForms:
-        """The affine forms of boxes lower, upper (n, q), in deviation coordinates."""
+        """Return the affine forms of the boxes lower, upper (n, q), in deviation coordinates."""
         d = self.model.d
         c = np.clip(0.5 * lower + 0.5 * upper, lower, upper)
         r = np.where(lower == upper, 0.0, np.maximum(up(upper - c), up(c - lower)))

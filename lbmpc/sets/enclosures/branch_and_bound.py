@@ -1,4 +1,4 @@
-"""The maximum of f'h over a region to a tolerance, from above, by branch and bound on affine forms."""
+"""Upper bounds for the maxima of f'h over a region, to a tolerance, by branch and bound on affine forms."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from lbmpc.sets.enclosures.interval import Interval, matrix_product, up
 Progress = Callable[[float], None]
 
 BATCH = 256
-# A region is not cut below this fraction of its width to find out where the plant's equations hold.
+# Smallest share of a region's width at which it is searched for the domain of the plant's equations.
 FINEST = 2.0**-12
 
 
 class BranchAndBound:
     """Branch and bound for the maxima of f'h over a region, for all rows f of `directions` (k, d) at once.
 
-    At any time `upper()` holds: every box ever set aside has left its upper bound in `settled`.
+    `upper()` is valid at any time: every discarded box has left its upper bound in `settled`.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class BranchAndBound:
         self.bound = np.full(k, np.inf)
 
     def run(self, budget: int, progress: Progress | None) -> np.ndarray:
-        """Upper bounds of the maxima, (k,); within the tolerance of them if the budget of boxes sufficed."""
+        """Return upper bounds of the maxima, (k,), within the tolerance if the budget of boxes is large enough."""
         shown = 0.0
         first_gap: np.ndarray | None = None
         while self.row.size and self.evaluated < budget:
@@ -63,7 +63,7 @@ class BranchAndBound:
         if not np.isfinite(result).all():
             name = self.disturbance.model.plant.name
             raise DisturbanceError(
-                f"{name}: after {self.evaluated} boxes the flow is still not enclosed in all of the region; take a "
+                f"{name}: after {self.evaluated} boxes the flow is still not enclosed in the whole region; use a "
                 "smaller region, a shorter period, or a larger budget"
             )
         if progress is not None:
@@ -76,7 +76,7 @@ class BranchAndBound:
         return result
 
     def _allowed(self) -> np.ndarray:
-        # The range seen so far is within the true one: what is allowed is never more than was asked for.
+        # The range found so far lies within the true one, so the allowed error is never too large.
         with np.errstate(invalid="ignore"):
             seen = self.best - self.least
         return np.maximum(self.tolerance * np.where(np.isfinite(seen), seen, 0.0), self.floor)
@@ -91,14 +91,14 @@ class BranchAndBound:
         self.lower, self.upper_corner = self.lower[which], self.upper_corner[which]
 
     def _round(self) -> None:
-        """Evaluate the most promising boxes, and put what is left of each in its place."""
+        """Evaluate the most promising boxes and replace each by its remaining parts."""
         urgency = (self.bound - self.best[self.row]) / self._allowed()[self.row]
         count = min(BATCH, self.row.size)
         chosen = np.argpartition(-urgency, count - 1)[:count]
         rows, lower, upper, parent = (
             a[chosen] for a in (self.row, self.lower, self.upper_corner, self.bound)
         )
-        # Different directions often ask for the same box.
+        # Different directions often need the same box.
         boxes, place = np.unique(np.hstack([lower, upper]), axis=0, return_inverse=True)
         place = place.ravel()
         q = lower.shape[1]
@@ -110,7 +110,7 @@ class BranchAndBound:
         value = matrix_product(Interval.of(f)[:, None, :], mine.g[..., None])[:, 0, 0]
         slope = matrix_product(Interval.of(f)[:, None, :], mine.G)[:, 0, :]
         reach = matrix_product(Interval.of(slope.magnitude())[:, None, :], Interval.of(mine.r)[..., None])
-        # A child lies in its parent, whose bound holds for it too.
+        # A child lies in its parent, so the parent's bound holds for it.
         bound = np.where(proved, up(value.upper + reach.upper[:, 0, 0]), np.inf)
         bound = np.fmin(bound, parent)
         self._learn(rows[proved], value[proved], slope[proved], mine.r[proved])
@@ -120,7 +120,7 @@ class BranchAndBound:
         index = np.arange(len(rows))
         first_high, second_low = high.copy(), low.copy()
         first_high[index, cut], second_low[index, cut] = middle[index, cut], middle[index, cut]
-        # A box that is a single point has one half, itself.
+        # A box that is a single point has only one half, itself.
         point = (low == high).all(axis=1) & proved
         settled = (lower == upper).all(axis=1) & proved
         np.maximum.at(self.settled, rows[settled], bound[settled])
@@ -134,7 +134,7 @@ class BranchAndBound:
             self.upper_corner = np.vstack([self.upper_corner, last[which]])
 
     def _learn(self, rows: np.ndarray, value: Interval, slope: Interval, r: np.ndarray) -> None:
-        """What f'h certainly reaches: in the middle, and in the corner to which the slope points."""
+        """Record values that f'h certainly attains: at the centre, and in the corner along the slope."""
         m = slope.middle()
         sure = np.maximum(np.abs(m) - slope.radius(m), 0.0)
         np.maximum.at(self.best, rows, value.lower + (sure * r).sum(axis=1) * (1 - 1e-12))
@@ -151,7 +151,7 @@ class BranchAndBound:
         proved: np.ndarray,
         rows: np.ndarray,
     ) -> np.ndarray:
-        """The coordinate to halve, (n,): the one whose uncertain slope costs most."""
+        """Return the coordinate to halve, (n,): the one with the largest contribution of its slope's uncertainty."""
         width = self.region.upper - self.region.lower
         relative = (upper - lower) / np.where(width > 0, width, 1.0)
         if not proved.all():
@@ -161,14 +161,13 @@ class BranchAndBound:
         return np.where(proved[:, None], cost, relative).argmax(axis=1)
 
     def _explain(self, lower: np.ndarray, upper: np.ndarray, relative: np.ndarray) -> None:
-        """Go on with boxes (n, q) that are not enclosed only while halving may help: not where a mere point fails."""
+        """Raise `DisturbanceError` for boxes (n, q) without enclosure if halving cannot help, as for single points."""
         c = np.clip(0.5 * lower + 0.5 * upper, lower, upper)
         points = self.disturbance.forms(c, c)
         for i, trouble in enumerate(points.trouble):
             if trouble or relative[i].max() <= FINEST:
                 reason = (
-                    trouble
-                    or f"the flow is enclosed from points, but from no box that is not tiny. {SMALLER}"
+                    trouble or f"the flow is enclosed from points, but only from very small boxes. {SMALLER}"
                 )
                 raise DisturbanceError(nowhere(self.disturbance.model, lower[i], upper[i], reason))
 
@@ -176,6 +175,6 @@ class BranchAndBound:
 def _faces(
     lower: np.ndarray, upper: np.ndarray, slope: Interval, proved: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The face of each box (n, q) that holds the maximum: where f'h is monotone, only an end counts."""
+    """Return the face of each box (n, q) with the maximum: along a monotone coordinate only one end matters."""
     rising, falling = (slope.lower >= 0) & proved[:, None], (slope.upper <= 0) & proved[:, None]
     return np.where(rising, upper, lower), np.where(falling & ~rising, lower, upper)

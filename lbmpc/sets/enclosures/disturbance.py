@@ -1,8 +1,8 @@
-"""Rigorous outer bounds of the disturbance of a known plant,
+"""Rigorous outer bounds of the disturbance of a plant given by equations,
 
     h(x, u) = Phi_T(x + x_e, u + u_e) - x_e - A x - B u        in deviation coordinates,
 
-over boxes of x and u: as a box, as a hull in template directions, and as an affine form per region.
+over boxes of x and u: as a box, as a hull in template directions, or as an affine form per region.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceBound:
-    """For all (x, u) in `region`: h(x, u) - slope_x x - slope_u u lies in conv(vertices)."""
+    """The bound: for all (x, u) in `region`, h(x, u) - slope_x x - slope_u u lies in conv(vertices)."""
 
     region: Region
     slope_x: np.ndarray
@@ -50,12 +50,12 @@ class DisturbanceBound:
 
     @classmethod
     def plain(cls, region: Region, vertices: np.ndarray) -> DisturbanceBound:
-        """A plain W of vertices (k, d)."""
+        """Return a bound without slopes, with vertices (k, d)."""
         d, m = len(region.x_lower), len(region.u_lower)
         return cls(region, np.zeros((d, d)), np.zeros((d, m)), vertices)
 
     def support(self, directions: np.ndarray) -> np.ndarray:
-        """max of f'w over w in conv(vertices) for every row f of `directions` (r, d), rounded up, (r,)."""
+        """Return max of f'w over w in conv(vertices) for every row f of `directions` (r, d), rounded up, (r,)."""
         rows = Interval.of(np.atleast_2d(np.asarray(directions, dtype=float)))
         return matrix_product(rows, Interval.of(self.vertices.T)).upper.max(axis=1)
 
@@ -67,12 +67,13 @@ def bound_box(
     progress: Progress | None = None,
     budget: int = BUDGET,
 ) -> DisturbanceBound:
-    """The smallest box around h over the region, each side within `tolerance` of h's range, never inside it.
+    """Return the smallest box around h over the region. Each side is within `tolerance` of the range of h.
 
-    `progress` is called with the fraction done. After `budget` boxes the bound is what it is then: wider, as rigorous.
+    The box always contains h. `progress` is called with the share of the work that is done. If `budget` boxes are not
+    enough, the bound is wider, and still rigorous.
 
     Raises:
-        DisturbanceError: the region is no region of this plant, or reaches where its equations do not hold.
+        DisturbanceError: the region does not fit this plant, or includes points outside the domain of its equations.
     """
     _check(model, region)
     disturbance = Disturbance(model)
@@ -88,13 +89,14 @@ def bound_hull(
     progress: Progress | None = None,
     budget: int = BUDGET,
 ) -> DisturbanceBound:
-    """A polytope around h over the region, tight in template directions.
+    """Return a polytope around h over the region, tight in template directions.
 
-    directions (k, d) are in units of the half-widths of h's box. By default: 16 in every plane of two components of h
-    that are not negligible (wider than 1e-9 of X's width). The components that are keep their tiny box.
+    directions (k, d) are in units of the half-widths of the box around h. The default is 16 directions in every plane
+    of two components of h that are not negligible (wider than 1e-9 of the width of X). Negligible components keep their
+    box.
 
     Raises:
-        DisturbanceError: as `bound_box`.
+        DisturbanceError: as for `bound_box`.
     """
     _check(model, region)
     disturbance = Disturbance(model)
@@ -107,7 +109,7 @@ def bound_hull(
             f"{model.plant.name}: template directions have the shape {template.shape}; give rows of {model.d} finite "
             "numbers"
         )
-    # A component that is negligible has its own bounds already, whatever direction it is part of.
+    # A negligible component has its own bounds already, so it is removed from the directions.
     template = template[:, live] if live.size else np.zeros((0, 0))
     template = template[np.count_nonzero(template, axis=1) > 1]
     if live.size < 2 or not len(template):
@@ -127,12 +129,13 @@ def bound_hull(
 
 
 def bound_affine(model: Model, regions: Sequence[Region], cuts: int = 2) -> list[DisturbanceBound]:
-    """For every region a slope and a box around what it leaves of h; 2^cuts pieces share the slope.
+    """Return a slope and a box around the remainder of h for every region; 2^cuts parts share the slope.
 
-    The box is of second order in the region's size, its second-order part overestimated by about 1 / 2^cuts.
+    The size of the box is of second order in the size of the region. Its second-order part is overestimated by about
+    1 / 2^cuts.
 
     Raises:
-        DisturbanceError: as `bound_box`, for the first region it holds for.
+        DisturbanceError: as for `bound_box`, for the first such region.
     """
     if not regions:
         return []
@@ -149,10 +152,10 @@ def bound_affine(model: Model, regions: Sequence[Region], cuts: int = 2) -> list
 
 
 def given_box(model: Model, half_widths: np.ndarray, region: Region) -> DisturbanceBound:
-    """The user's own W: |h_i| <= half_widths[i], (d,), claimed for the region and not verified here.
+    """Return a user's W, |h_i| <= half_widths[i], (d,), for the region. It is not verified here.
 
     Raises:
-        DisturbanceError: not d finite numbers that are not negative.
+        DisturbanceError: W does not consist of d finite, nonnegative numbers.
     """
     _check(model, region)
     half = require_half_widths(model, half_widths)
@@ -160,7 +163,7 @@ def given_box(model: Model, half_widths: np.ndarray, region: Region) -> Disturba
 
 
 def require_half_widths(model: Model, half_widths: np.ndarray) -> np.ndarray:
-    """These, (d,). Raises `DisturbanceError`: not d finite numbers that are not negative."""
+    """Return the half-widths, (d,). Raises `DisturbanceError` unless they are d finite, nonnegative numbers."""
     half = np.asarray(half_widths, dtype=float)
     if half.shape != (model.d,) or not np.isfinite(half).all() or (half < 0).any():
         raise DisturbanceError(
@@ -173,7 +176,7 @@ def require_half_widths(model: Model, half_widths: np.ndarray) -> np.ndarray:
 def _extent(
     disturbance: Disturbance, region: Region, tolerance: float, progress: Progress | None, budget: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest value of every component of h, (d,) each, rounded outwards."""
+    """Return the minimum and maximum of every component of h, (d,) each, rounded outwards."""
     d = disturbance.model.d
     floor = np.tile(NEGLIGIBLE * _width_of_x(region), 2)
     search = BranchAndBound(disturbance, region, np.vstack([np.eye(d), -np.eye(d)]), tolerance, floor)
@@ -196,10 +199,10 @@ def _affine(model: Model, region: Region, forms: AffineForms) -> DisturbanceBoun
 def _halve(
     forms: AffineForms, lower: np.ndarray, upper: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each box in two, across the coordinate that widens h's enclosure most (components relative to their own)."""
+    """Halve each box across the coordinate that widens the enclosure of h most, relative per component."""
     cost = (forms.G.upper - forms.G.lower) * forms.r[:, None, :]
     total = cost.sum(axis=2, keepdims=True)
-    # Components that are linear but for rounding have no say.
+    # Components that are linear up to rounding are ignored.
     share = np.where(total > 1e-9 * forms.r.max(axis=1)[:, None, None], cost / np.maximum(total, 1e-300), 0.0)
     cut = share.sum(axis=1).argmax(axis=1)
     index = np.arange(len(lower))
@@ -230,7 +233,7 @@ def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _template(live: np.ndarray, d: int) -> np.ndarray:
-    """ANGLES directions in every plane of two live components, less the axes, which the box has."""
+    """Return ANGLES directions in every plane of two components, without the axes, which the box covers."""
     angles = 2 * np.pi * np.arange(ANGLES) / ANGLES
     angles = angles[np.arange(ANGLES) % (ANGLES // 4) != 0]
     rows = []
@@ -243,13 +246,13 @@ def _template(live: np.ndarray, d: int) -> np.ndarray:
 
 
 def _vertices(rows: np.ndarray, support: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Points (k, n) whose hull contains {w: rows w <= support, low <= w <= high}.
+    """Return points (k, n) whose hull contains {w: rows w <= support, low <= w <= high}.
 
-    Qhull's vertices are rounded. Moving every face outwards by PAD, in units in which the box is [-1, 1]^n and faces
-    have unit normals, adds a ball of radius PAD; if every vertex of that larger polytope is off by less than PAD, the
-    hull of the rounded vertices still contains the smaller one. That they are is checked: every face of the hull,
-    found anew from the rounded vertices, is compared by a linear programme with the smaller polytope. Otherwise the
-    box is returned, which contains it too.
+    Qhull's vertices are rounded. Every face is therefore moved outwards by PAD, in units in which the box is [-1, 1]^n
+    and faces have unit normals. This adds a ball of radius PAD. If every vertex of the larger polytope is off by less
+    than PAD, the hull of the rounded vertices contains the original polytope. A linear programme checks this for every
+    face of the hull, which is computed again from the rounded vertices. If the check fails, the result is the box,
+    which contains the polytope too.
     """
     n = len(low)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -270,7 +273,7 @@ def _vertices(rows: np.ndarray, support: np.ndarray, low: np.ndarray, high: np.n
     points = points[hull.vertices]
     faces = np.unique(np.round(hull.equations, 14), axis=0)
     reach = [-linprog(-face[:n], A_ub=a, b_ub=b, bounds=[(None, None)] * n).fun + face[n] for face in faces]
-    # Half of the ball is left for the rounding of the programmes and of the way back to the plant's units.
+    # Half of the ball is reserved for rounding in the programmes and in the conversion to the plant's units.
     if max(reach) > -0.5 * PAD:
         return _corners(low, high)
     return points * half + middle

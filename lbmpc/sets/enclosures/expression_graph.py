@@ -1,6 +1,6 @@
-"""A plant's equations as elementary operations: read from CasADi, and differentiated without rounding.
+"""A plant's equations as elementary operations, read from CasADi and differentiated without rounding.
 
-CasADi's own derivatives fold constants in floating point.
+CasADi's own derivatives are not used, because they fold constants in floating point.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import casadi as ca
 
 CASADI = {getattr(ca, name): name[3:].lower() for name in dir(ca) if name.startswith("OP_")}
-"""Names of CasADi's instructions."""
+"""Names of CasADi's instructions by number."""
 CONJUGATE = {"sin": "cos", "cos": "sin"}
-"""The series of each needs the other one's."""
+"""Each function needs the series of the other one."""
 
 
 class UnsupportedOperation(ValueError):
-    """The plant's equations use an operation without rigorous series; `leaves`: what it is taken of."""
+    """The plant's equations use an operation without rigorous series; `leaves` are the states and inputs involved."""
 
     def __init__(self, operation: str, leaves: tuple[Node, ...]):
         super().__init__(
@@ -30,7 +30,7 @@ class UnsupportedOperation(ValueError):
 
 @dataclass(frozen=True)
 class Node:
-    """One operation: `number` is a constant's value or an integer exponent, `index` that of a state or an input."""
+    """One operation. `number` is a constant or an integer exponent; `index` is that of a state or an input."""
 
     operation: str
     operands: tuple[int, ...] = ()
@@ -39,7 +39,7 @@ class Node:
 
 
 def leaves(nodes: Sequence[Node], operands: Sequence[int]) -> tuple[Node, ...]:
-    """The states and inputs that some of the nodes depend on, states first."""
+    """Return the states and inputs that some of the nodes depend on, states first."""
     found, seen, pending = set(), set(), list(operands)
     while pending:
         i = pending.pop()
@@ -52,7 +52,7 @@ def leaves(nodes: Sequence[Node], operands: Sequence[int]) -> tuple[Node, ...]:
 
 
 class Graph:
-    """Elementary operations in the order of evaluation; equal operations are stored once."""
+    """Elementary operations in order of evaluation. Equal operations are stored once."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -77,7 +77,7 @@ class Graph:
         return self.add(Node("add", (a, b)))
 
     def times(self, a: int, b: int) -> int:
-        """a b; powers of one quantity are kept as powers, which are tight where products are not."""
+        """Return the node of a b. Products of one quantity become powers, whose enclosures are tight."""
         one = Node("constant", number=1.0)
         if self.nodes[a] == one:
             return b
@@ -101,7 +101,7 @@ class Graph:
         return self.add(Node("div", (a, b)))
 
     def function(self, operation: str, a: int) -> int:
-        """sqrt, exp, log, sin, cos, tanh or neg; with it what its series needs."""
+        """Return the node of sqrt, exp, log, sin, cos, tanh or neg, and add the nodes that its series needs."""
         result = self.add(Node(operation, (a,)))
         if operation in CONJUGATE:
             self.add(Node(CONJUGATE[operation], (a,)))
@@ -110,10 +110,10 @@ class Graph:
         return result
 
     def read(self, function: ca.Function) -> list[int]:
-        """Nodes of the outputs of f(x, u).
+        """Return the nodes of the outputs of f(x, u).
 
         Raises:
-            UnsupportedOperation: an operation that has no series here; the text names it.
+            UnsupportedOperation: an operation has no series here. The text names it.
         """
         work: dict[int, int] = {}
         outputs: dict[int, int] = {}
@@ -166,11 +166,11 @@ class Graph:
         return self.function("exp", self.times(b, self.function("log", a)))
 
     def leaves(self, operands: Sequence[int]) -> tuple[Node, ...]:
-        """The states and inputs that these nodes depend on, states first."""
+        """Return the states and inputs that these nodes depend on, states first."""
         return leaves(self.nodes, operands)
 
     def derivative(self, output: int, seed: int) -> int | None:
-        """Node of d(output)/d(seed); None where it is zero by structure."""
+        """Return the node of d(output)/d(seed); None if it is structurally zero."""
         known: dict[int, int | None] = {seed: self.constant(1.0)}
 
         def of(i: int) -> int | None:
@@ -220,7 +220,7 @@ class Graph:
         raise AssertionError(node.operation)
 
     def total(self, terms: Sequence[int | None]) -> int | None:
-        """Sum of what is not zero by structure."""
+        """Return the sum of the terms that are not structurally zero."""
         present = [term for term in terms if term is not None]
         if not present:
             return None

@@ -1,12 +1,12 @@
-"""Validated integration: where a plant's flow takes a box of states and inputs in one period, and its derivative.
+"""Validated integration: enclosures of a plant's flow over one period, and of its derivative, for boxes of x and u.
 
 Each step has three parts (Nedialkov, Jackson and Corliss 1999). A box E that no trajectory leaves during the step is
-guessed and *proved* by one inclusion. Taylor coefficients over the starting set give the polynomial, the one over E its
-remainder. The sets are then carried in mean-value form,
+guessed and *proved* by one inclusion. The Taylor coefficients over the starting set give the polynomial, and the one
+over E gives the remainder. The sets are then propagated in mean-value form,
 
     Phi_t(p) in Phi_t(c) + D_t (p - c),    D_t an enclosure of dPhi_t/dp over the whole initial box p = (x, u),
 
-with dPhi/dp from the variational equation S' = f_x S + [0, f_u], so that a box is not wrapped again in every step.
+with dPhi/dp from the variational equation S' = f_x S + [0, f_u]. This avoids wrapping the box again in every step.
 """
 
 from __future__ import annotations
@@ -25,47 +25,47 @@ from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product
 from lbmpc.sets.enclosures.series import Tape
 
 ORDERS = 16
-# Norm of f_x times a step: 1.5^16 / 16! = 3e-11, and E shrinks what is left to rounding.
+# Norm of f_x times a step. 1.5^16 / 16! = 3e-11, and E reduces the rest to rounding.
 STEP_NORM = 1.2
 ATTEMPTS = 4
 DOUBLINGS = 3
-# A remainder wider than this, of the state's size and of the box's image, is worth a smaller step.
+# A step is halved if its remainder is wider than this, relative to the state and to the image of the box.
 ROUGH, ROUGH_OF_BOX = 1e-11, 1e-6
 
 
-SMALLER = "Take a smaller region of x and u, or a shorter period"
+SMALLER = "Use a smaller region of x and u, or a shorter period"
 DOMAINS = {
     "sqrt": "its argument must stay above 0",
     "log": "its argument must stay above 0",
-    "a division": "its divisor must not come to 0",
+    "a division": "its divisor must not reach 0",
 }
 
 
 def name_of(plant: Description, leaf: Node) -> str:
-    """What the plant calls a state or an input of its equations."""
+    """Return the plant's name of a state or an input of its equations."""
     return (plant.states if leaf.operation == "state" else plant.inputs)[leaf.index]
 
 
 class NoEnclosure(ArithmeticError):
-    """No box was proved to hold the trajectories of a step, for the boxes of the mask `where`."""
+    """No box was proved to contain the trajectories of a step, for the boxes of the mask `where`."""
 
     def __init__(self, where: np.ndarray):
-        super().__init__("no box could be proved to hold all trajectories")
+        super().__init__("no box could be proved to contain all trajectories")
         self.where = where
 
 
 @dataclass(frozen=True, eq=False)
 class FlowEnclosure:
-    """Where boxes go in one period; n boxes, d states, q = d + m coordinates of p = (x, u)."""
+    """The images of boxes after one period; n boxes, d states, q = d + m coordinates of p = (x, u)."""
 
     end: Interval
-    """(n, d), holds Phi(p) for every p of the box."""
+    """(n, d), contains Phi(p) for every p of the box."""
     centre: Interval
-    """(n, d), holds Phi(c)."""
+    """(n, d), contains Phi(c)."""
     derivative: Interval
-    """(n, d, q), holds dPhi/dp for every p of the box."""
+    """(n, d, q), contains dPhi/dp for every p of the box."""
     trouble: tuple[str, ...]
-    """(n,), empty where the enclosure is proved, else why it is not; its numbers then mean nothing."""
+    """(n,), the reason why there is no proof, with invalid numbers; empty for a proved enclosure."""
 
     @property
     def proved(self) -> np.ndarray:
@@ -83,7 +83,7 @@ class Flow:
         orders: int = ORDERS,
         name_of: Callable[[Node], str] = lambda node: f"{node.operation} {node.index}",
     ):
-        """`name_of`: what a state or an input is called, for messages."""
+        """`name_of` returns the name of a state or an input for messages."""
         self.d, self.m = function.numel_in(0), function.numel_in(1)
         self.period, self.steps, self.orders = period, steps, orders
         self._name_of = name_of
@@ -95,7 +95,7 @@ class Flow:
 
     @classmethod
     def of_plant(cls, plant: Plant, period: float) -> Flow:
-        """As many steps as the plant's linearisation asks for."""
+        """Build the flow with as many steps as the plant's linearisation requires."""
         f = plant.function()
         x, u = ca.SX.sym("x", plant.d), ca.SX.sym("u", plant.m)
         slope = np.abs(
@@ -111,7 +111,7 @@ class Flow:
         return self.d + self.m
 
     def _variational(self, graph: Graph, outputs: list[int]) -> tuple[list[tuple[int, int]], list[int]]:
-        """Which S_ij are not zero by structure, and the nodes of their dS_ij/dt, with S_ij as states d, d + 1, ..."""
+        """Return the structurally nonzero S_ij, and the nodes of dS_ij/dt, with S_ij as states d, d + 1, ..."""
         d, q = self.d, self.q
         slopes = [
             [graph.derivative(f, graph.state(j) if j < d else graph.input(j - d)) for j in range(q)]
@@ -140,7 +140,7 @@ class Flow:
     def enclose(
         self, x: Interval, u: Interval, x_centre: Interval, u_centre: Interval, radii: np.ndarray
     ) -> FlowEnclosure:
-        """The flow of n boxes x (n, d) and u (n, m), about points inside, given as intervals of no or tiny width.
+        """Enclose the flow of n boxes x (n, d) and u (n, m) about inner points, given as (almost) point intervals.
 
         radii (n, q): |p - c| of every p of the box, rounded up.
         """
@@ -178,21 +178,21 @@ class Flow:
         return FlowEnclosure(end, centre, slope, tuple(trouble))
 
     def _trouble(self, error: DomainError | NoEnclosure) -> str:
-        """What failed, of what, and what to do."""
+        """Return the operation that failed, its variables and a remedy."""
         if isinstance(error, NoEnclosure):
             return f"{error}. {SMALLER}"
         names = " and ".join(self._name_of(leaf) for leaf in error.leaves)
         return (
-            f"{error.operation} of an expression in {names or 'constants'} reaches where it is not defined and "
-            f"smooth ({DOMAINS[error.operation]}). Give {names or 'the plant'} bounds that keep away "
-            "from there during the whole period, a smaller region so, or give W yourself (--kind given)"
+            f"{error.operation} of an expression in {names or 'constants'} leaves its domain of definition and "
+            f"smoothness ({DOMAINS[error.operation]}). Give {names or 'the plant'} bounds that keep inside "
+            "this domain during the whole period, use a smaller region, or give W yourself (--kind given)"
         )
 
     def _integrate(
         self, x: Interval, u: Interval, xc: Interval, uc: Interval, radii: np.ndarray, steps: int
     ) -> tuple[Interval, Interval, Interval]:
         n, d, q = x.shape[0], self.d, self.q
-        # The step is an interval too: a period divided by the number of steps is rarely a float.
+        # The step is an interval, because a period divided by the number of steps is rarely a float.
         width = Interval.of(self.period) / float(steps)
         identity = np.broadcast_to(np.hstack([np.eye(d), np.zeros((d, q - d))]), (n, d, q))
         slope = Interval.of(identity)
@@ -209,7 +209,7 @@ class Flow:
         return x, xc, slope
 
     def _step(self, x: Interval, us: list[Interval], width: Interval) -> tuple[Interval, Interval, Interval]:
-        """(x after the step (n, d), its derivative by the state and input at the start (n, d, q), remainder (d, n))."""
+        """Return x after the step (n, d), its derivative by the initial state and input (n, d, q), remainder (d, n)."""
         n, d, q = x.shape[0], self.d, self.q
         one, zero = Interval.of(np.ones(n)), Interval.of(np.zeros(n))
         start = [x[:, i] for i in range(d)] + [one if i == j else zero for i, j in self._pattern]
@@ -225,8 +225,8 @@ class Flow:
             last = self._whole.series([box[i] for i in range(len(start))], us, width, self.orders)
             remainder = last.coefficient(self.orders)
             reached = path + Interval(np.minimum(remainder.lower, 0.0), np.maximum(remainder.upper, 0.0))
-            # Strictly inside: were there a first time at which a trajectory is on the border of the box, it would have
-            # been in the box until then, so Taylor's formula would put it into `reached`, off the border.
+            # Strictly inside proves the box: suppose that a trajectory first reaches the boundary of the box. It was in
+            # the box until then, so Taylor's formula puts it into `reached`, which does not touch the boundary.
             inside = (reached.lower > box.lower) & (reached.upper < box.upper)
             if inside.all():
                 break
@@ -248,14 +248,14 @@ class Flow:
 
 
 def _rough(end: Interval, centre: Interval) -> np.ndarray:
-    """Boxes, (n,), whose remainder is more than rounding and more than a trifle of what the box itself becomes."""
+    """Return the boxes, (n,), whose remainder exceeds rounding and a small share of the box's image."""
     width = centre.upper - centre.lower
     small = ROUGH * (1.0 + centre.magnitude()) + ROUGH_OF_BOX * (end.upper - end.lower)
     return np.asarray((width > small).any(axis=1))
 
 
 def _chain(local: Interval, slope: Interval, d: int) -> Interval:
-    """d(after)/dp from the step's own derivative (n, d, q) and d(before)/dp (n, d, q)."""
+    """Return d(after)/dp from the derivative of the step (n, d, q) and d(before)/dp (n, d, q)."""
     q = slope.shape[-1]
     result = matrix_product(local[:, :, :d], slope)
     return Interval(

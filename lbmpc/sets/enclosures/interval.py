@@ -1,9 +1,9 @@
-"""Interval arithmetic on numpy arrays, rounded outwards.
+"""Interval arithmetic on numpy arrays with outward rounding.
 
-Every operation returns an interval that contains all real results of its operands: for +, -, *, / and sqrt, which
-IEEE 754 rounds to nearest, one step of `nextafter` outwards is enough. numpy documents its exp, log, sin, cos and tanh
-to less than 4 units in the last place; `LIBRARY_ULPS` of them are added here. The names follow IEEE 1788: an interval
-is `lower` <= `upper`, elementwise, and may be unbounded after an overflow; it is never empty.
+Every operation returns an interval that contains all real results for its operands. +, -, *, / and sqrt are rounded to
+nearest by IEEE 754, so one step of `nextafter` outwards is enough. numpy documents errors below 4 units in the last
+place for exp, log, sin, cos and tanh; `LIBRARY_ULPS` units are added here. The names follow IEEE 1788: an interval is
+`lower` <= `upper`, elementwise. It may be unbounded after an overflow, and it is never empty.
 """
 
 from __future__ import annotations
@@ -14,43 +14,43 @@ from typing import Any
 import numpy as np
 
 LIBRARY_ULPS = 8
-# Beyond this the reduction of an angle by multiples of pi is not worth the trouble: sin is then in [-1, 1].
+# Larger angles are not reduced by multiples of pi; sin is then in [-1, 1].
 LARGEST_ANGLE = 1e5
 
 
 class DomainError(ArithmeticError):
-    """An operand reaches where the operation is not defined; `where` is a mask over the batch.
+    """An operand leaves the domain of the operation; `where` is a mask over the batch.
 
-    `leaves` are the states and inputs that the operand depends on, as nodes of the graph, where they are known.
+    `leaves` are the states and inputs that the operand depends on, as nodes of the graph, if they are known.
     """
 
     def __init__(self, operation: str, where: np.ndarray, leaves: tuple[Any, ...] = ()):
-        super().__init__(f"the argument of {operation} leaves the domain where it is defined and smooth")
+        super().__init__(f"the argument of {operation} leaves the domain in which it is defined and smooth")
         self.operation = operation
         self.where = where
         self.leaves = leaves
 
 
 def down(value: Any) -> np.ndarray:
-    """A number below every real number that rounds to `value`."""
+    """Return a number below every real number that rounds to `value`."""
     return np.nextafter(value, -np.inf)
 
 
 def up(value: Any) -> np.ndarray:
-    """A number above every real number that rounds to `value`."""
+    """Return a number above every real number that rounds to `value`."""
     return np.nextafter(value, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """An array of intervals [lower, upper]; both arrays have the same shape, (...)."""
+    """An array of intervals [lower, upper]. Both arrays have the same shape, (...)."""
 
     lower: np.ndarray
     upper: np.ndarray
 
     @classmethod
     def of(cls, value: Any) -> Interval:
-        """The floats themselves, as intervals of no width."""
+        """Return floats as intervals of zero width."""
         if isinstance(value, Interval):
             return value
         array = np.asarray(value, dtype=float)
@@ -64,20 +64,20 @@ class Interval:
         return Interval(self.lower[index], self.upper[index])
 
     def middle(self) -> np.ndarray:
-        """A float inside, near the middle."""
+        """Return a float inside the interval, near its centre."""
         return np.clip(0.5 * self.lower + 0.5 * self.upper, self.lower, self.upper)
 
     def radius(self, middle: np.ndarray | None = None) -> np.ndarray:
-        """The least float known to reach both ends from `middle`, rounded up."""
+        """Return the smallest float known to reach both ends from `middle`, rounded up."""
         m = self.middle() if middle is None else middle
         return np.maximum(up(np.maximum(m - self.lower, self.upper - m)), 0.0)
 
     def magnitude(self) -> np.ndarray:
-        """max |x| over the interval; exact."""
+        """Return max |x| over the interval; exact."""
         return np.maximum(np.abs(self.lower), np.abs(self.upper))
 
     def meet(self, other: Interval) -> Interval:
-        """The intersection of two enclosures of the same quantity, which therefore is not empty."""
+        """Return the intersection of two enclosures of the same quantity, which is never empty."""
         return Interval(np.maximum(self.lower, other.lower), np.minimum(self.upper, other.upper))
 
     def __neg__(self) -> Interval:
@@ -97,7 +97,7 @@ class Interval:
         o = Interval.of(other)
         with np.errstate(invalid="ignore", over="ignore"):
             products = [a * b for a in (self.lower, self.upper) for b in (o.lower, o.upper)]
-        # An end at infinity stands for reals without a bound: zero times any of them is zero.
+        # An infinite end stands for unbounded real numbers, and zero times any of them is zero.
         products = [np.where(np.isnan(p), 0.0, p) if np.isnan(p).any() else p for p in products]
         low = np.minimum(np.minimum(products[0], products[1]), np.minimum(products[2], products[3]))
         high = np.maximum(np.maximum(products[0], products[1]), np.maximum(products[2], products[3]))
@@ -108,7 +108,7 @@ class Interval:
         _require((o.lower > 0) | (o.upper < 0), "a division")
         with np.errstate(over="ignore", invalid="ignore"):
             quotients = [a / b for a in (self.lower, self.upper) for b in (o.lower, o.upper)]
-        if any(np.isnan(q).any() for q in quotients):  # infinity over infinity: say nothing
+        if any(np.isnan(q).any() for q in quotients):  # infinity over infinity: no bound
             everything = np.full(np.broadcast(self.lower, o.lower).shape, np.inf)
             return Interval(-everything, everything)
         low = np.minimum(np.minimum(quotients[0], quotients[1]), np.minimum(quotients[2], quotients[3]))
@@ -128,7 +128,7 @@ class Interval:
         return Interval.of(other) / self
 
     def power(self, exponent: int) -> Interval:
-        """x^n for an integer n >= 0, tight for both signs of x."""
+        """Return x^n for an integer n >= 0, tight for both signs of x."""
         if exponent == 0:
             return Interval.of(np.ones(self.shape))
         if exponent % 2:
@@ -140,7 +140,7 @@ class Interval:
         return Interval(np.maximum(_power(near, exponent, down), 0.0), _power(far, exponent, up))
 
     def sqrt(self) -> Interval:
-        """Asks for x > 0: at zero the root has no derivative, and no flow through it can be followed."""
+        """Return the root of x > 0. At zero it has no derivative, so no flow through zero can be enclosed."""
         _require(self.lower > 0, "sqrt")
         return Interval(np.maximum(down(np.sqrt(self.lower)), 0.0), up(np.sqrt(self.upper)))
 
@@ -164,11 +164,11 @@ class Interval:
         return self._wave(np.cos, 0.0)
 
     def _wave(self, function: Any, top: float) -> Interval:
-        """A function of period 2 pi with its maximum 1 at 2 pi (n + top) and its minimum -1 half a turn later."""
+        """Enclose a function of period 2 pi with maximum 1 at 2 pi (n + top) and minimum -1 half a period later."""
         tame = (self.magnitude() < LARGEST_ANGLE) & (self.upper - self.lower < 6.0)
         low_at, high_at = np.where(tame, self.lower, 0.0), np.where(tame, self.upper, 0.0)
         a, b = function(low_at), function(high_at)
-        # Turns, with far more slack than their rounding has: an extremum too many costs nothing but width.
+        # In turns, with a slack far above rounding. A superfluous extremum only widens the result.
         first, last = low_at / (2 * np.pi) - 1e-9, high_at / (2 * np.pi) + 1e-9
         crest = np.floor(last - top) >= np.ceil(first - top)
         trough = np.floor(last - top - 0.5) >= np.ceil(first - top - 0.5)
@@ -178,7 +178,7 @@ class Interval:
 
 
 def matrix_product(a: Interval, b: Interval) -> Interval:
-    """Matrix product (..., i, j) @ (..., j, k), each entry an enclosure of the exact sum."""
+    """Return the matrix product (..., i, j) @ (..., j, k); each entry encloses the exact sum."""
     terms = Interval(a.lower[..., :, :, None], a.upper[..., :, :, None]) * Interval(
         b.lower[..., None, :, :], b.upper[..., None, :, :]
     )
@@ -189,9 +189,9 @@ def matrix_product(a: Interval, b: Interval) -> Interval:
 
 
 def _power(value: np.ndarray, exponent: int, outwards: Any) -> np.ndarray:
-    """value^exponent rounded by `outwards` at every product; right as |value|^i keeps the sign's monotony."""
+    """Return value^exponent, rounded by `outwards` at every product. It is valid because |value|^i is monotone."""
     size = np.abs(value)
-    # Away from zero is outwards for an upper bound of a positive number and for a lower bound of a negative one.
+    # Outwards is away from zero for an upper bound of a positive or a lower bound of a negative number.
     grow = (value > 0) == (outwards is up)
     result = size
     with np.errstate(over="ignore", under="ignore"):
@@ -202,7 +202,7 @@ def _power(value: np.ndarray, exponent: int, outwards: Any) -> np.ndarray:
 
 
 def _widen(value: np.ndarray, sign: int) -> np.ndarray:
-    """A bound on what a library function returns with an error of a few units in the last place."""
+    """Return a bound for the result of a library function with an error of a few units in the last place."""
     with np.errstate(over="ignore"):
         return value + sign * (np.abs(value) * (LIBRARY_ULPS * 2.3e-16) + 1e-307)
 

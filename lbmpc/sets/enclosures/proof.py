@@ -1,7 +1,7 @@
-"""Proof that a plant's h stays in a given W: for all x and u of a region, h(x, u) - L x - M u in conv(W).
+"""Proof that h of a plant stays in a given W: for all x and u of a region, h(x, u) - L x - M u in conv(W).
 
-By interval arithmetic, with the region cut into boxes until each row of W holds on each of them. Who made W, and how,
-does not matter; the enclosure of the flow is what constructions of W use too.
+The proof uses interval arithmetic. The region is cut into boxes until each row of W holds on each box. The origin of W
+does not matter. The enclosure of the flow is the one that constructions of W also use.
 """
 
 from __future__ import annotations
@@ -19,35 +19,38 @@ from lbmpc.sets.enclosures.branch_and_bound import BATCH, Progress
 from lbmpc.sets.enclosures.interval import Interval, down, matrix_product, up
 
 HAIR = 1e-9
-"""What a row of W may be exceeded by, in lengths scaled by X's half-widths: another processor rounds otherwise."""
+"""Allowed violation of a row of W, scaled by the half-widths of X. Rounding depends on the processor."""
 NARROW = 1e-7
-"""A W that is narrower than this in a state, as a share of X's half-width, is taken for as wide as this there."""
+"""Share of the half-width of X. A smaller width of W in a state is replaced by this one."""
 BUDGET = 100_000
-"""Boxes at most."""
+"""Largest number of boxes."""
 
 
 @dataclass(frozen=True)
 class Proved:
-    """What came of the proof."""
+    """The result of a proof."""
 
     reason: str
-    """Where h is not proved to stay in W; empty where it is everywhere."""
+    """Where h is not proved to stay in W; empty if the proof is complete."""
     beyond: float
-    """How far outside of its W h may still be, as a share of X's half-widths: what HAIR is at W's corners."""
+    """Possible distance of h from its W, as a share of the half-widths of X: the effect of HAIR at the corners of W."""
     boxes: int
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """F w <= b, (k, d) and (k,), which holds in W, and beyond it only `beyond` from it."""
+    """F w <= b, (k, d) and (k,). It holds in W, and no solution is farther than `beyond` from W."""
 
     F: np.ndarray
     b: np.ndarray
     beyond: float
 
     def on(self, forms: AffineForms, slope: np.ndarray) -> tuple[np.ndarray, Interval, np.ndarray]:
-        """Over n boxes, of every row over h - slope p: by how much it is certainly broken in the middle (n, k), its
-        slopes in p (n, k, q), and the room that certainly is left everywhere (n, k); in scaled lengths."""
+        """Evaluate all rows of h - slope p over n boxes, in scaled lengths.
+
+        Returns:
+            The certain violation at the centre (n, k), slopes in p (n, k, q), and the certain slack everywhere (n, k).
+        """
         F, H = Interval.of(self.F), Interval.of(slope)
         middle = forms.g - matrix_product(H, Interval.of(forms.c)[..., None])[..., 0]
         value = matrix_product(F, middle[..., None])[..., 0]
@@ -57,7 +60,7 @@ class _Rows:
 
 
 def _of_certificate(model: Model, said: ModelOf) -> Model:
-    """The model with the very numbers that a certificate has; they may differ in the last digit."""
+    """Return the model with exactly the certificate's numbers, which may differ in the last digit."""
     x_e, u_e = np.array(said.x_e), np.array(said.u_e)
     plant = replace(model.plant, x_e=x_e, u_e=u_e)
     equations = replace(model.require_equations("a proof"), x_e=x_e, u_e=u_e)
@@ -69,16 +72,18 @@ def _of_certificate(model: Model, said: ModelOf) -> Model:
 def prove(
     model: Model, certificate: Certificate, progress: Progress | None = None, budget: int = BUDGET
 ) -> Proved:
-    """Whether h - L x - M u lies in W, in every piece, for all states of X in its box and all inputs allowed there.
+    """Prove that h - L x - M u lies in W, in every piece, for all states of X in its box and all allowed inputs.
 
     Raises:
-        DisturbanceError: nothing is known of the plant's flow from some of them.
+        DisturbanceError: the plant's flow cannot be enclosed from some of them.
     """
     rows: list[_Rows] = []
     for piece in certificate.pieces:
         found = _rows(np.array(piece.W), model.plant.x_scale)
         if found is None:
-            return Proved(f"in piece {piece.name}, W is flat in a direction that is no state's", np.inf, 0)
+            return Proved(
+                f"in piece {piece.name}, W is flat in a direction that is not a state's axis", np.inf, 0
+            )
         rows.append(found)
     work = _Work(_of_certificate(model, certificate.model), certificate, rows)
     while work.left and not work.reason:
@@ -96,7 +101,7 @@ ALL = -1
 
 @dataclass(frozen=True, eq=False)
 class _Boxes:
-    """n boxes: whose piece (n,), for which row of its W or ALL (n,), what share of the piece (n,), corners (n, q)."""
+    """n boxes: piece (n,), row of its W or ALL (n,), share of the piece (n,), corners (n, q)."""
 
     piece: np.ndarray
     row: np.ndarray
@@ -114,19 +119,19 @@ class _Boxes:
 
     @property
     def points(self) -> np.ndarray:
-        """Those of no extent, (n,)."""
+        """Mask of the boxes of zero size, (n,)."""
         return np.asarray((self.lower == self.upper).all(axis=1))
 
 
 class _Work:
-    """Boxes of all pieces on which W is not proved yet, the largest first; each for all rows of its W, or for one."""
+    """Boxes of all pieces without a proof, largest first; each for one row of its W or for all rows."""
 
     def __init__(self, model: Model, certificate: Certificate, rows: list[_Rows]):
         self._disturbance, self._rows = Disturbance(model), rows
         pieces = certificate.pieces
         self._names = [piece.name for piece in pieces]
         self._slopes = [np.hstack([np.array(p.slope_x), np.array(p.slope_u)]) for p in pieces]
-        # A piece lies in X, or `lbmpc.sets.check` refuses it.
+        # A piece lies in X; otherwise `lbmpc.sets.check` refuses it.
         (x_low, x_high), (u_low, u_high) = certificate.model.X, certificate.model.U
         lower = np.array([np.maximum([*p.x_lower, *p.u_lower], [*x_low, *u_low]) for p in pieces])
         upper = np.array([np.minimum([*p.x_upper, *p.u_upper], [*x_high, *u_high]) for p in pieces])
@@ -141,7 +146,7 @@ class _Work:
         return len(self._boxes.piece)
 
     def take(self) -> None:
-        """Look at a batch of boxes; what is not proved on them comes back in halves."""
+        """Evaluate a batch of boxes. Boxes without a proof are halved and added again."""
         boxes, self._boxes = self._boxes[:BATCH], self._boxes[BATCH:]
         forms = self._disturbance.forms(boxes.lower, boxes.upper)
         self.evaluated += len(boxes.piece)
@@ -149,7 +154,7 @@ class _Work:
         for i in np.unique(boxes.piece):
             mine = (boxes.piece == i) & forms.proved
             self._halve_rows(boxes[mine], forms[mine], int(i))
-        # Where nothing is enclosed, across the side that is the longest beside the piece's box.
+        # Boxes without an enclosure are halved across the side that is longest relative to the piece's box.
         rest, trouble = boxes[~forms.proved], [text for text in forms.trouble if text]
         self._require_more_than_points(rest, trouble)
         self._halve(rest, (rest.upper - rest.lower) / self._width[rest.piece])
@@ -165,8 +170,8 @@ class _Work:
             return
         box, row = np.nonzero(asked & ~(room >= 0.0))
         slope, left = slopes[box, row], boxes[box]
-        self._require_more_than_points(left, ["W leaves no room beyond h"] * len(box))
-        # Where a row rises or falls all along a side, its maximum is at that end.
+        self._require_more_than_points(left, ["W has no slack for h"] * len(box))
+        # If a row is monotone along a side, its maximum is at that end.
         low = np.where(slope.lower >= 0.0, left.upper, left.lower)
         high = np.where((slope.upper <= 0.0) & (slope.lower < 0.0), left.lower, left.upper)
         share = left.share / np.bincount(box, minlength=len(boxes.piece))[box]
@@ -184,7 +189,7 @@ class _Work:
         first, second = boxes.upper.copy(), boxes.lower.copy()
         first[index, cut] = second[index, cut] = middle
         share = boxes.share / 2
-        # Behind the others: a large batch costs little more than a small one.
+        # They are added at the end, because a large batch costs little more than a small one.
         for lower, upper in ((boxes.lower, first), (second, boxes.upper)):
             self._boxes = self._boxes.and_(_Boxes(boxes.piece, boxes.row, share, lower, upper))
 
@@ -194,13 +199,13 @@ class _Work:
 
 
 def _rows(W: np.ndarray, half: np.ndarray) -> _Rows | None:
-    """Rows that bound conv(W), of vertices (k, d); None where W is flat in a direction that is no state's."""
+    """Return rows that bound conv(W), with vertices (k, d); None if W is flat off the states' axes."""
     low, high = (W / half).min(axis=0), (W / half).max(axis=0)
     middle, radius = 0.5 * (low + high), 0.5 * (high - low)
     wide = np.flatnonzero(radius > NARROW)
     radius = np.maximum(radius, NARROW)
     d, narrow = len(half), len(half) - len(wide)
-    # The box around W, and in the states where W is wide the faces of its hull.
+    # The box around W, and in the states in which W is wide the faces of its hull.
     F, b = np.vstack([np.eye(d), -np.eye(d)]), np.concatenate([middle + radius, radius - middle])
     if len(wide) > 1:
         try:
@@ -213,7 +218,7 @@ def _rows(W: np.ndarray, half: np.ndarray) -> _Rows | None:
         F, b = np.vstack([F, rows]), np.concatenate([b, ((W / half) @ rows.T).max(axis=0)])
     beyond = 2 * NARROW * np.sqrt(narrow)
     if len(wide):
-        # {F w <= b + HAIR} lies in W blown up about a point inside by HAIR over that point's distance to the rows.
+        # {F w <= b + HAIR} lies in W scaled about an inner point by HAIR over the distance of that point to the rows.
         bounding = np.abs(F[:, wide]).max(axis=1) > 0
         rows = np.column_stack([F[bounding][:, wide], np.ones(bounding.sum())])
         inside = linprog(np.append(np.zeros(len(wide)), -1.0), rows, b[bounding], bounds=(None, None))
@@ -226,6 +231,4 @@ def _rows(W: np.ndarray, half: np.ndarray) -> _Rows | None:
 def _outside(model: Model, piece: str, point: np.ndarray, excess: float) -> str:
     e = np.concatenate([model.plant.x_e, model.plant.u_e])
     x, u = (np.array2string(part, precision=6) for part in np.split(point + e, [model.d]))
-    return (
-        f"in piece {piece}, from x = {x} with u = {u}, h is outside of W by {excess:.3g} of X's half-widths"
-    )
+    return f"in piece {piece}, from x = {x} with u = {u}, h is outside W by {excess:.3g} of X's half-widths"

@@ -1,11 +1,11 @@
 """Taylor series in time of expressions along a flow, with balls as coefficients.
 
-`Tape` runs the operations of a graph order by order for a batch of boxes: if all operands are known to order k, so is
-every result. Time is in units of the step, so that coefficient k already carries the step's k-th power.
+`Tape` runs the operations of a graph order by order for a batch of boxes: from operands known to order k it computes
+the results to order k. Time is in units of the step, so coefficient k contains the k-th power of the step.
 
-Order 0 is an interval operation and tight. Higher orders use balls, middle +- radius: for the sums of products that
-make up a Taylor recurrence they need three plain products where intervals need four products and their extrema, and
-what they lose is of third order in the size of the box.
+Order 0 is an interval operation and tight. Higher orders use balls, middle +- radius. A Taylor recurrence consists of
+sums of products, for which balls need three plain products, and intervals four products and their extrema. The loss is
+of third order in the size of the box.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from lbmpc.sets.enclosures.expression_graph import CONJUGATE, Graph, Node, leaves
 from lbmpc.sets.enclosures.interval import DomainError, Interval
 
-# A sum of up to 40 products of floats, in any order, is off by less than 41 * 2^-53 = 4.6e-15 of the sum of their
-# magnitudes (Higham, Accuracy and Stability, 3.1); DOT is twice that, for the arithmetic on the bound itself. TINY is
-# far more than 40 products can lose by underflow.
+# The error of a sum of up to 40 products of floats, in any order, is below 41 * 2^-53 = 4.6e-15 of the sum of their
+# magnitudes (Higham, Accuracy and Stability, 3.1). DOT is twice that, to cover the arithmetic of the bound itself. TINY
+# is far above the loss of 40 products by underflow.
 MOST_ORDERS = 40
 DOT = 1e-14
 ULP = 2.3e-16
@@ -35,11 +35,11 @@ class Tape:
         self._where = {node: i for i, node in enumerate(self.nodes)}
         self.needed = self._reach()
         self.fixed = self._fixed_in_time()
-        # States that are not read by any equation still have a series.
+        # States that no equation uses also have a series.
         self.states = {node.index: i for i, node in enumerate(self.nodes) if node.operation == "state"}
 
     def partners(self, i: int) -> tuple[int, ...]:
-        """Nodes whose series that of node i needs: its operands, and last, for some, another function of them."""
+        """Return the nodes whose series node i needs: its operands, and for some nodes a related function."""
         node = self.nodes[i]
         if node.operation in CONJUGATE:
             return (*node.operands, self._where[Node(CONJUGATE[node.operation], node.operands)])
@@ -66,10 +66,10 @@ class Tape:
     def series(
         self, x: Sequence[Interval], u: Sequence[Interval], step: Interval, orders: int
     ) -> Coefficients:
-        """Coefficients 0..`orders` of every state, x[i] and u[j] of shape (batch,), in units of `step` seconds.
+        """Return coefficients 0..`orders` of every state; x[i] and u[j] have shape (batch,); time in `step` seconds.
 
         Raises:
-            DomainError: a root, logarithm or division meets what it is not defined for, in some boxes.
+            DomainError: a root, logarithm or division leaves its domain in some boxes.
         """
         return Coefficients(self, x, u, step, orders)
 
@@ -79,13 +79,15 @@ class Coefficients:
 
     def __init__(self, tape: Tape, x: Sequence[Interval], u: Sequence[Interval], step: Interval, orders: int):
         if orders > MOST_ORDERS - 2:
-            raise ValueError(f"{orders} orders asked for, at most {MOST_ORDERS - 2} are rounded rightly")
+            raise ValueError(
+                f"{orders} orders requested; the bounds on rounding hold for at most {MOST_ORDERS - 2}"
+            )
         self.tape, self.orders = tape, orders
         batch = x[0].shape[0]
         d = len(x)
         count = len(tape.nodes)
         self._first: dict[int, Interval] = {}
-        # Nodes first, then the states: a state that is read by an equation shares its node's rows.
+        # Nodes come first, then states. A state that an equation uses shares the rows of its node.
         rows = count + d
         self._m = np.zeros((rows, orders + 1, batch))
         self._r = np.zeros((rows, orders + 1, batch))
@@ -107,12 +109,12 @@ class Coefficients:
                 self._store(self._state[i], k + 1, m, r)
 
     def coefficient(self, k: int) -> Interval:
-        """The k-th coefficient of every state, (states, batch)."""
+        """Return the k-th coefficient of every state, (states, batch)."""
         m, r = self._m[self._state, k], self._r[self._state, k]
         return Interval(np.nextafter(m - r, -np.inf), np.nextafter(m + r, np.inf))
 
     def total(self, remainder: Interval) -> Interval:
-        """All known coefficients and a remainder (states, batch): the states after one step."""
+        """Return the states after one step: all coefficients plus a remainder (states, batch)."""
         result = remainder
         for k in range(self.orders, -1, -1):
             result = result + self.coefficient(k)
@@ -162,7 +164,7 @@ class Coefficients:
         size = np.abs(m)
         self._m[i, k], self._r[i, k], self._abs[i, k] = m, r, size
         self._mag[i, k] = size + r
-        # The rounding of a sum of products rides on the second factor's radius.
+        # The radius of the second factor includes the rounding of a sum of products.
         self._reach[i, k] = r + DOT * size
 
     def _scale(self, i: int, k: int, factor: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +175,7 @@ class Coefficients:
     def _convolve(
         self, a: int, b: int, k: int, lowest: int, highest: int, weights: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """sum of a_j b_{k-j} over lowest <= j <= highest, a_j times weights[j] where given; rounded to be safe."""
+        """Return the sum of a_j b_{k-j} over lowest <= j <= highest, with a_j times weights[j], and its error bound."""
         if highest < lowest:
             return np.zeros(self._batch), np.zeros(self._batch)
         left = slice(lowest, highest + 1)
@@ -189,7 +191,7 @@ class Coefficients:
         return m, r * (1 + 2 * DOT) + TINY
 
     def _advance(self, i: int, k: int) -> None:
-        """Order k >= 1 of node i from the lower orders of everything and order k of its operands."""
+        """Compute order k >= 1 of node i from the lower orders of all nodes and order k of its operands."""
         node = self.tape.nodes[i]
         if node.operation == "state":
             return
@@ -237,7 +239,7 @@ class Coefficients:
         self._store(i, k, m, r)
 
     def _fixed_times(self, a: int, b: int, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """a_0 b_k, where a does not change in time."""
+        """Return a_0 b_k for an a that is constant in time."""
         m = self._m[a, 0] * self._m[b, k]
         r = self._abs[a, 0] * self._r[b, k] + self._r[a, 0] * self._mag[b, k]
         return m, (r + ULP * np.abs(m)) * (1 + DOT) + TINY
@@ -247,7 +249,7 @@ class Coefficients:
         return m, (self._r[a, k] + other[1] + ULP * np.abs(m)) * (1 + DOT) + TINY
 
     def _divide(self, m: np.ndarray, r: np.ndarray, b: int) -> tuple[np.ndarray, np.ndarray]:
-        """(m +- r) / b_0, as an interval division: b_0 does not contain zero, or order 0 would have said so."""
+        """Return (m +- r) / b_0 by an interval division. b_0 does not contain zero; order 0 checked that."""
         quotient = Interval(np.nextafter(m - r, -np.inf), np.nextafter(m + r, np.inf)) / self._first[b]
         middle = quotient.middle()
         return middle, quotient.radius(middle)

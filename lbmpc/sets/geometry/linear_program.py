@@ -1,7 +1,7 @@
-"""scipy's `linprog`, imported when the first linear program is solved.
+"""scipy's `linprog`, imported at the first linear program.
 
-The import takes a third of a second. A controller whose sets are boxes solves none, and one that died is away until it
-has imported everything.
+The import takes a third of a second. A controller whose sets are boxes solves no linear program, and a restarted
+controller is down until all its imports are done.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import Any
 
 
 def linprog(*arguments: Any, **options: Any) -> Any:
-    """`scipy.optimize.linprog`, see there."""
+    """Call `scipy.optimize.linprog`."""
     from scipy.optimize import linprog as solve
 
     return solve(*arguments, **options)
 
 
 def load() -> None:
-    """Import it now: whoever solves in a control loop calls this before the loop."""
+    """Import scipy's solver now. Call it before a control loop that solves linear programs."""
     import scipy.optimize  # noqa: F401

@@ -1,7 +1,7 @@
-"""Set operations on bounded polytopes {x : G x <= g}. Linear programs go to HiGHS, hulls to Qhull.
+"""Set operations on bounded polytopes {x : G x <= g}. HiGHS solves linear programs, Qhull computes hulls.
 
-Every operation works in coordinates scaled by the set's own bounding box, so that states in different units do no harm,
-and names what it cannot work on: empty, unbounded, flat, badly scaled.
+Every operation scales coordinates by the set's own bounding box, so that states can have different units. Sets that are
+empty, unbounded, flat or badly scaled are reported.
 """
 
 from __future__ import annotations
@@ -16,53 +16,53 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
 
-# Relative to the bounding box: below it, a set has no inside that floating-point numbers can tell.
+# Relative to the bounding box. A thinner set has no interior in floating point.
 FLAT = 1e-9
-# Widths of a bounding box further apart than this lose too many digits.
+# Largest ratio of the widths of a bounding box. Larger ones lose too many digits.
 BADLY_SCALED = 1e12
-# Scaled coordinates beyond this count as infinite.
+# Scaled coordinates above this count as infinite.
 FAR = 1e6
 ROWS_AT_ONCE = 400
 JOGGLED = "QJ"
 MOST_DIMENSIONS = 6
-"""Up to here vertices are enumerated; their number grows beyond use above."""
+"""Largest dimension in which vertices are enumerated. In higher dimensions there are too many."""
 
 
 class UnboundedSetError(SetError):
-    """A set that should be bounded is not; the text names the direction."""
+    """A set that must be bounded is not. The text names the direction."""
 
 
 class FlatSetError(SetError):
-    """A set has no inside, only a surface; the text names its thickness."""
+    """A set has no interior. The text gives its thickness."""
 
 
 class BadlyScaledError(SetError):
-    """A set's widths are too far apart for floating-point numbers."""
+    """The widths of a set differ too much for floating point."""
 
 
 class ConvexSet(Protocol):
-    """Whatever has a support function."""
+    """A set with a support function."""
 
     def support(self, directions: np.ndarray) -> np.ndarray:
-        """max f' w over the set for each row f of directions (r, d); (r,)."""
+        """Return max f' w over the set for each row f of directions (r, d); (r,)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A bounded set {x : G x <= g} with an inside: G is (r, d), g (r,). Its rows may be redundant.
+    """A bounded set {x : G x <= g} with an interior: G is (r, d), g (r,). Its rows may be redundant.
 
-    Build it with `body`, which checks and scales; everything here may then rely on it.
+    Build it with `body`, which checks and scales. The methods rely on that.
     """
 
     G: np.ndarray
     g: np.ndarray
     scale: np.ndarray
-    """Half-widths of a box around it, or of whatever it is measured by, (d,)."""
+    """Half-widths of a box around it, or of its scale of measurement, (d,)."""
     centre: np.ndarray
-    """A point well inside, (d,): the Chebyshev centre in scaled coordinates."""
+    """An inner point, (d,): the Chebyshev centre in scaled coordinates."""
     radius: float
-    """Of the largest scaled ball inside, between 0 and about 1."""
+    """Radius of the largest scaled ball inside, between 0 and about 1."""
 
     @property
     def dimension(self) -> int:
@@ -89,23 +89,23 @@ class Body:
 
     @property
     def volume(self) -> float:
-        """In the units of the states multiplied."""
+        """Volume in the product of the units of the states."""
         if self.dimension == 1:
             return float(np.ptp(self.vertices))
         return float(convex_hull(self.vertices / self.scale).volume * np.prod(self.scale))
 
     def contains(self, x: np.ndarray, tolerance: float = 0.0) -> np.ndarray:
-        """Which of the points (..., d) are inside; (...) of bool."""
+        """Return which of the points (..., d) are inside; (...) of bool."""
         return np.asarray((np.asarray(x) @ self.G.T <= self.g + tolerance).all(axis=-1))
 
     def support(self, directions: np.ndarray) -> np.ndarray:
-        """max f' x over the set for each row f of directions (r, d); (r,)."""
+        """Return max f' x over the set for each row f of directions (r, d); (r,)."""
         return np.asarray((np.asarray(directions) @ self.vertices.T).max(axis=-1))
 
     def includes(self, other: Body, tolerance: float = 1e-11) -> bool:
-        """Whether `other` lies inside, each row moved outwards by `tolerance` of its scaled length.
+        """Return whether `other` lies inside, with each row moved outwards by `tolerance` of its scaled length.
 
-        The tolerance covers the rounding of a vertex; what must be proved goes to `lbmpc.sets.check`.
+        The tolerance covers the rounding of a vertex. For a proof, use `lbmpc.sets.check`.
         """
         allowed = self.g + tolerance * np.linalg.norm(self.G * self.scale, axis=1)
         if other.dimension <= MOST_DIMENSIONS:
@@ -115,7 +115,7 @@ class Body:
         )
 
     def reduced(self) -> Body:
-        """The same set without redundant rows, by the hull of the dual points."""
+        """Return the same set without redundant rows, by the hull of the dual points."""
         G, g, c = self._scaled()
         if self.dimension == 1:
             found = [int(np.argmin(np.where(s * G[:, 0] > 0, g / np.abs(G[:, 0]), np.inf))) for s in (1, -1)]
@@ -125,7 +125,7 @@ class Body:
         return Body(self.G[keep], self.g[keep], self.scale, self.centre, self.radius)
 
     def _scaled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit rows, bounds and centre in scaled coordinates."""
+        """Return unit rows, bounds and centre in scaled coordinates."""
         G = self.G * self.scale
         lengths = np.linalg.norm(G, axis=1)
         return G / lengths[:, None], self.g / lengths, self.centre / self.scale
@@ -138,18 +138,18 @@ def body(
     scale: np.ndarray | None = None,
     inside: Body | None = None,
 ) -> Body:
-    """Check {x : G x <= g} and find its scale and a point well inside.
+    """Check {x : G x <= g}, and find its scale and an inner point.
 
     Args:
-        G: (r, d); rows of zeros are dropped where they say nothing.
+        G: (r, d); rows of zeros without effect are dropped.
         g: (r,).
-        what: its name, for messages.
-        scale: half-widths to measure by, (d,); the bounding box's own by default, which takes 2 d linear programs.
-        inside: another set whose centre may serve, which saves a linear program.
+        what: name of the set for messages.
+        scale: half-widths as scale of measurement, (d,); by default those of the bounding box, from 2 d linear
+        programs. inside: another set whose centre may be used, which saves a linear program.
 
     Raises:
-        EmptySetError: holds nothing.
-        UnboundedSetError, FlatSetError, BadlyScaledError: it is not a body.
+        EmptySetError: the set is empty.
+        UnboundedSetError, FlatSetError, BadlyScaledError: the set is not a body.
     """
     G, g = np.asarray(G, dtype=float), np.asarray(g, dtype=float)
     if not (np.isfinite(G).all() and not np.isnan(g).any()):
@@ -157,7 +157,7 @@ def body(
     length = np.linalg.norm(G if scale is None else G * scale, axis=1)
     silent = length <= 1e-14 * max(length.max(initial=0.0), 1e-300)
     if (g[silent] < 0).any():
-        raise EmptySetError(f"{what} is empty: a row asks for 0 <= {g[silent].min():.3g}")
+        raise EmptySetError(f"{what} is empty: a row requires 0 <= {g[silent].min():.3g}")
     keep = ~silent & np.isfinite(g)
     G, g = G[keep], g[keep]
     if scale is None:
@@ -171,18 +171,18 @@ def body(
     if radius <= FLAT:
         raise FlatSetError(
             f"{what} is flat: the largest ball inside has {max(radius, 0.0):.2g} of its width. "
-            "Leave out the state that does not move, or give every constraint some room."
+            "Remove the state that does not move, or widen the constraints."
         )
     return Body(G, g, scale, centre * scale, radius)
 
 
 def body_of(polytope: Polytope, what: str = "the set", scale: np.ndarray | None = None) -> Body:
-    """`body` of a two-sided polytope."""
+    """Return `body` of a two-sided polytope."""
     return body(*polytope.one_sided(), what, scale)
 
 
 def convex_hull(points: np.ndarray) -> ConvexHull:
-    """Qhull, with points moved by a hair where rounding leaves it no consistent answer."""
+    """Return Qhull's hull, with slightly moved points if rounding gives no consistent result otherwise."""
     try:
         return ConvexHull(points)
     except QhullError:
@@ -190,14 +190,14 @@ def convex_hull(points: np.ndarray) -> ConvexHull:
 
 
 def eliminate(G: np.ndarray, g: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fourier-Motzkin: {x : exists y with G (x, y) <= g}, y the last `columns` variables; rows not yet reduced.
+    """Eliminate variables by Fourier-Motzkin: {x : exists y with G (x, y) <= g}, y the last `columns` variables.
 
-    Every pair of a row that bounds y from above with one that bounds it from below gives a row; between two variables
-    the redundant ones are dropped.
+    Every pair of an upper and a lower bound of y gives a row. Redundant rows are dropped between two variables, and not
+    at the end.
     """
     for k in range(columns):
         if k:
-            found = body(G, g, "what is left after eliminating an input").reduced()
+            found = body(G, g, "the set after eliminating an input").reduced()
             G, g = found.G, found.g
         b = G[:, -1]
         rest = np.abs(G[:, :-1]).max(axis=1, initial=0.0)
@@ -213,7 +213,7 @@ def eliminate(G: np.ndarray, g: np.ndarray, columns: int) -> tuple[np.ndarray, n
 
 
 def support_of(G: np.ndarray, g: np.ndarray, direction: np.ndarray) -> float:
-    """max direction' x over {G x <= g} by a linear program; inf where unbounded. Raises `EmptySetError`."""
+    """Return max direction' x over {G x <= g} by a linear program; inf if unbounded. Raises `EmptySetError`."""
     found = linprog(-direction, G, g, bounds=(None, None), method="highs")
     if found.status == 3 or (found.status == 4 and not found.success):
         return float("inf")
@@ -223,7 +223,7 @@ def support_of(G: np.ndarray, g: np.ndarray, direction: np.ndarray) -> float:
 
 
 def _smallest(values: np.ndarray) -> np.ndarray:
-    """Indices of the `ROWS_AT_ONCE` smallest."""
+    """Return the indices of the `ROWS_AT_ONCE` smallest values."""
     if len(values) <= ROWS_AT_ONCE:
         return np.arange(len(values))
     return np.argpartition(values, ROWS_AT_ONCE)[:ROWS_AT_ONCE]
@@ -243,7 +243,7 @@ def _bounding_scale(G: np.ndarray, g: np.ndarray, what: str) -> np.ndarray:
     widest = width.max(initial=0.0)
     if (width <= FLAT * np.maximum(np.abs(high), np.abs(low))).any() or widest <= 0.0:
         i = int(np.argmin(width))
-        raise FlatSetError(f"{what} is flat: variable {i} only ever is {high[i]:.6g}")
+        raise FlatSetError(f"{what} is flat: variable {i} is fixed at {high[i]:.6g}")
     if widest / width.min() > BADLY_SCALED:
         raise BadlyScaledError(
             f"{what} is badly scaled: its widths go from {width.min():.2g} to {widest:.2g}; use other units"
@@ -252,14 +252,14 @@ def _bounding_scale(G: np.ndarray, g: np.ndarray, what: str) -> np.ndarray:
 
 
 def _chebyshev(G: np.ndarray, g: np.ndarray, what: str) -> tuple[np.ndarray, float]:
-    """Centre and radius of the largest ball in {G x <= g}.
+    """Return centre and radius of the largest ball in {G x <= g}.
 
-    Of very many rows only those are shown to the linear program that some earlier answer broke.
+    If there are many rows, the linear program uses only those that an earlier solution violated.
     """
     d = G.shape[1]
     rows = np.column_stack([G, np.linalg.norm(G, axis=1)])
     seen = _smallest(g / rows[:, d])
-    # A box around everything, so that the first answers are bounded; the set itself is inside it or unbounded.
+    # A box around everything keeps the first solutions bounded. The set is inside it, or is unbounded.
     wide = [(-FAR, FAR)] * d + [(None, FAR)]
     while True:
         found = linprog(np.append(np.zeros(d), -1.0), rows[seen], g[seen], bounds=wide, method="highs")

@@ -1,6 +1,6 @@
-"""A trajectory of the true plant from a state into a set, with as much room to X's bounds as there is.
+"""A trajectory of the true plant from a state into a set, with the largest possible distance to the bounds of X.
 
-Only a proposal: nothing is claimed of it. `lbmpc.sets.invariance.regions` builds certified sets around it, or fails to.
+The trajectory is only a proposal. `lbmpc.sets.invariance.regions` tries to build certified sets around it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from lbmpc.sets.constraint_sets import input_set, state_set
 from lbmpc.sets.geometry.operations import Body
 
 STEP_NORM = 0.4
-"""|a| dt of one integration step at most."""
+"""Upper limit of |a| dt per integration step."""
 ENOUGH_ROOM = 0.04
-"""Share of X's half-widths; a longer one is not looked for once one has it."""
+"""Share of X's half-widths. Longer trajectories are not tried once one has this distance."""
 LENGTHS = (10, 20, 40, 60, 90, 140)
 DEPTH = 0.01
-"""How deep inside the set it ends, as a share of X's half-widths."""
+"""Distance of the final state from the boundary of the set, as a share of X's half-widths."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """x (n + 1, d) and u (n, m) in deviation coordinates; `room` is to X's bounds, as a share of its half-widths."""
+    """x (n + 1, d) and u (n, m) in deviations; `room` is the distance to X's bounds as a share of its half-widths."""
 
     x: np.ndarray
     u: np.ndarray
@@ -35,7 +35,7 @@ class Trajectory:
 
 
 def find_trajectory(model: Model, start: np.ndarray, goal: Body) -> Trajectory | None:
-    """From `start`, (d,), into `goal`: the shortest of `LENGTHS` with enough room, else the roomiest, or None."""
+    """Return the shortest trajectory from `start`, (d,), into `goal` with enough room, else the best one, or None."""
     best = None
     for steps in LENGTHS:
         found = _of_length(model, start, goal, steps)
@@ -63,7 +63,7 @@ def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Traje
     opti.subject_to(opti.bounded(0.0, room, 2 * ENOUGH_ROOM))
     lengths = np.linalg.norm(goal.G * half, axis=1)
     opti.subject_to(ca.DM(goal.G) @ x[:, steps] <= goal.g - DEPTH * lengths)
-    # Room first; among those of equal room the one that moves the inputs least.
+    # Maximise the room; among trajectories of equal room minimise the motion of the inputs.
     unit = U.upper - U.lower
     effort = sum(ca.sumsqr((u[:, k + 1] - u[:, k]) / unit) for k in range(steps - 1))
     opti.minimize(-100.0 * room + 0.1 * effort)
@@ -71,15 +71,15 @@ def _of_length(model: Model, start: np.ndarray, goal: Body, steps: int) -> Traje
     opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "max_iter": 200})
     try:
         found = opti.solve()
-    except RuntimeError:  # infeasible, or not converged: there is none of this length
+    except RuntimeError:  # infeasible or not converged: no trajectory of this length
         return None
     xs = np.asarray(found.value(x)).reshape(model.d, -1).T
     return Trajectory(xs, np.asarray(found.value(u)).reshape(model.m, -1).T, float(found.value(room)))
 
 
 def one_period(model: Model) -> ca.Function:
-    """(x, u), deviations -> x after one period, (d,)."""
-    plant = model.require_equations("a way into the sets")
+    """Build (x, u), in deviations, -> x after one period, (d,)."""
+    plant = model.require_equations("a trajectory into the sets")
     f = plant.function()
     x, u = ca.SX.sym("x", model.d), ca.SX.sym("u", model.m)
     steps = max(

@@ -1,12 +1,12 @@
-"""Robust controllable sets along a trajectory into a control invariant set, with h bounded locally.
+"""Robust controllable sets along a trajectory into a control invariant set, with local bounds of h.
 
-In a small cell of states and inputs h is nearly affine, h in slope_x x + slope_u u + W with W of second order in the
-cell's size. Backwards along a trajectory from a state x_0 into the set C, with S_n = C,
+In a small cell of states and inputs h is nearly affine: h in slope_x x + slope_u u + W with W of second order in the
+size of the cell. The sets are computed backwards along a trajectory from a state x_0 into the set C, with S_n = C,
 
     S_i = cell_i with X with {x : there is u in cell_i with (A + slope_x) x + (B + slope_u) u + W in S_{i+1}},
 
-so from every state of S_i the plant is brought into S_{i+1}, and in the end into C, whatever w in W. The family
-C, S_{n-1}, ..., S_0 is robust control invariant, a union of polytopes, and holds x_0 if S_0 does.
+so from every state of S_i the plant can be steered into S_{i+1}, and finally into C, for every w in W. The family C,
+S_{n-1}, ..., S_0 is robust control invariant. It is a union of polytopes, and contains x_0 if S_0 does.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from lbmpc.sets.invariance.approach import Trajectory, find_trajectory
 from lbmpc.sets.invariance.robust_control import UncertainSystem, predecessor
 
 REMAINDERS = (1e-3, 5e-4)
-"""What a cell's W may be, as a share of X's half-widths, tried in turn."""
+"""Allowed sizes of W of a cell, as a share of X's half-widths, tried in turn."""
 SPARE = 2e-5
-"""How much each step promises beyond W, as a share of X's half-widths: room for the checker's rounding."""
+"""Slack of each step beyond W, as a share of X's half-widths, for the rounding of the checker."""
 LARGEST = 0.4
-"""A cell's half-width at most, as a share of that of X and U."""
+"""Largest half-width of a cell as a share of that of X and U."""
 
 
 @dataclass(frozen=True, eq=False)
 class ControllableSet:
-    """S_i with the cell in which its bound of h holds."""
+    """S_i with the cell in which its bound of h is valid."""
 
     set: Body
     bound: DisturbanceBound
@@ -43,15 +43,15 @@ class ControllableSet:
 def controllable_sets(
     model: Model, start: np.ndarray, goal: Body, progress: Callable[[float], None] = lambda done: None
 ) -> list[ControllableSet]:
-    """The sets S_{n-1}, ..., S_0 from next to `goal` back to `start`, (d,); S_0 holds `start`.
+    """Return the sets S_{n-1}, ..., S_0, from the neighbour of `goal` back to the one that contains `start`, (d,).
 
     Raises:
-        SetError: none was found; the text says how far it came.
+        SetError: no such sets were found. The text says how far the construction got.
     """
     trajectory = find_trajectory(model, start, goal)
     if trajectory is None:
         raise SetError(
-            "no way of the true plant from the given state into the invariant set was found that stays inside X"
+            "no trajectory of the true plant was found that leads from the given state into the invariant set inside X"
         )
     trouble = ""
     for remainder in REMAINDERS:
@@ -60,7 +60,7 @@ def controllable_sets(
         except EmptySetError as error:
             trouble = str(error)
     raise SetError(
-        f"a way into the invariant set exists, but no certified sets around it were found: {trouble}"
+        f"a trajectory into the invariant set exists, but no certified sets around it were found: {trouble}"
     )
 
 
@@ -77,14 +77,16 @@ def _along(
             model, target, bounds[i], f"the set {len(trajectory.u) - i} steps before the goal"
         )
         if not target.contains(trajectory.x[i]).all():
-            raise EmptySetError(f"the set {len(trajectory.u) - i} steps before the goal misses the way")
+            raise EmptySetError(
+                f"the set {len(trajectory.u) - i} steps before the goal misses the trajectory"
+            )
         found.append(ControllableSet(target, bounds[i]))
         progress(len(found) / len(trajectory.u))
     return found
 
 
 def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: str) -> Body:
-    """The states of the bound's cell, inside X, from which an input of the cell leads into the target."""
+    """Return the states of the bound's cell, inside X, from which an input of the cell leads into the target."""
     region = bound.region
     X = body_of(state_set(model), "X", model.plant.x_scale)
     inputs = Polytope.box(region.u_lower, region.u_upper, model.plant.inputs)
@@ -96,9 +98,9 @@ def _one_step_into(model: Model, target: Body, bound: DisturbanceBound, what: st
 
 
 def cell_size(model: Model, x: np.ndarray, u: np.ndarray, remainder: float) -> np.ndarray:
-    """Half-widths (d + m,) of a cell about (x, u) in which h is affine to `remainder` of X's half-widths.
+    """Return half-widths (d + m,) of a cell about (x, u) in which h is affine up to `remainder` of X's half-widths.
 
-    From a large cell, that side is halved, again and again, whose halving takes most off the remainder.
+    The search starts with a large cell and repeatedly halves the side that reduces the remainder most.
     """
     half = _half_widths(model)
     size, d = LARGEST * half, model.d
@@ -117,7 +119,7 @@ def cell_size(model: Model, x: np.ndarray, u: np.ndarray, remainder: float) -> n
 
 
 def _region(model: Model, x: np.ndarray, u: np.ndarray, size: np.ndarray) -> Region:
-    """A cell about (x, u), cut to X and U."""
+    """Return a cell about (x, u), intersected with X and U."""
     X, U, d = state_set(model), input_set(model), model.d
     return Region(
         np.maximum(x - size[:d], X.lower),

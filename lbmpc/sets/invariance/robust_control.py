@@ -1,13 +1,13 @@
-"""The maximal robust control invariant set: from each of its states some input keeps the next one in it, whatever w.
+"""The maximal robust control invariant set: from each state some input keeps the next state in the set for every w.
 
 The predecessor iteration (Bertsekas 1972; Blanchini 1999):  C_0 = X,  C_{j+1} = C_j with Pre(C_j), where
 
     Pre(C) = {x : there is u in U with A x + B u + w in C for all w in W}
            = {x : there is u with G (A x + B u) <= g - h_W(G)},  the input eliminated by Fourier-Motzkin.
 
-The iteration runs with W + eps S, S the ball of X's half-widths. As soon as C_j - eps S lies in C_{j+1}, C_{j+1} is
-invariant for W itself: from x in C_{j+1} some u leads into C_j - eps S for every w in W. So it ends, and what it ends
-with is invariant, not nearly.
+The iteration uses W + eps S, where S is the ball of X's half-widths. As soon as C_j - eps S lies in C_{j+1}, C_{j+1} is
+exactly invariant for W: from x in C_{j+1} some u leads into C_j - eps S for every w in W. The iteration therefore ends
+after finitely many steps.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, SetError
 
 WIDE = 1e3
 LEFT_TO_CHECKER = 0.05
-"""How much of the slack an invariant stage leaves, for the rounding of whoever checks it."""
+"""Share of the slack that an invariant stage keeps for the rounding of the checker."""
 COPY_SHARES = tuple(np.arange(0.95, 0.0, -0.05).tolist())
-"""Sizes of the smaller copies that are tried, the largest first."""
+"""Sizes of the smaller copies that are tried, largest first."""
 
 
 @dataclass(frozen=True, eq=False)
 class UncertainSystem:
-    """x+ = A x + B u + w, w in W, u in U; A (d, d), B (d, m)."""
+    """The system x+ = A x + B u + w, w in W, u in U; A (d, d), B (d, m)."""
 
     A: np.ndarray
     B: np.ndarray
@@ -39,7 +39,7 @@ class UncertainSystem:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One step of the iteration; `excess` is how far C_j - eps S still sticks out of C_{j+1}, in scaled lengths."""
+    """One step of the iteration; `excess` is the part of C_j - eps S outside C_{j+1}, in scaled lengths."""
 
     step: int
     set: Body
@@ -55,9 +55,10 @@ class Stage:
 def predecessor(
     target: Body, plant: UncertainSystem, slack: float = 0.0, scale: np.ndarray | float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (G, g) of Pre(target), redundant ones among them; W is widened by slack times the ball of `scale`, (d,).
+    """Return rows (G, g) of Pre(target), which may be redundant; W is enlarged by slack times the ball of `scale`,
+    (d,).
 
-    With several inputs those of a box that is `WIDE` times the target are among them.
+    With several inputs the rows include those of a box of `WIDE` times the size of the target.
     """
     d = target.dimension
     reach = plant.W.support(target.G) + slack * np.linalg.norm(target.G * scale, axis=1)
@@ -69,7 +70,7 @@ def predecessor(
     bounds = [target.g - reach, g_u]
     m = plant.B.shape[1]
     if m > 1:
-        # What is forgotten within a period is bounded by no row of the target; between two inputs bounds are needed.
+        # Rows of the target do not bound directions that decay within a period, but elimination needs bounds.
         box = Polytope.box(target.centre - WIDE * target.scale, target.centre + WIDE * target.scale, ())
         G_box, g_box = box.one_sided()
         parts.append(np.column_stack([G_box, np.zeros((2 * d, m))]))
@@ -80,18 +81,19 @@ def predecessor(
 def predecessor_iteration(
     X: Body, plant: UncertainSystem, slack: float = 3e-4, patience: int = 150, start: Stage | None = None
 ) -> Iterator[Stage]:
-    """The predecessor iteration, stage by stage, until one is invariant.
+    """Run the predecessor iteration, stage by stage, until one is invariant.
 
     Args:
-        X: the states allowed.
-        slack: eps, as a share of X's half-widths. A larger one ends sooner, with a smaller set.
-        patience: steps after which a smaller copy of the set reached is looked for that is invariant, so that an
-            iteration that converges too slowly still ends with a certified set.
-        start: a stage to go on from, after an interruption.
+        X: the allowed states.
+        plant: the uncertain system.
+        slack: eps, as a share of X's half-widths. A larger value ends sooner, with a smaller set.
+        patience: number of steps after which a smaller invariant copy of the present set is searched, so that a slowly
+            converging iteration ends with a certified set.
+        start: a stage to continue from after an interruption.
 
     Raises:
-        EmptySetError: nothing is left; names the step.
-        SetError: out of patience, and no smaller copy is invariant.
+        EmptySetError: the set is empty. The text names the step.
+        SetError: the iteration did not converge, and no smaller copy is invariant.
     """
     current, first = (X.reduced(), 0) if start is None else (start.set, start.step)
     eps = slack if start is None else start.slack
@@ -113,7 +115,7 @@ def predecessor_iteration(
         except EmptySetError as error:
             raise EmptySetError(
                 f"no robust control invariant set exists for this X, U and W: {error}. "
-                "A smaller W (a smaller region, or bounds by region), a shorter period or a larger U would help."
+                "A smaller W (a smaller region, or bounds by region), a shorter period or a larger U may help."
             ) from error
         new = new.reduced()
         yield (stage := Stage(step, new, _excess(current, new, eps, X.scale), eps))
@@ -125,12 +127,12 @@ def predecessor_iteration(
 def _smaller_copy(
     current: Body, plant: UncertainSystem, eps: float, scale: np.ndarray, patience: int
 ) -> Body:
-    """The largest of some copies of a set, shrunk about the equilibrium, that is invariant for W + eps S."""
+    """Return the largest of some scaled copies of a set, about the equilibrium, that is invariant for W + eps S."""
     for share in COPY_SHARES:
         try:
             copy = body(current.G, share * current.g, "a smaller copy", scale)
             G, g = predecessor(copy, plant, eps, scale)
-            before = body(np.vstack([copy.G, G]), np.concatenate([copy.g, g]), "what stays in it", scale)
+            before = body(np.vstack([copy.G, G]), np.concatenate([copy.g, g]), "its invariant part", scale)
         except EmptySetError:
             continue
         if before.includes(copy, 0.0):
@@ -142,10 +144,10 @@ def _smaller_copy(
 
 
 def _excess(before: Body, after: Body, eps: float, scale: np.ndarray) -> float:
-    """How far `before` drawn in by eps sticks out of `after`, in scaled lengths; at most 0 when it does not."""
+    """Return how far `before`, shrunk by eps, extends beyond `after`, in scaled lengths; at most 0 if it does not."""
     lengths = np.linalg.norm(before.G * scale, axis=1)
     try:
-        shrunk = body(before.G, before.g - eps * lengths, "the set drawn in", scale, before)
+        shrunk = body(before.G, before.g - eps * lengths, "the shrunk set", scale, before)
     except EmptySetError:
         return -np.inf
     reach = after.G @ shrunk.vertices.T

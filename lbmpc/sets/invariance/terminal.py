@@ -1,7 +1,7 @@
 """The maximal robust positively invariant set of x+ = (A+BK) x + w inside X and K x in U.
 
-Gilbert and Kolmanovsky's recursion (1995): O = {x : F (A+BK)^k x <= f - support of R_k, k = 0, 1, ...}, stopped at
-the first k whose rows are all redundant.
+The recursion is that of Gilbert and Kolmanovsky (1995): O = {x : F (A+BK)^k x <= f - support of R_k, k = 0, 1, ...},
+stopped at the first k whose rows are all redundant.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from lbmpc.sets.geometry.polytope import EmptySetError, Polytope, in_shares, row
 
 
 def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps: int = 200) -> Polytope:
-    """Omega of the paper: disturbance invariant under v = K z, inside X with K x in U.
+    """Return Omega of the paper: disturbance invariant under v = K z, inside X with K x in U.
 
     Raises:
-        EmptySetError: there is none (it names the step and the row), or it is not determined within max_steps.
+        EmptySetError: there is none, with step and row in the text; or it is not determined within max_steps.
     """
     rows_x, bounds_x = X.one_sided()
     rows_u, bounds_u = U.one_sided()
     rows = np.vstack([rows_x, rows_u @ model.K])
     bounds = np.concatenate([bounds_x, bounds_u])
     if not len(rows):
-        # Nothing is bounded: the whole space.
+        # Without any bound Omega is the whole space.
         return Polytope(rows, bounds, bounds, ())
     names, scale = _names(X) + _names(U), model.plant.x_scale
     ranges = row_ranges(rows, scale)
@@ -40,7 +40,7 @@ def terminal_set(model: Model, X: Polytope, U: Polytope, W: Polytope, max_steps:
             raise EmptySetError(
                 f"no robust positively invariant set of A + BK exists: after {k} steps the disturbance alone moves "
                 f"{names[worst]} past its bound by {-bound[worst]:.3g}. "
-                "A smaller W, another K or a shorter period would help."
+                "A smaller W, another K or a shorter period may help."
             )
         known, candidates = in_shares(kept_rows, kept_bounds, scale), in_shares(power, bound, scale)
         new = [i for i, row in enumerate(zip(*candidates, strict=True)) if not _redundant(*row, *known)]

@@ -1,4 +1,4 @@
-"""`tandem model`: a plant file, started and looked at."""
+"""`tandem model`: start a plant file, and check it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ from tandem.commands.model.new import ModelNew
 
 @dataclass(frozen=True, kw_only=True)
 class ModelCommand:
-    """A plant file: start one, and look at what is in it."""
+    """Plant files: start one, and check one."""
 
     action: Annotated[ModelCheck, subcommand("check")] | Annotated[ModelNew, subcommand("new")]

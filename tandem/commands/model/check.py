@@ -1,4 +1,4 @@
-"""`tandem model check`: what is in a plant file, what it is like to control, and all that is wrong."""
+"""`tandem model check`: the content of a plant file, its properties for control, and all of its faults."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ MARKS = {"ok": ("ok", "green"), "note": ("look", "yellow"), "fault": ("wrong", "
 
 @dataclass(frozen=True, kw_only=True)
 class ModelCheck(Configured):
-    """Look at a plant: A and B, poles, what the inputs move, the horizon, W, the safe input; and all that is wrong."""
+    """Check a plant: A and B, poles, reach of the inputs, horizon, W, safe input; and list all faults."""
 
     KEYS = (("plant", "plant.model"), ("rate", "rate"))
 
     plant: Annotated[Positional[str], arg(metavar="FILE:NAME")]
-    """A plant file and the name in it, which may be left out where there is one; or a plant that comes with Tandem."""
+    """A plant file and the name in it, which may be left out if there is one; or a shipped plant."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
     """Samples a second."""
     prove: bool = False
-    """Bound h over X and U rigorously as well, where there are equations; that may take a minute."""
+    """Also bound h over X and U rigorously, if there are equations; that may take a minute."""
 
     def run(self) -> int:
-        """0, or 2 where something is wrong."""
+        """Return 0, or 2 if there is a fault."""
         import numpy as np
 
         from controller_node.build import build_estimator
@@ -102,7 +102,7 @@ class ModelCheck(Configured):
         for table in matrix_tables(self.console.width, known.states, names, matrices, scales):
             self.console.print(table)
         sampled = bound = None
-        # Of matrices that are their own truth h is zero.
+        # For matrices that are their own truth, h is zero.
         if not isinstance(true, Known):
             with self.console.status("asking the true motion for h"):
                 rng = np.random.default_rng(0)
@@ -150,7 +150,7 @@ class ModelCheck(Configured):
         return 2 if faults else 0
 
     def _proved(self, model: Model, own_truth: bool) -> np.ndarray | None:
-        """A rigorous bound of |h| over X and U, (d,) per second; None, and why, where there is none."""
+        """Return a rigorous bound of |h| over X and U, (d,) per second; or None and the reason."""
         import numpy as np
 
         from lbmpc.sets.enclosures.disturbance import DisturbanceError, Region, bound_box
@@ -190,7 +190,7 @@ def _with_unit(known: Known, name: str, value: float) -> str:
 
 
 def _rounded(value: float, scale: float) -> str:
-    """Four digits; what is rounding beside the half-width is 0."""
+    """Four digits; a value within rounding of the half-width is 0."""
     return f"{0.0 if abs(value) < ROUNDING * scale else value:.4g}"
 
 

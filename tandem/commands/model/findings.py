@@ -1,4 +1,4 @@
-"""What is to be said of a model before it is used: one sentence each, and whether it is well."""
+"""Findings about a model before it is used: one sentence each, with its severity."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from tandem.model_tables import percent, poles_text
 
 Verdict = Literal["ok", "note", "fault"]
 FOLLOWED = 10.0
-"""Seconds for which the safe input is followed, or two horizons if that is longer."""
+"""Seconds for which the safe input is simulated, or two horizons if that is longer."""
 CHEAP = 1e-3
-"""Of what the dearest input costs at its half-width: a performance state that costs less there is not cared for."""
+"""Share of the cost of the most expensive input at its half-width; a cheaper performance state has no effect."""
 DOUBLED = 2.0
-"""What an error of a prediction over the dead time may grow by."""
+"""Largest growth of an error of a prediction over the dead time."""
 BESIDE = 0.01
-"""Half-widths from x_e, in every state: exactly there an unstable plant would stay."""
+"""Half-widths from x_e, in every state: an unstable plant would stay exactly at x_e."""
 WEAK = 0.1
-"""Half-widths: a state that full inputs move less within the horizon is hardly in their hands."""
+"""Half-widths: the inputs have little effect on a state that full inputs move less within the horizon."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A "note" is worth a look, with a "fault" nothing works."""
+    """A "note" needs attention; with a "fault" nothing works."""
 
     verdict: Verdict
     subject: str
@@ -47,7 +47,7 @@ class Finding:
 
 
 def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Finding]:
-    """Of a model for which there is a controller.
+    """Findings about a model for which there is a controller.
 
     Args:
         model: at the rate.
@@ -71,7 +71,7 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
 
 
 def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) -> Finding:
-    """W, (d,) per second, against what was found of h."""
+    """W, (d,) per second, against the h that was found."""
     lost = (
         f"; from {found.lost} of {found.samples} states the motion cannot be followed" if found.lost else ""
     )
@@ -90,7 +90,7 @@ def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) 
 
 
 def weights_finding(model: Model) -> Finding | None:
-    """What a half-width of a performance state costs, where that is next to nothing beside the inputs; else None."""
+    """The cost of a half-width of a performance state, if it is small against the inputs; else None."""
     plant = model.plant
     states = np.diag(model.Q) * plant.x_scale**2 / model.period
     inputs = np.diag(model.R) * plant.u_scale**2 / model.period
@@ -220,6 +220,6 @@ def _safe(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator[Fi
 
 
 def _beside_rest(plant: Known) -> np.ndarray:
-    """A state of X, (d,), a little beside x_e, on the side that has more room."""
+    """A state of X, (d,), a little beside x_e, on the side with more room."""
     side = np.where(plant.x_max - plant.x_e >= plant.x_e - plant.x_min, BESIDE, -BESIDE)
     return plant.state_rows.pulled(plant.x_e + side * plant.x_scale, plant.x_e)

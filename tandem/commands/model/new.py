@@ -13,7 +13,7 @@ from tandem.commands.base import Command
 
 @dataclass(frozen=True, kw_only=True)
 class ModelNew(Command):
-    """Write a plant file to start from, with comments; it runs as it is."""
+    """Write a plant file to start from, with comments; it runs without changes."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.py")]
     """Its name."""
@@ -25,7 +25,7 @@ class ModelNew(Command):
 
         text = files("tandem.templates").joinpath("plant.py").read_text(encoding="utf-8")
         name = str(self.file)
-        # Not one that would end a text of Python.
+        # Not one that would end a string of Python.
         plain = name.isprintable() and '"' not in name and "\\" not in name
         write_new(self.file, text.replace("THIS_FILE", name if plain else "FILE.py"))
         self.say(

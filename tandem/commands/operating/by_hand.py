@@ -1,4 +1,4 @@
-"""`tandem manual`, `tandem pause` and `tandem auto`: a hand on the switch of a plant that runs."""
+"""`tandem manual`, `tandem pause` and `tandem auto`: manual control of a running plant."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from tandem.operating.hand_session import Follower
 
 RENEWALS = 3
-"""Of a lease: two may be lost."""
+"""Share of a lease: two messages may be lost."""
 HEARD_S, HEARD_PERIODS = 2.0, 4.0
 HEALTH_S = 0.7
-"""A little more than from one health to the next."""
+"""Seconds. A little more than the interval of health messages."""
 LOOK_S = 0.1
 LONGEST_S = 1e8
 ENDED = 1
@@ -34,7 +34,7 @@ ENDED = 1
 
 @contextmanager
 def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
-    """A commander, and what Ctrl-C sets. Raises as `tandem.operating.commander.commanding`."""
+    """A commander, and the event that Ctrl-C sets. Raises as `tandem.operating.commander.commanding`."""
     from node_runtime.lifecycle import stopped_by_signals
     from protocol import topics
     from tandem.operating.commander import commanding
@@ -48,13 +48,13 @@ def on_the_bus(config: Config) -> Iterator[tuple[Commander, threading.Event]]:
 
 
 def patience(config: Config) -> float:
-    """Seconds in which a plant says what acts."""
+    """Seconds in which a plant publishes its state."""
     return max(HEARD_S, HEARD_PERIODS * config.period)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ByHand(Configured):
-    """A command that stays in the foreground while what it says counts."""
+    """A command that stays in the foreground while its message counts."""
 
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="(default: until Ctrl-C)")] = None
     """For how long."""
@@ -68,7 +68,7 @@ class ByHand(Configured):
             return self._command(config, plant, commander, stopping)
 
     def _check(self, plant: Description) -> None:
-        """Raises `Refused` for what needs nobody to be seen as wrong."""
+        """Raise `Refused` for a mistake that needs no bus to be found."""
 
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
@@ -84,7 +84,7 @@ class ByHand(Configured):
         word: Word,
         follower: Follower,
     ) -> str:
-        """Say it again and again until something ends it: why, or "" where the person did."""
+        """Repeat the message until something ends it; return the reason, or "" if the person ended it."""
         from node_runtime.realtime import clock
         from tandem.operating.hand_session import lease_of, line
 
@@ -94,7 +94,7 @@ class ByHand(Configured):
         said = shown = -math.inf
         while not stopping.is_set() and (now := clock.now()) < end:
             if now - said >= every:
-                # Number 0 begins it, and is said until it is taken; those behind it only renew.
+                # Number 0 begins the session and is repeated until it is accepted; later numbers renew it.
                 commander.say(word, again=not follower.begun)
                 follower.said()
                 said = now
@@ -110,7 +110,7 @@ class ByHand(Configured):
         return ""
 
     def _reason(self, commander: Commander, follower: Follower, why: str) -> str:
-        """As the plant says it, where it is the plant that ended it: in its next health."""
+        """The reason as the plant reports it in its next health, if the plant ended the session."""
 
         def told(heard: Message) -> bool:
             follower.take(heard)
@@ -128,11 +128,11 @@ class ByHand(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Manual(ByHand):
-    """Drive a running plant's input by hand, until Ctrl-C or until the plant would leave X. The controller goes on
-    learning, and takes over then. With certificates it needs the commander's."""
+    """Drive a running plant manually, until Ctrl-C or until it would leave X. The controller goes on learning, and
+    takes over at the end. With certificates it needs the commander's."""
 
     inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]
-    """u=1.2, in the plant's own units; inputs that are not named stay what they are."""
+    """u=1.2, in the plant's own units; inputs that are not named keep their value."""
 
     def _check(self, plant: Description) -> None:
         from tandem.operating.hand_session import assignments
@@ -176,8 +176,8 @@ class Manual(ByHand):
 
 @dataclass(frozen=True, kw_only=True)
 class Pause(ByHand):
-    """Let the controller hold a running plant at the nearest rest to where it is, until Ctrl-C. With certificates it
-    needs the commander's."""
+    """Let the controller hold a running plant at the equilibrium nearest to its state, until Ctrl-C. With certificates
+    it needs the commander's."""
 
     def _command(
         self, config: Config, plant: Description, commander: Commander, stopping: threading.Event
@@ -189,7 +189,7 @@ class Pause(ByHand):
         follower = Follower(commander.run_id, Reference)
         self.say("paused; Ctrl-C goes on")
         why = self._stay(config, plant, commander, stopping, word, follower)
-        # Where another has said where to go, that counts; who says `auto` leaves this to us.
+        # If another person gives a reference, that counts; `auto` is handled here.
         if not follower.elsewhere:
             commander.say_last(Reference(run_id=commander.run_id, seq=0, kind="configured"))
         return self._ended(why, "paused")
@@ -197,7 +197,7 @@ class Pause(ByHand):
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Configured):
-    """Give a plant that somebody drives by hand, or has paused, back to its controller. With certificates it needs the
+    """Return a plant from manual control or from a pause to its controller. With certificates it needs the
     commander's."""
 
     def run(self) -> int:

@@ -1,4 +1,4 @@
-"""`tandem set-point`: gives a running controller set-points, and prints its answer."""
+"""`tandem set-point`: give a running controller set-points, and print its answer."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class SetPoint(Configured):
     lease: Annotated[
         float | None, arg(name="for", metavar="S", help_behavior_hint="(default: until another is given)")
     ] = None
-    """Seconds after which the configured reference is back, 60 at most."""
+    """Seconds after which the configured reference returns, 60 at most."""
     file: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """A sequence of set-points instead: a CSV file with the columns time (seconds from now) and states."""
     configured: bool = False
-    """Go back to the reference of the configuration."""
+    """Return to the reference of the configuration."""
     seconds: Annotated[float, arg(metavar="S")] = 3.0
-    """How long to wait for the controller's answer."""
+    """Seconds to wait for the controller's answer."""
 
     def run(self) -> int:
         config, plant = self.resolve_with_plant()

@@ -1,4 +1,4 @@
-"""`tandem sets`: certified sets, computed, checked and drawn."""
+"""`tandem sets`: compute, check and plot certified sets."""
 
 from __future__ import annotations
 

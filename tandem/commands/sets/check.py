@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SetsCheck(Configured):
-    """Prove the claim of a file again, from the file and the plant's equations; and that it is about this model."""
+    """Prove the claim of a file again from the file and the plant's equations, and check that it fits this model."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """A file of certified sets."""
     samples: Annotated[int, arg(metavar="N")] = 20_000
-    """States and inputs at which the true plant is asked whether W holds, before that is proved."""
+    """Number of states and inputs at which W is sampled before it is proved."""
     prove: bool = True
-    """Prove W by interval arithmetic, which takes most of the time; else it is only sampled, and the output says so."""
+    """Prove W by interval arithmetic, which takes most of the time; otherwise it is only sampled."""
 
     def run(self) -> int:
-        """0: everything holds; 3: refused, and why."""
+        """Return 0 if everything holds, 3 if the file is refused."""
         config, _ = self.resolve()
         from controller_node.build import build_model
         from controller_node.certified_sets import read_sets
@@ -60,7 +60,7 @@ class SetsCheck(Configured):
         return NO_SETS if reason else 0
 
     def _reason(self, sets: CertifiedSets, model: Model, result: dict[str, Any]) -> str:
-        """Why the claim is refused, empty where it holds; what was found out goes into `result`."""
+        """Return why the claim is refused, empty if it holds; results go into `result`."""
         from lbmpc.sets.check import check
         from lbmpc.sets.enclosures.affine_forms import DisturbanceError
         from lbmpc.sets.enclosures.proof import prove

@@ -1,4 +1,4 @@
-"""`tandem sets compute`: construct, have it checked, keep it, write it, say what it is worth."""
+"""`tandem sets compute`: construct sets, check them, store them, write them, and print their properties."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ WARNING_SAMPLES = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class SetsCompute(Configured):
-    """Compute sets in which the true plant can be kept for ever, have them checked, and write them to a file."""
+    """Compute sets in which the true plant can be kept forever, check them, and write them to a file."""
 
     kind: Annotated[
         Literal["regions", "hull", "box", "given", "all"], arg(metavar="regions|hull|box|given|all")
     ] = "regions"
-    """What is known of the model error h: its bound as a box, as a hull, by regions around a way from x0 as well, or
-    given as controller.W. `all`: box, hull and regions in one table, and the last one written."""
+    """Knowledge of the model error h: its bound as a box, as a hull, also by regions around a path from x0, or given as
+    controller.W. `all`: box, hull and regions in one table; the last one is written."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("sets.json")
-    """Where the sets go; gzipped where the name ends in .gz."""
+    """File of the sets; gzipped if the name ends in .gz."""
     slack: Annotated[float, arg(metavar="SHARE")] = 3e-4
-    """Room beyond W, as a share of X's half-widths: more ends sooner, with smaller sets."""
+    """Margin beyond W, as a share of X's half-widths: a larger one ends sooner, with smaller sets."""
     fresh: bool = False
-    """Take nothing from the cache."""
+    """Do not use the cache."""
 
     def run(self) -> int:
-        """0: written; 3: there are no such sets, and why."""
+        """Return 0 if the sets are written, 3 if there are none."""
         config, _ = self.resolve()
 
         from controller_node.build import build_model, given_disturbance
@@ -95,7 +95,7 @@ class SetsCompute(Configured):
     def _one(
         self, kind: Kind, model: Model, start: np.ndarray, W: np.ndarray | None
     ) -> tuple[CertifiedSets, bool]:
-        """The sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
+        """Return the sets, and whether they were in the cache. Raises `SetError`, `DisturbanceError`, `OSError`."""
         from controller_node.certified_sets import (
             CertifiedSets,
             Found,
@@ -103,7 +103,7 @@ class SetsCompute(Configured):
             Work,
             default_cache,
             read_sets,
-            why_not_believed,
+            why_not_trusted,
         )
         from lbmpc.sets.certificate import CertificateError
         from lbmpc.sets.check import check
@@ -112,7 +112,7 @@ class SetsCompute(Configured):
         from lbmpc.sets.guard import Guard
 
         work = Work.of(model, kind, start, W, self.slack, default_cache())
-        doubt = why_not_believed(work)
+        doubt = why_not_trusted(work)
         saved: Saved = SavedArrays(work.folder) if doubt is None else {}
         if doubt is not None:
             self.say(f"{doubt}; computed without it", style="yellow")
@@ -154,7 +154,7 @@ class SetsCompute(Configured):
 
 
 def _result(kind: Kind, sets: CertifiedSets | str, cached: bool) -> dict[str, Any]:
-    """One object of `--json`."""
+    """Return one object of `--json`."""
     if isinstance(sets, str):
         nothing = dict.fromkeys(("contains_x0", "invariance_margin", "seconds", "file"))
         return {"kind": kind, "facets": 0, "volume_fraction": 0.0, "certificate": sets, **nothing}

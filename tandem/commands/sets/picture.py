@@ -1,6 +1,6 @@
-"""Certified sets as a picture: projections, slices, and W with the tube beside them, in the plant's own units.
+"""Certified sets as a picture: projections, slices, and W with the tube, in the plant's own units.
 
-Told apart by line style, marker and lightness as well as by colour (Okabe and Ito's).
+Sets differ by line style, marker and lightness as well as by colour (Okabe and Ito's).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from run_log.reporting.canvas import words
 from run_log.reporting.plots import BLACK, BLUE, GREY, SKY, VERMILION
 
 PLANES = 3
-"""Pairs of states drawn at most."""
+"""Largest number of pairs of states."""
 TUBE = (1, 2, 4, 8)
 """Which R_i are drawn."""
 FILL, ANGLES = "#DCE6EE", 72
@@ -32,7 +32,7 @@ Plane = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What a picture shows; x0, and the states of a run (n, d), in the plant's own units."""
+    """Content of a picture; x0, and the states of a run (n, d), in the plant's own units."""
 
     certificate: Certificate
     model: Model
@@ -67,7 +67,7 @@ def picture(drawn: Drawn, title: str) -> Figure:
 
 
 def _planes(drawn: Drawn) -> list[Plane]:
-    """The performance states first, then pairs of states not yet shown, then any."""
+    """The performance states first, then pairs with states not yet shown, then any."""
     plant = drawn.model.plant
     first = tuple(dict.fromkeys([*plant.performance, *range(plant.d)]))
     if plant.d == 1:
@@ -95,7 +95,7 @@ def _projections(ax: Axes, drawn: Drawn, pieces: list[Body], plane: Plane) -> No
 
 
 def _slices(ax: Axes, drawn: Drawn, pieces: list[Body], plane: Plane, through: np.ndarray, name: str) -> None:
-    """What the sets hold of the plane through a state; a projection shows what they hold for some other states."""
+    """Sections of the sets with the plane through a state; a projection covers some values of the other states."""
     point, kept = through - drawn.model.plant.x_e, list(plane)
     rest = [i for i in range(len(point)) if i not in plane]
     scale = drawn.model.plant.x_scale[kept]
@@ -110,7 +110,7 @@ def _slices(ax: Axes, drawn: Drawn, pieces: list[Body], plane: Plane, through: n
 
 
 def _disturbances(ax: Axes, drawn: Drawn, plane: Plane) -> None:
-    """R_i = W + A_K W + ... + A_K^(i-1) W, the sets that a tube keeps free, by their outermost points."""
+    """R_i = W + A_K W + ... + A_K^(i-1) W, the sets that a tube excludes, by their outermost points."""
     W = np.array(drawn.certificate.pieces[0].W)
     angles = np.linspace(0.0, 2 * np.pi, ANGLES, endpoint=False)
     directions = np.zeros((ANGLES, drawn.model.d))
@@ -136,7 +136,7 @@ def _disturbances(ax: Axes, drawn: Drawn, plane: Plane) -> None:
 
 
 def _styled(pieces: list[Body]) -> list[tuple[Body, dict[str, object]]]:
-    """The pieces around the way below, the base set over them."""
+    """The pieces around the path below, the base set above them."""
     base = {"fill": True, "facecolor": FILL, "edgecolor": BLUE, "linewidth": 1.6, "label": "base set C"}
     others = [
         (
@@ -155,7 +155,7 @@ def _styled(pieces: list[Body]) -> list[tuple[Body, dict[str, object]]]:
 
 
 def _polygon(ax: Axes, drawn: Drawn, points: np.ndarray, plane: Plane, style: dict[str, object]) -> None:
-    """The hull of points (k, 2), deviations; a point or a line where they span no more."""
+    """The hull of points (k, 2), deviations; a point or a line if they span no more."""
     at = points + drawn.model.plant.x_e[list(plane)]
     size = np.ptp(points, axis=0)
     if size.min() <= 1e-12 * max(size.max(), 1e-300):

@@ -1,4 +1,4 @@
-"""`tandem sets plot`: a file of certified sets as a picture, with a run laid over it."""
+"""`tandem sets plot`: plot a file of certified sets, with a run over it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SetsPlot(Configured):
-    """Draw sets: projections and slices with X, W, the tube, x0, and a run if there is one.
+    """Plot sets: projections and slices with X, W, the tube, x0, and a run if one is given.
 
     The plant is the run's, or the configuration's; without both the one that the file names, of those that come with
     Tandem.
@@ -30,12 +30,12 @@ class SetsPlot(Configured):
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """A file of certified sets."""
     log: Annotated[Path | None, arg(name="run", metavar="LOG", help_behavior_hint="(default: none)")] = None
-    """A log whose states are laid over the sets."""
+    """A log whose states are plotted over the sets."""
     out: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: FILE with .png)")] = None
-    """Where the picture goes."""
+    """File of the picture."""
 
     def run(self) -> int:
-        """0: drawn; 3: the file is refused."""
+        """Return 0 if it is drawn, 3 if the file is refused."""
         import numpy as np
 
         from controller_node.certified_sets import read_sets
@@ -78,7 +78,7 @@ class SetsPlot(Configured):
         return 0
 
     def _plant(self, name: str) -> Known | Plant:
-        """The configuration's where there is one. Raises `LookupError`."""
+        """The configuration's plant, if there is one. Raises `LookupError`."""
         from lbmpc.plants import get_plant
         from node_runtime.config.plant import plant_of
 

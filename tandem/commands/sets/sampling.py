@@ -14,12 +14,12 @@ from lbmpc.sets.geometry.operations import body
 from lbmpc.sets.invariance.approach import one_period
 
 HAIR = 1e-9
-"""Of the integration of a sample, as a share of a row's scaled length; a rigorous W is wider than that."""
+"""Integration error of a sample, as a share of a row's scaled length; a rigorous W is wider than that."""
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """W against the true plant; `excess` is how far h was outside, as a share of X's half-widths, at most 0 inside."""
+    """Result; `excess` is the distance of h outside W, as a share of X's half-widths, at most 0 inside."""
 
     samples: int
     excess: float
@@ -27,7 +27,7 @@ class Sampled:
 
 
 def sample(certificate: Certificate, model: Model, samples: int, seed: int = 0) -> Sampled:
-    """Random states and inputs of every piece: does h lie in its W, in the directions of its target's rows?"""
+    """Check that h of random states and inputs of every piece lies in its W, in the directions of its rows."""
     rng, move = np.random.default_rng(seed), one_period(model)
     half = model.plant.x_scale
     worst, where, asked = -math.inf, "", 0

@@ -1,4 +1,4 @@
-"""A plant file of a stranger's, as text: two tanks, from docs/your-plant.md, and a simulator for one of them."""
+"""A user's plant file, as text: two tanks, from docs/tutorials/your-plant.md, and a simulator for one of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEAKING = Leaking()
 
 def write_tanks(folder: Path) -> Path:
     """tanks.py, as the page of the documentation has it."""
-    page = (DOCS / "your-plant.md").read_text(encoding="utf-8")
+    page = (DOCS / "tutorials/your-plant.md").read_text(encoding="utf-8")
     _, _, rest = page.partition("```python\n# tanks.py\n")
     file = folder / "tanks.py"
     file.write_text(rest.partition("```")[0], encoding="utf-8")

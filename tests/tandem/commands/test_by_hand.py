@@ -120,8 +120,8 @@ def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
         return ["--config", str(file)]
 
     with served(local) as machine:
-        assert main(["manual", f"u={U + 0.01}", *far("operator")]) == 2
-        assert "is the certificate of operator.jet1" in capsys.readouterr().err
+        assert main(["manual", f"u={U + 0.01}", *far("viewer")]) == 2
+        assert "is the certificate of viewer.jet1" in capsys.readouterr().err
         issue(keys, "brief", "commander.jet1", 4.0 / 86400.0)
         with by_hand(f"u={U + 0.02}", "--seconds", "5", *far("brief")):
             wait_for(lambda: U + 0.02 in machine.written)

@@ -162,7 +162,7 @@ def test_one_linear_feedback_is_refused_with_its_equation(tmp_path: Path, capsys
     )
     text = refused(capsys, str(tmp_path / "run.mcap"))
     assert re.search(r"run.mcap: the samples do not say what A and B are:\n  - u = .*\+ constant, to", text)
-    assert "the input is a linear function of what else is seen, as under one fixed feedback" in text
+    assert "the input is a linear function of the other variables, as under one fixed feedback" in text
     assert "Record motion that differs: from several x0" in text
 
 
@@ -180,7 +180,9 @@ def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> No
     text = refused(capsys, str(tmp_path / "short.mcap"))
     assert re.search("19 samples are too few: .* has 4 numbers .*, and 40 samples are the least", text)
     save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
-    assert "is what no model explains, as measuring noise is" in refused(capsys, str(tmp_path / "noisy.mcap"))
+    assert "is not explained by any model, like measurement noise" in refused(
+        capsys, str(tmp_path / "noisy.mcap")
+    )
 
 
 def test_what_cannot_be_given_together_is_refused(logs: list[str], tmp_path: Path, capsys: Capture) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import stat
 from pathlib import Path
 
@@ -97,6 +98,21 @@ def test_renewing_one_role_leaves_the_others_and_keeps_the_hosts(
     assert 364 < credentials.of_process(str(folder / "trainer"), "trainer", "jet2").days_left() < 366
 
 
+def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "k"
+    main(["keys", "create", "--plant", "jet2", "--out", str(folder)])
+    shutil.rmtree(folder / "viewer")
+    assert main(["keys", "renew", str(folder), "--role", "viewer"]) == 0
+    assert 364 < credentials.of_process(str(folder / "viewer"), "viewer", "jet2").days_left() < 366
+    capsys.readouterr()
+    elsewhere = tmp_path / "other"
+    elsewhere.mkdir()
+    authority = str(folder / "authority")
+    assert main(["keys", "renew", str(elsewhere), "--role", "viewer", "--authority", authority]) == 2
+    assert "no certificate.pem in it" in capsys.readouterr().err
+    assert list(elsewhere.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -177,7 +193,7 @@ def test_keys_that_do_not_fit_are_named(keys: Path, tmp_path: Path):
     with pytest.raises(ConfigError, match=r"is not the key of certificate\.pem"):
         credentials.read(mine)
     os.truncate(mine / "key.pem", 20)
-    with pytest.raises(ConfigError, match="no private key"):
+    with pytest.raises(ConfigError, match="not a private key"):
         credentials.read(mine)
     (mine / "authority.pem").unlink()
     with pytest.raises(ConfigError, match=r"authority\.pem: cannot be read"):
@@ -202,7 +218,7 @@ def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
     assert publishes["trainer"] == {
         f"tandem/jet1/trainer/{name}" for name in ("hidden_weights", "run_info", "health")
     }
-    assert publishes["operator"] == set()
+    assert publishes["viewer"] == set()
     assert publishes["commander"] == {f"tandem/jet1/operator/{name}" for name in ("reference", "override")}
     assert publishes["recorder"] == {"tandem/jet1/recorder/run_info", "tandem/jet1/recorder/health"}
     asked = [role for role in rights.ROLES if rights.rights_of(role).asks]

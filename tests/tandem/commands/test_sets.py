@@ -130,7 +130,7 @@ def spoil(cached: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
         ("folder", r"can be written by others \(mode 0775\)"),
         ("file", r"can be written by others \(mode 0664\)"),
         ("link", "is a link"),
-        ("above", "which everybody can write"),
+        ("above", "which all users can write to"),
         ("owner", "belongs to"),
     ],
 )
@@ -175,7 +175,7 @@ def test_sets_that_are_installed_are_in_force_where_the_cache_is_not_believed(
     theirs = model.require_equations("this test")
     cubic = replace(theirs, rhs=lambda x, u: [dx + (x[0] - theirs.x_e[0]) ** 3 for dx in theirs.rhs(x, u)])
     for own in (replace(model, equations=cubic), replace(model, equations=None)):
-        with pytest.raises(ConfigError, match="none are there for this plant"):
+        with pytest.raises(ConfigError, match="there are none for this plant"):
             find_sets(config, own, tmp_path)
     assert "chmod -R go-w" in caplog.text
 
@@ -192,7 +192,7 @@ def test_a_gzipped_file_is_the_same_sets(cached: Path):
 
 def test_a_small_file_cannot_unpack_to_any_size(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("controller_node.certified_sets.LARGEST", 10_000)
-    with pytest.raises(CertificateError, match="when unpacked"):
+    with pytest.raises(CertificateError, match="after decompression"):
         CertifiedSets.from_bytes(gzip.compress(bytes(1_000_000)))
 
 
@@ -207,7 +207,7 @@ def test_an_output_that_is_no_file_is_refused_before_anything_is_computed(
     make(tmp_path / "out")
     kind = (tmp_path / "out").lstat().st_mode
     assert main(["sets", "compute", *OPTIONS, "--out", str(tmp_path / "out")]) == 2
-    assert "only a regular file is read, replaced or moved" in capsys.readouterr().err
+    assert "only regular files are read, replaced or moved" in capsys.readouterr().err
     assert (tmp_path / "out").lstat().st_mode == kind
     assert not (tmp_path / "cache").exists()
 

@@ -161,4 +161,4 @@ def test_what_is_guaranteed_is_not_so_of_an_estimate() -> None:
     said = guarantee(exact, build_model(exact))
     assert "estimate" not in said
     assert guarantee(estimated, build_model(estimated)).startswith(said)
-    assert "for the true state nothing is guaranteed" in guarantee(estimated, build_model(estimated))
+    assert "nothing is guaranteed for the true state" in guarantee(estimated, build_model(estimated))

@@ -202,7 +202,7 @@ def test_perfect_knows_the_present_equations_of_a_plant_that_drifts_and_replays(
 @pytest.mark.parametrize("setting", ["plant.truth.slope=1e9", "rate=1e-6"])
 def test_a_truth_too_fast_for_perfect_is_refused_and_takes_no_memory(setting: str) -> None:
     config_too_fast = config("controller.oracle=perfect", setting)
-    with pytest.raises(ConfigError, match=r"too fast, or too wild|not Schur stable|no stabilising K"):
+    with pytest.raises(ConfigError, match=r"too fast|not Schur stable|no stabilising K"):
         ControllerCore(config_too_fast, "controller")
 
 

@@ -1,1 +1,1 @@
-"""The real processes of a run, what surrounds them, and what is heard of them."""
+"""The real processes of a run, their environment, and the messages that they publish."""

@@ -1,10 +1,10 @@
-"""Links that can be cut, made slow, narrow and lossy, between this machine and a network namespace of its own.
+"""Links that can be cut, delayed, narrowed and made lossy, between this machine and a network namespace of its own.
 
-Linux's own way, tc netem, is a kernel module that small virtual machines lack. So the trainer's link is a wire made of
-two TUN devices: this program carries every IP packet between them, and what it drops, TCP must really send again. The
-plant's link is a pair of devices of the kernel (veth), which costs a command no time and can only be cut.
+Linux's tc netem is a kernel module that small virtual machines lack. The trainer's link is therefore a wire between
+two TUN devices. This program carries every IP packet between them, and TCP must resend what it drops. The
+plant's link is a pair of kernel devices (veth). It costs a command no time and can only be cut.
 
-    python link.py pump NAMESPACE DEVICE DEVICE      is how `Wire` starts itself
+        python link.py pump NAMESPACE DEVICE DEVICE      is how `Wire` starts this program
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ import msgspec
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 MTU = 1500
 QUEUE_S = 0.5
-"""A narrow wire keeps packets for this long before it drops them, as routers do."""
+"""Seconds. A narrow wire queues packets for this long before it drops them, as routers do."""
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """What happens to packets in either direction."""
+    """Treatment of packets in either direction."""
 
     cut: bool = False
     loss: float = 0.0
@@ -39,22 +39,22 @@ class Shape(msgspec.Struct, frozen=True):
     delay: float = 0.0
     """Seconds, each way."""
     rate: float = 0.0
-    """Bits a second, each way; 0: any."""
+    """Bits per second, each way; 0: unlimited."""
 
 
 class Link(Protocol):
-    """A way to a namespace; processes in it reach this machine at `here`."""
+    """A path to a namespace; processes in it reach this machine at `here`."""
 
     here: str
     prefix: list[str]
-    """Words before a command that make it run at the other end."""
+    """Command prefix that runs a command at the other end."""
 
     def shape(self, shape: Shape) -> None:
         """From now on."""
 
 
 def available() -> bool:
-    """Whether this process may make network namespaces."""
+    """Return whether this process may make network namespaces."""
     return (
         os.geteuid() == 0
         and subprocess.run(["ip", "netns"], capture_output=True, check=False).returncode == 0
@@ -63,7 +63,7 @@ def available() -> bool:
 
 @contextmanager
 def link(kind: Literal["veth", "wire"], number: int, seed: int = 0) -> Iterator[Link]:
-    """A namespace behind a link, for the length of a `with`. `number`: 0 to 99, another for each link."""
+    """Make a namespace behind a link, for the length of a `with`. `number`: 0 to 99, different for each link."""
     name = f"tandem{os.getpid()}-{number}"
     _ip("netns", "add", name)
     try:
@@ -78,7 +78,7 @@ def link(kind: Literal["veth", "wire"], number: int, seed: int = 0) -> Iterator[
 
 
 class _End:
-    """What both kinds share: names and addresses. The subnet follows from the process, so that two suites may run."""
+    """Names and addresses of both kinds of link. The subnet depends on the process, so two suites may run at once."""
 
     def __init__(self, namespace: str, number: int):
         net = f"10.{128 + os.getpid() % 100}.{(os.getpid() // 100) % 250}"
@@ -96,7 +96,7 @@ class _End:
 
 
 class Veth(_End):
-    """A pair of the kernel's own devices; can only be cut."""
+    """A pair of kernel devices; can only be cut."""
 
     def __init__(self, namespace: str, number: int):
         super().__init__(namespace, number)
@@ -186,7 +186,7 @@ def pump(near: str, far: str, seed: int) -> None:
             _, _, device, packet = heapq.heappop(under_way)
             try:
                 os.write(device, packet)
-            except OSError:  # the device is not up yet, or not any more: the packet is lost
+            except OSError:  # the device is not up: the packet is lost
                 continue
 
 

@@ -1,4 +1,4 @@
-"""One run of the real processes, to be killed, frozen and cut off; what dies it starts again, as a supervisor would."""
+"""One run of the real processes, with faults on request. It restarts processes that die, as a supervisor does."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ COMMANDS = {
 }
 STOP_ORDER = ("controller", "plant", "trainer", "recorder", "router")
 RESTARTED = ("router", "trainer", "controller")
-"""A recorder that has died stays dead, as under `tandem run`: its log is never overwritten."""
+"""A dead recorder is not restarted, as under `tandem run`, because its log must not be overwritten."""
 RESTART_S = 0.5
-"""As `tandem run` waits before it starts a dead process again."""
+"""Seconds that `tandem run` waits before it restarts a dead process."""
 READY_S = 60.0
 STOP_S = 8.0
 LOOK_S = 0.01
@@ -51,7 +51,7 @@ Place = Literal["loopback", "veth", "wire"]
 
 
 class RigError(RuntimeError):
-    """The run did not come about, whatever the fault: a process did not start, no command came."""
+    """The run failed for reasons other than the fault: a process did not start, or no command came."""
 
 
 class Rig:
@@ -78,7 +78,7 @@ class Rig:
         self._seed, self._around = seed, around or Surroundings()
         port = free_port()
         while f":{port}" in str(self._around.settings):
-            # The scene's door for other machines has it, though nobody listens there yet.
+            # The scene's endpoint for other machines has this port, although no router listens there yet.
             port = free_port()
         self.config = override(
             config,
@@ -101,9 +101,9 @@ class Rig:
         self._command_key = topics.COMMAND.name
         self.restarts = True
         self.door: str | None = None
-        """Where the router listens for other machines."""
+        """Address at which the router listens for other machines."""
         self.ended_at = math.inf
-        """When all were told to stop."""
+        """When all processes were told to stop."""
         self.listening_at: dict[int, float] = {}
         """When the router listened after its n-th start."""
 
@@ -141,7 +141,7 @@ class Rig:
         bus.open()
         self._stack.callback(bus.close, 0.5)
         self._mailbox = bus.everything()
-        # The log begins with the memory that the controller begins with.
+        # The log begins with the memory with which the controller begins.
         self.wait(lambda: self._ready("recorder"), READY_S, "the recorder ready")
         self.processes["controller"].start()
         self.wait(
@@ -155,7 +155,7 @@ class Rig:
         self.wait(lambda: self.first_command is not None, READY_S, "the first command")
 
     def _prepare(self, name: str) -> Running:
-        """What its process will be; the router is not at the same address everywhere, so each has its configuration."""
+        """Describe the process; the router's address depends on the place, so each has its own configuration."""
         config = self.config
         prefix: list[str] = []
         if name in self.links:
@@ -181,7 +181,7 @@ class Rig:
         return Running(name, [*prefix, *words], self._around.environment, self.folder / f"{name}.txt")
 
     def end(self) -> None:
-        """Stop all politely, in the order of a supervisor; what does not stop is killed, and is an event."""
+        """Stop all in the order of a supervisor; a process that does not stop is killed, which is an event."""
         self.restarts = False
         self.ended_at = clock.now()
         for name in STOP_ORDER:
@@ -204,7 +204,7 @@ class Rig:
     # -- time ----------------------------------------------------------
 
     def look(self) -> None:
-        """A hundredth of a second: hear what was said, start again what has died."""
+        """Take a hundredth of a second: read messages, and restart dead processes."""
         clock.sleep_until(clock.now() + LOOK_S)
         assert self._mailbox is not None
         prefix = topics.everything(self.config.name).removesuffix("**")
@@ -234,12 +234,12 @@ class Rig:
         self.run_until(clock.now() + seconds)
 
     def run_until(self, moment: float) -> None:
-        """Let the run go on until `moment` on the monotonic clock."""
+        """Let the run continue until `moment` on the monotonic clock."""
         while clock.now() < moment:
             self.look()
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Let the run go on until something is so. Raises `RigError` when it is not in time."""
+        """Let the run continue until a condition holds. Raises `RigError` if it does not hold in time."""
         deadline = clock.now() + timeout_s
         while not condition():
             if clock.now() > deadline:
@@ -250,35 +250,35 @@ class Rig:
     # -- faults --------------------------------------------------------
 
     def note(self, text: str, *concerns: str, whole_again: bool = False) -> None:
-        """Remember that something was done now."""
+        """Record an event at this moment."""
         self.events.append(Event(clock.now(), text, concerns, whole_again))
 
     def kill(self, *names: str) -> None:
-        """kill -9 of these at once."""
+        """Kill these processes at once, with kill -9."""
         self.note(f"kill {' and '.join(names)}", *names)
         for name in names:
             self.processes[name].killed.append(clock.now())
             self.processes[name].signal(signal.SIGKILL)
 
     def await_restarted(self, timeout_s: float) -> None:
-        """Let the run go on until all that was killed and is started again has spoken, at most for `timeout_s`."""
+        """Let the run continue until every restarted process has published, at most for `timeout_s`."""
         killed = [name for name in RESTARTED if self.processes[name].killed]
         deadline = clock.now() + timeout_s
         while clock.now() < deadline and not all(self.back_at(name) for name in killed):
             self.look()
 
     def back_at(self, name: str) -> float | None:
-        """When a process that was killed spoke again; None: not yet."""
+        """When a killed process published again; None: not yet."""
         running = self.processes[name]
         if len(running.started) <= len(running.killed):
             return None
         if name == "router":
-            # Its own first word travels through itself; what it writes is as early as it can be known.
+            # The router's first message travels through itself, so its own output is the earliest evidence.
             return self.listening_at.get(len(running.started))
         return next((at for at, _ in self.health(name) if at > running.started[-1]), None)
 
     def freeze(self, name: str, seconds: float) -> None:
-        """SIGSTOP, and SIGCONT after a while."""
+        """Send SIGSTOP, and SIGCONT later."""
         self.note(f"stop {name}", name)
         self.processes[name].signal(signal.SIGSTOP)
         self.run_for(seconds)
@@ -286,7 +286,7 @@ class Rig:
         self.note(f"{name} goes on", name, whole_again=True)
 
     def shape(self, name: str, shape: links.Shape, seconds: float) -> None:
-        """What happens to the packets of the plant's or the trainer's link for a while."""
+        """Apply a shape to the packets of the plant's or the trainer's link for a while."""
         self.note(f"{name}'s link: {shape}")
         self.links[name].shape(shape)
         self.run_for(seconds)
@@ -294,21 +294,21 @@ class Rig:
         self.note(f"{name}'s link is back", whole_again=True)
 
     def attack(self, kind: str, rate: float, seconds: float, seed: int) -> dict[str, float]:
-        """Let a stranger send bad messages for a while; how many it sent, by topic."""
+        """Let a stranger send bad messages for a while; return how many it sent, by topic."""
         sent = self._beside(
             "attacker", self.config, kind, str(rate), str(seconds), str(seed), seconds=seconds
         )
         return {f"sent {topic}": count for topic, count in sent.items()}
 
     def knock(self, kind: str, folder: Path, seconds: float) -> dict[str, float]:
-        """Let a stranger try the router's door for other machines for a while; what it was told."""
+        """Let a stranger try the router's endpoint for other machines for a while; return what it was told."""
         far = override(self.config, [f'bus.endpoint="{self.door}"'])
         return self._beside("stranger", far, kind, str(folder), str(seconds), seconds=seconds)
 
     def _beside(
         self, program: str, config: Config, kind: str, *words: str, seconds: float
     ) -> dict[str, float]:
-        """Run one of `strangers` beside the run until it ends; the counts that it prints."""
+        """Run one of `strangers` beside the run until it ends; return the counts that it prints."""
         file = self.folder / f"{program}.toml"
         file.write_text(to_toml(config), encoding="utf-8")
         command = [sys.executable, "-m", f"verification.faults.strangers.{program}", str(file), kind, *words]
@@ -327,7 +327,7 @@ class Rig:
     # -- what is known while it runs -------------------------------------
 
     def health(self, process: str) -> list[tuple[float, m.Health]]:
-        """All that a process said of itself so far, and when it was heard."""
+        """Return all health messages of a process so far, and when they were received."""
         topic = topics.HEALTH[process]
         return [
             (heard.at, message)

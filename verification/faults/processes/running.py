@@ -1,4 +1,4 @@
-"""A process of a run, and what is remembered of a run: what was heard, and what was done to it."""
+"""A process of a run, and the record of a run: received messages and injected events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from node_runtime.realtime import clock
 
 @dataclass(frozen=True)
 class Heard:
-    """One message as the suite heard it on the bus."""
+    """One message that the suite received on the bus."""
 
     at: float
     """Seconds on the monotonic clock."""
@@ -23,7 +23,7 @@ class Heard:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that was done to the run."""
+    """An event that was injected into the run."""
 
     at: float
     """Seconds on the monotonic clock."""
@@ -31,12 +31,12 @@ class Event:
     concerns: tuple[str, ...] = ()
     """Processes, or "disk"."""
     whole_again: bool = False
-    """What was hurt is well from now on."""
+    """The hurt process is well from now on."""
 
 
 @dataclass
 class Running:
-    """One process, and when it was started and killed; seconds on the monotonic clock."""
+    """One process, with the times of its start and kill; seconds on the monotonic clock."""
 
     name: str
     words: list[str]

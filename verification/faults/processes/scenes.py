@@ -1,6 +1,6 @@
-"""What surrounds a run from its start until its figures are gathered: a disk that can fail, a clock that can step.
+"""Environments of a run until its figures are computed: a disk that can fail, a clock that can step.
 
-Each is a context manager that is given the run's folder and yields what the processes need in their environment and
+Each is a context manager. It receives the run's folder and yields what the processes need in their environment and
 in their configurations.
 """
 
@@ -20,7 +20,7 @@ from verification.faults.strangers import stranger
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is different for the processes of one run."""
+    """Settings that differ for the processes of one run."""
 
     environment: dict[str, str] = field(default_factory=dict)
     """Variables of all."""
@@ -41,13 +41,13 @@ def nothing(folder: Path) -> Iterator[Surroundings]:
 
 @contextmanager
 def memory_disk(folder: Path) -> Iterator[Surroundings]:
-    """The log lies on a small disk of its own, which `fill` can fill."""
+    """The log is on a small disk of its own, which `fill` can fill."""
     with _mounted(folder, "-t", "tmpfs", "-o", "size=32m", "tmpfs"):
         yield Surroundings()
 
 
 def fill(folder: Path) -> None:
-    """From now on nothing more can be written to the log's disk."""
+    """Fill the log's disk, so that nothing more can be written."""
     free = os.statvfs(folder / DISK)
     with (folder / DISK / BALLAST).open("wb") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, free.f_bavail * free.f_frsize)
@@ -60,7 +60,7 @@ def empty(folder: Path) -> None:
 
 @contextmanager
 def real_disk(folder: Path) -> Iterator[Surroundings]:
-    """The log lies on an ext4 file system of its own, which `write_protect` can make read-only under way."""
+    """The log is on an ext4 file system of its own, which `write_protect` can make read-only during the run."""
     image = folder / "image"
     with image.open("wb") as file:
         file.truncate(64 * 1024 * 1024)
@@ -71,7 +71,7 @@ def real_disk(folder: Path) -> Iterator[Surroundings]:
 
 
 def write_protect(folder: Path) -> None:
-    """As Linux does by itself after an error of the disk: read-only from now on, for files that are open too."""
+    """Make the file system read-only, for open files too, as Linux does after a disk error."""
     subprocess.run(["mount", "-o", "remount,abort", str(folder / DISK)], check=True, capture_output=True)
 
 
@@ -88,7 +88,7 @@ def _mounted(folder: Path, *words: str) -> Iterator[None]:
 
 @contextmanager
 def own_wall_clock(folder: Path) -> Iterator[Surroundings]:
-    """All processes have a wall clock that `step_clock` can step; the machine's own stays as it is."""
+    """All processes have a wall clock that `step_clock` can step; the machine's own clock does not change."""
     folder.mkdir(parents=True, exist_ok=True)
     library, offset = folder / "clock_shim.so", folder / OFFSET
     source = Path(__file__).with_name("clock_shim.c")
@@ -98,14 +98,14 @@ def own_wall_clock(folder: Path) -> Iterator[Surroundings]:
 
 
 def step_clock(folder: Path, seconds: float) -> None:
-    """Step the wall clock of all processes of the run, for good."""
+    """Step the wall clock of all processes of the run permanently."""
     with (folder / OFFSET).open("r+b") as file:
         file.write(struct.pack("@q", round(seconds * 1e9)))
 
 
 @contextmanager
 def door_with_certificates(folder: Path) -> Iterator[Surroundings]:
-    """The router listens for other machines too, by TLS; `stranger` has keys that should not open, or not that far."""
+    """The router also listens for other machines, by TLS; `stranger` has keys that must be refused or limited."""
     stranger.keys(_made(folder / KEYS))
     router = folder / KEYS / "good" / "router"
     yield Surroundings(

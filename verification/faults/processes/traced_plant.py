@@ -1,9 +1,9 @@
-"""`tandem plant` with a witness: every sample and every command it takes is also written to a file of this machine.
+"""`tandem plant` with a trace: every sample and every command it takes is also written to a file.
 
     python traced_plant.py SUPERVISOR CONFIG TRACE
 
-What the true plant does while the router is dead or its link is cut is not on the bus. The plant's own code is
-`plant_sim.node.main`, unchanged; here its gateway only gets a `Shield` that writes down what it is asked and what it
+The bus does not show what the true plant does while the router is dead or its link is cut. The plant's own code is
+`plant_sim.node.main`, unchanged. Its gateway only gets a `Shield` that records its calls and
 answers.
 A line on standard input lets it begin.
 """
@@ -27,7 +27,7 @@ from tandem.child import end_with
 
 
 class Sampled(msgspec.Struct, frozen=True, tag="sample"):
-    """One sample, and when the plant's loop got to it; seconds on the monotonic clock."""
+    """One sample, and when the plant's loop handled it; seconds on the monotonic clock."""
 
     at: float
     state: PlantState
@@ -47,14 +47,14 @@ Traced = Sampled | Commanded
 
 
 def read(path: Path) -> list[Traced]:
-    """A trace; what a killed plant left unfinished at its end is left out."""
+    """Read a trace; an unfinished last line of a killed plant is left out."""
     lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
     decoder = msgspec.json.Decoder(Traced)
     return [decoder.decode(line) for line in lines]
 
 
 class TracedShield(Shield):
-    """A `Shield` that writes down what happens."""
+    """A `Shield` that records what happens."""
 
     file: BinaryIO
     encoder = msgspec.json.Encoder()
@@ -74,7 +74,7 @@ class TracedShield(Shield):
 
 
 def main(supervisor: int, config: str, trace: str) -> int:
-    """The plant, until it is told to stop."""
+    """Run the plant until it is told to stop."""
     end_with(supervisor)
     logging.basicConfig(format="%(message)s", level="INFO")
     with open(trace, "ab", buffering=0) as file:

@@ -1,4 +1,4 @@
-"""What the suite heard from the processes of the run itself."""
+"""The messages that the suite received from the processes of the run itself."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from verification.faults.processes.rig import Rig
 
 
 class Witness:
-    """Each message once; strangers' are left out."""
+    """Each message once; strangers' messages are left out."""
 
     def __init__(self, rig: Rig):
         self._rig = rig
         self._known: dict[str, list[tuple[float, Any]]] = {}
 
     def of(self, topic: Topic) -> list[tuple[float, Any]]:
-        """(when heard, message), in order of arrival."""
+        """(time of receipt, message), in order of arrival."""
         if topic.name not in self._known:
             found: dict[tuple[str, int], tuple[float, Any]] = {}
             for heard in self._rig.heard:

@@ -1,1 +1,1 @@
-"""Programs beside a run that send what must not be obeyed."""
+"""Programs beside a run that send messages which must not be obeyed."""

@@ -1,10 +1,10 @@
-"""A stranger on the bus: messages that must not be obeyed, many a second, on every topic.
+"""A stranger on the bus: many bad messages a second, on every topic.
 
     python -m verification.faults.strangers.attacker CONFIG KIND RATE SECONDS SEED
 
-It listens, so that it can send again, cut short and change what the processes of the run said. What it sent is printed
-as one JSON object: topic -> how many. With a weights kind it is a stolen trainer: right run, next version, right hash
-unless that is what is wrong; its sets bear `samples` = MARK, so that a log tells them from the trainer's own.
+It listens, so that it can repeat, truncate and change messages of the run's processes. It prints the number sent
+as one JSON object, by topic. With a weights kind it acts as a stolen trainer: right run, next version, right hash
+unless the hash is what is wrong. Its sets have `samples` = MARK, so that a log distinguishes them from the trainer's.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ STRANGER = "stranger-000000000000"
 KINDS = ("garbage", "truncated", "oversized", "replayed", "reordered", "foreign run", "NaN")
 WEIGHTS = ("NaN", "huge", "huge, just within the norm", "wrong shape", "wrong hash", "stale", "subtly worse")
 LARGE = 1024 * 1024
-"""Bytes; topics that may be larger than this get an oversized message now and then only, to spare the machine."""
+"""Bytes; topics with a larger limit get oversized messages only rarely, to limit the load."""
 LARGE_EVERY_S = 2.0
 LISTEN_S = 0.3
 REMEMBERED = 100
 
 
 class Ear:
-    """The last good messages of each topic, whoever sent them."""
+    """The last good messages of each topic, from any sender."""
 
     def __init__(self, mailbox: Mailbox, prefix: str):
         self._mailbox, self._prefix = mailbox, prefix
@@ -65,13 +65,13 @@ class Ear:
 
 
 def garbage(rng: random.Random) -> bytes:
-    """Bytes that mean nothing, now and then the beginning of a map."""
+    """Return random bytes, sometimes with the beginning of a map."""
     body = rng.randbytes(rng.randrange(300))
     return rng.choice([b"", bytes([0x80 | rng.randrange(16)])]) + body
 
 
 def not_finite(tree: Any, rng: random.Random) -> bool:
-    """Put a NaN or an infinity in the place of one number below `tree`; whether there was one."""
+    """Put a NaN or an infinity in place of one number below `tree`; return whether there was one."""
     places = list(_floats(tree))
     if not places:
         return False
@@ -92,7 +92,7 @@ def _floats(tree: Any) -> Any:
 
 
 class _Numbers:
-    """The numbers of an array as it travels, of which one can be set."""
+    """Return the numbers of an encoded array, so that one can be set."""
 
     def __init__(self, array: dict[str, Any]):
         self._array = array
@@ -104,7 +104,7 @@ class _Numbers:
 
 
 def bad(kind: str, topic: Topic, heard: deque[bytes], rng: random.Random) -> bytes | None:
-    """One message of this kind, None where what was heard so far does not allow one."""
+    """Return one message of this kind; None if the messages received so far do not allow one."""
     if kind == "garbage":
         return garbage(rng)
     if kind == "oversized":
@@ -112,7 +112,7 @@ def bad(kind: str, topic: Topic, heard: deque[bytes], rng: random.Random) -> byt
     if not heard:
         return None
     if kind == "reordered":
-        # Backwards from the newest, which itself was heard already.
+        # Backwards from the newest, which was received already.
         heard.rotate(1)
         return heard[0]
     payload = rng.choice(heard)
@@ -129,7 +129,7 @@ def bad(kind: str, topic: Topic, heard: deque[bytes], rng: random.Random) -> byt
 
 
 def flood(config: Config, kind: str, rate: float, seconds: float, seed: int) -> Counter[str]:
-    """`rate` bad messages a second, over all topics in turn; how many went to each."""
+    """Send `rate` bad messages a second, over all topics in turn; return how many went to each."""
     rng, stop = random.Random(seed), threading.Event()
     sent: Counter[str] = Counter()
     with Bus(config, "monitor", STRANGER) as bus:
@@ -201,7 +201,7 @@ def forged(
 
 
 def steal(config: Config, kind: str, rate: float, seconds: float, seed: int) -> Counter[str]:
-    """Send forged hidden weights as the trainer that is heard, `rate` a second."""
+    """Send forged hidden weights in the trainer's name, `rate` a second."""
     rng = np.random.default_rng(seed)
     sent: Counter[str] = Counter()
     oldest: m.HiddenWeights | None = None
@@ -217,7 +217,7 @@ def steal(config: Config, kind: str, rate: float, seconds: float, seed: int) -> 
             for delivery in mailbox.drain():
                 try:
                     weights = codec.decode(topics.HIDDEN_WEIGHTS, delivery.payload)
-                except codec.BadMessage:  # its own
+                except codec.BadMessage:  # the attacker's own
                     continue
                 if isinstance(weights, m.HiddenWeights) and weights.samples != MARK:
                     oldest, newest = oldest or weights, weights

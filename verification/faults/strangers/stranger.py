@@ -1,9 +1,9 @@
-"""Somebody at the router's door for other machines, with a certificate that should not open it, or not that far.
+"""A client at the router's endpoint for other machines, with a certificate that must not open it, or not that far.
 
     python -m verification.faults.strangers.stranger CONFIG KIND KEYS SECONDS
 
-CONFIG names the door (`bus.endpoint`), KEYS is the folder that `keys` filled. What it tried, what was refused and what
-it was told is printed as one JSON object.
+CONFIG names the endpoint (`bus.endpoint`), KEYS is the folder that `keys` filled. It prints what it tried, what was
+refused and what it was told as one JSON object.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ VERDICT_S = 1.0
 
 
 def keys(folder: Path) -> None:
-    """The plant's keys in `folder`/good, another authority's of the same names in /other, and one that has expired."""
+    """Write the plant's keys in `folder`/good, another authority's of the same names in /other, and an expired one."""
     certificate_authority.create(PLANT, [], folder / "good", 30)
     certificate_authority.create(PLANT, [], folder / "other", 30)
     drawer, late = folder / "good" / "authority", folder / "late"
@@ -51,7 +51,7 @@ def keys(folder: Path) -> None:
 
 
 def try_door(config: Config, kind: str, folder: Path) -> tuple[bool, str]:
-    """Once: whether it was refused, and what the stranger's own side says."""
+    """Try once; return whether it was refused, and what the stranger's own side says."""
     if kind == "no certificate":
         return without_certificate(config.bus.endpoint, folder / "good" / "trainer" / "authority.pem")
     place = folder / "late" if kind == "expired certificate" else folder / "other" / "trainer"
@@ -62,7 +62,7 @@ def try_door(config: Config, kind: str, folder: Path) -> tuple[bool, str]:
 
 
 def without_certificate(endpoint: str, authority: Path) -> tuple[bool, str]:
-    """A TLS client that knows the authority, and shows nothing."""
+    """A TLS client that knows the authority and shows no certificate."""
     place = urlsplit(f"tls://{endpoint.partition('/')[2]}")
     assert place.hostname is not None
     assert place.port is not None
@@ -81,7 +81,7 @@ def without_certificate(endpoint: str, authority: Path) -> tuple[bool, str]:
 
 
 def beyond_rights(config: Config, folder: Path, seconds: float) -> Counter[str]:
-    """Send commands and states with a trainer's certificate, by a program that checks nothing itself."""
+    """Send commands and states with a trainer's certificate, by a program without checks of its own."""
     found: Counter[str] = Counter()
     place = folder / "good" / "trainer"
     try:
@@ -110,7 +110,7 @@ def beyond_rights(config: Config, folder: Path, seconds: float) -> Counter[str]:
             found["tries"] += 1
         clock.sleep_until(clock.now() + 0.02)
     session.close()
-    # What the router did with them it does not tell; its counters do.
+    # The router does not tell the client what it did with these messages; its counters do.
     found["refused"] = found["tries"]
     return found
 

@@ -1,0 +1,80 @@
+"""What the order and the times of messages say: which were lost on the way, and when each was sent."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from typing import Any
+
+from node_runtime.bus.inbox import AgeEstimate, Follower
+from protocol import topics
+
+COUNTED = (topics.TICK.name, topics.RESULT.name)
+"""Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
+MOST_RUNS = 100
+"""That are remembered on each topic."""
+OLDEST_S = 60.0
+"""A message that seems older than that has a sender whose clock was set."""
+
+
+class LostTicks:
+    """Ticks whose messages were made and never arrived here, because of cut links or full queues."""
+
+    def __init__(self, follow_silence: float):
+        self._followed = {name: Follower(follow_silence) for name in COUNTED}
+        self._last: dict[tuple[str, str], int] = {}
+        """By topic and run."""
+        self.count: dict[str, int] = {}
+        """By topic, the messages that are missing."""
+
+    def take(self, name: str, run_id: str, seq: int, time_ns: int) -> int:
+        """How many are missing just before this message.
+
+        A message out of order, or of another run than the one that is followed, was sent again or by a stranger.
+        """
+        if self._followed[name].accept(run_id, seq, time_ns * 1e-9) != "ok":
+            return 0
+        key = (name, run_id)
+        last = self._last.get(key)
+        if last is None and len(self._last) >= MOST_RUNS:
+            return 0
+        self._last[key] = seq
+        missing = 0 if last is None else max(0, seq - last - 1)
+        if missing:
+            self.count[name] = self.count.get(name, 0) + missing
+        return missing
+
+
+class SendTimes:
+    """When a message was sent, on the clock of the receiver.
+
+    The sender's time is on the sender's own clock. The difference between the two clocks is taken to be the smallest
+    difference between arrival and sending so far, so that the quickest message of a run counts as sent on arrival.
+    """
+
+    def __init__(self) -> None:
+        self._ages: OrderedDict[tuple[str, str], AgeEstimate] = OrderedDict()
+
+    def of(self, name: str, head: Any, time_ns: int) -> int:
+        """Return the time in ns, never after `time_ns`, that of the arrival; `time_ns` where the message has none."""
+        if name == topics.PLANT_STATE.name:
+            sent = head.t
+        elif name == topics.TICK.name:
+            sent = head.t + head.lateness
+        else:
+            return time_ns
+        key, arrived = (name, head.run_id), time_ns * 1e-9
+        ages = self._ages.get(key)
+        if ages is None:
+            ages = self._ages[key] = AgeEstimate()
+            if len(self._ages) > MOST_RUNS:
+                self._ages.popitem(last=False)
+        if not math.isfinite(sent) or not ages.plausible(sent, arrived):
+            return time_ns
+        ages.observe(sent, arrived)
+        age = ages.age(sent, arrived)
+        if age > OLDEST_S:
+            ages.reset()
+            ages.observe(sent, arrived)
+            return time_ns
+        return max(0, time_ns - round(age * 1e9))
