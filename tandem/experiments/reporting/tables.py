@@ -195,8 +195,10 @@ def _extremes(shown: dict[str, tuple[float, str]], what: str) -> str:
     if not shown:
         return "–"
     low, high = min(shown, key=lambda name: shown[name][0]), max(shown, key=lambda name: shown[name][0])
-    if low == high:
-        return f"{what}: {low} {shown[low][1]}"
+    if len(shown) == 1:
+        return f"{what}: {shown[low][1]} ({low})"
+    if shown[low][0] == shown[high][0]:
+        return f"{what}: {shown[low][1]} in every case"
     return f"{what}: lowest {shown[low][1]} ({low}), highest {shown[high][1]} ({high})"
 
 
