@@ -201,7 +201,7 @@ def _comes_with_tandem(model: Model) -> bool:
     return equations.rhs is shipped.rhs or _sha256_of(equations) == _sha256_of(shipped)
 
 
-def why_not_believed(work: Work) -> str | None:
+def why_not_trusted(work: Work) -> str | None:
     """Return why another user may have written a construction's files in the cache, and what to do; None if none can.
 
     Missing files are accepted.
@@ -297,7 +297,7 @@ def find_sets(config: Config, model: Model, cache: Path | None = None) -> Certif
     doubts: list[str] = []
     for kind in PREFERRED:
         work = Work.of(model, kind, start, None, SLACK, cache)
-        doubt = why_not_believed(work) if work.sets.exists() else None
+        doubt = why_not_trusted(work) if work.sets.exists() else None
         candidates = [work.sets] if doubt is None else []
         doubts += [doubt] if doubt is not None else []
         if _comes_with_tandem(model):

@@ -21,7 +21,7 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
     Raises:
         ConfigError: there are no sets for `invariant`.
     """
-    said = _of_states_that_are_known(config, model, sets)
+    said = _of_known_states(config, model, sets)
     if config.estimator.kind == "none" or config.controller.tightening == "none" or model.plant.dead_time:
         return said
     return (
@@ -30,7 +30,7 @@ def guarantee(config: Config, model: Model, sets: CertifiedSets | None = None) -
     )
 
 
-def _of_states_that_are_known(config: Config, model: Model, sets: CertifiedSets | None) -> str:
+def _of_known_states(config: Config, model: Model, sets: CertifiedSets | None) -> str:
     if model.plant.dead_time and config.controller.tightening in ("first_step", "tube"):
         return (
             f"guaranteed: nothing; {config.controller.tightening} tightens by the effect of W in one period, and not "

@@ -31,7 +31,7 @@ class Keyframes:
         self._states: deque[tuple[int, ControllerState]] = deque(maxlen=STATES_KEPT)
         self._heard: int | None = None
         self._due: list[float] = []
-        bus.when_heard(topics.KEYFRAME, self._hear_reader)
+        bus.when_heard(topics.KEYFRAME, self._add_listener)
 
     def remember(self, seq: int) -> None:
         """Store the state after tick `seq`, before the next tick begins."""
@@ -71,6 +71,6 @@ class Keyframes:
             del self._due[0]
             self.send(seq)
 
-    def _hear_reader(self, unsent: int) -> None:
+    def _add_listener(self, unsent: int) -> None:
         """Record a new listener, in a thread of the bus. It will receive the `unsent` messages of earlier ticks."""
         self._heard = unsent

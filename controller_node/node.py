@@ -261,11 +261,11 @@ class ControllerNode:
         # The plant refuses commands that answer none of its samples, and their policies. With a distrusted sensor the
         # policy would feed back a wrong measurement.
         obeyed = latched.verdict == "fresh"
-        believed = not outputs.result.sensor_faults
+        trusted = not outputs.result.sensor_faults
         if (
             self._backs_up
             and obeyed
-            and believed
+            and trusted
             and (backup := self._core.backup(outputs.command)) is not None
         ):
             self._bus.publish(topics.BACKUP, backup)

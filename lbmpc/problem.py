@@ -84,8 +84,7 @@ def build_problem(
     * `none`: plain X and U.
     * `first_step`: zbar_1 in X - W, plain X and U afterwards; state rows are soft.
     * `tube`: zbar_i in X - R_i, v_i in U - K R_i, zbar_N in Omega - R_N with Omega disturbance invariant. State rows
-    are
-      hard, because a problem that is feasible once stays feasible.
+      are hard, because a problem that is feasible once stays feasible.
     * `invariant`: v_0 is bounded so that the next state stays in the sets of `certificate`, hard. Later rows, and all
       rows outside the sets, are those of `first_step`.
 

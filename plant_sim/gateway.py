@@ -133,7 +133,7 @@ class Gateway:
         with (
             stopped_by_signals(stop) as stopping,
             punctual(config.realtime.priority, keep_awake=config.awake) as note,
-            _left_at_once(),
+            _interruptible(),
             Bus(config, "plant", run_id, stopping) as bus,
         ):
             loop = _Loop(shield, machine, bus, self._simulated)
@@ -154,7 +154,7 @@ def _leave_safe(shield: Shield, machine: Guarded) -> None:
 
 
 @contextmanager
-def _left_at_once() -> Iterator[None]:
+def _interruptible() -> Iterator[None]:
     """Accept a request to stop before there was a router."""
     try:
         yield
@@ -173,7 +173,7 @@ class _Loop:
         self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=d, inputs=m, arrived=self._arrived)
         self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=d, inputs=m, arrived=self._arrived)
         self._overrides: Inbox[Override] = Inbox(bus, topics.OVERRIDE, states=d, inputs=m)
-        names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
+        names = ("samples", "samples_skipped", "samples_late", *(f"driven_by_{source}" for source in NOTES))
         self._counts = dict.fromkeys(names, 0)
         self._source: InputSource = "hold"
         self._health: HealthPublisher | None = None
@@ -183,19 +183,19 @@ class _Loop:
         self._health = health
         garbage = GarbageCollection.at(self._period)
         garbage.begin()
-        pacer = Pacer(Grid(self._period, clock.now() + self._period), stop, partial(self._obey_until, stop))
+        pacer = Pacer(Grid(self._period, clock.now() + self._period), stop, partial(self._act_until, stop))
         while (turn := pacer.next()) is not None:
             self._sample(*turn)
-            self._say()
+            self._report()
             garbage.idle()
 
     def figures(self) -> dict[str, int]:
         """Return the counters for health, whose thread also runs while the loop waits for a call that hangs."""
         if self._machine.hangs:
-            self._say()
+            self._report()
         return self._counts | self._machine.counts
 
-    def _say(self) -> None:
+    def _report(self) -> None:
         if self._health is None:
             return
         moving, trouble = self._shield.moving, self._machine.trouble()
@@ -208,7 +208,7 @@ class _Loop:
         status: ProcessStatus = "failed" if trouble else "running" if moving else "ready"
         self._health.set(status, "; ".join(filter(None, (trouble, note))))
 
-    def _obey_until(self, stop: threading.Event, time: float) -> bool:
+    def _act_until(self, stop: threading.Event, time: float) -> bool:
         """Apply messages and due inputs until `time`; return False if told to stop."""
         # The loop sleeps before the sample, which is more punctual. Messages of that time act right after the sample.
         rest = time - STRETCH * self._period
@@ -240,10 +240,10 @@ class _Loop:
             state = self._shield.sample(slot.time, x, self._machine.measured)
             self._bus.publish(topics.PLANT_STATE, state)
             counts["samples"] += 1
-            counts[f"driven by {state.source}"] += 1
+            counts[f"driven_by_{state.source}"] += 1
             self._source = state.source
-        counts["samples skipped"] += slot.skipped
-        counts["samples late"] += lateness > LATE * self._period
+        counts["samples_skipped"] += slot.skipped
+        counts["samples_late"] += lateness > LATE * self._period
         self._shield.renew(slot.time, x, self._machine)
 
     def _take_orders(self) -> None:

@@ -109,7 +109,7 @@ class Shield:
         until = min(self._until, self.hand.until)
         return min(until, self._pending[0].arrived) if self._pending else until
 
-    # -- what is obeyed ----------------------------------------------------------------------------------
+    # -- accepted messages -------------------------------------------------------------------------------
 
     def command(self, command: Command, t: float) -> Verdict:
         """Let `command` act from time t on, or from the last sample if t lies before it.
@@ -163,7 +163,7 @@ class Shield:
         """
         self._jumped = True
 
-    # -- what acts ---------------------------------------------------------------------------------------
+    # -- acting inputs -----------------------------------------------------------------------------------
 
     def advance(self, t: float, machine: Machine) -> None:
         """Apply all inputs that are due by time t, each at its own time, for a plant in virtual time."""
@@ -231,7 +231,7 @@ class Shield:
         )
         del self._tape[:-MOST_ACTED]
 
-    # -- what a sample says ------------------------------------------------------------------------------
+    # -- samples -----------------------------------------------------------------------------------------
 
     def sample(self, t: float, x: np.ndarray, measured: float | None = None) -> PlantState:
         """Return the sample of x(t), (d,), with NaN for missing numbers, and of the inputs since the previous sample.

@@ -21,6 +21,7 @@ from tandem.commands.architecture import ArchitectureCommand
 from tandem.commands.base import INTERRUPTED, OPTIONAL_PACKAGES, Command
 from tandem.commands.config import ConfigCommand
 from tandem.commands.experiment import Experiment
+from tandem.commands.export import Export
 from tandem.commands.health import Health
 from tandem.commands.identify import Identify
 from tandem.commands.keys import KeysCommand
@@ -41,6 +42,7 @@ AnyCommand = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Report, subcommand("report")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Recover, subcommand("recover")]
     | Annotated[Router, subcommand("router")]
     | Annotated[Controller, subcommand("controller")]

@@ -8,13 +8,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
-from docs.generators import cli, configuration, messages, outside
+from docs.generators import outside
+from docs.generators.generated import GENERATED
 
-GENERATED = {
-    "reference/cli.md": cli.page,
-    "reference/configuration.md": configuration.page,
-    "reference/messages.md": messages.page,
-}
 # Files outside docs/ that mkdocs.yml lists.
 IN_THE_NAVIGATION = ("examples/README.md",)
 

@@ -85,8 +85,8 @@ class KalmanEstimator(Estimator):
         units = self._units = balanced(model.plant)[:d]
         least = self._least = LEAST * model.plant.x_scale
         told = GUESS * model.plant.x_scale if noise is None else noise
-        self._told = np.zeros(d)
-        self._told[measured] = np.maximum(told, least)[measured]
+        self._noise = np.zeros(d)
+        self._noise[measured] = np.maximum(told, least)[measured]
         sigma = np.maximum(process, least * model.period) / units
         rho = self._kept = float(np.exp(-model.period / correlation))
         self._F = np.block(
@@ -101,14 +101,14 @@ class KalmanEstimator(Estimator):
         self._any_input[:d, :d] = inputs @ inputs.T
         # For an unmeasured state: number of consecutive labels that carry the same information.
         self._repeats = (1.0 + rho) / (1.0 - rho)
-        guess = (self._told / units)[measured] ** 2
+        guess = (self._noise / units)[measured] ** 2
         self._finder = (
             NoiseFinder(self._F, self._Q, self._unknown, guess, measured) if noise is None else None
         )
 
     def initial_state(self) -> EstimatorState:
         d = self._model.d
-        finder = {} if self._finder is None else {"noise": self._told, **self._finder.initial_state()}
+        finder = {} if self._finder is None else {"noise": self._noise, **self._finder.initial_state()}
         return {
             **finder,
             "x": np.zeros(d),
@@ -120,7 +120,7 @@ class KalmanEstimator(Estimator):
 
     def noise(self, state: EstimatorState) -> np.ndarray:
         """Return the configured or estimated standard deviation of the measurements, (d,); 0 for unmeasured states."""
-        return state.get("noise", self._told)
+        return state.get("noise", self._noise)
 
     def found_noise(self, state: EstimatorState) -> np.ndarray:
         return state.get("noise", super().found_noise(state))
@@ -209,7 +209,7 @@ class KalmanEstimator(Estimator):
         pieces = ((delay, first), (self._model.period - delay, then)) if delay > 0.0 else ()
         after = self._predicted(state, self._nominal(state["x"], then, pieces))
         if self._is_lost(after):
-            return {**self._afresh(state), "sample": self.initial_state()["sample"]}
+            return {**self._reset(state), "sample": self.initial_state()["sample"]}
         if self._finder is not None:
             after = self._finder.begun(after, self._scaled(after))
         return {**after, "sample": np.array([source, min(sequence + 1, LAST)], dtype=np.int64)}
@@ -217,7 +217,7 @@ class KalmanEstimator(Estimator):
     def commanded(self, state: EstimatorState, u: np.ndarray) -> EstimatorState:
         return {**state, "inputs": np.stack([state["inputs"][1], u])}
 
-    def _afresh(self, state: EstimatorState) -> EstimatorState:
+    def _reset(self, state: EstimatorState) -> EstimatorState:
         """Return the memory with an unknown state. Commanded inputs and noise estimates are kept."""
         nothing = np.zeros(self._model.d)
         return {**state, "x": nothing, "disturbance": nothing.copy(), "covariance": self._unknown}
@@ -225,7 +225,7 @@ class KalmanEstimator(Estimator):
     def _begun(self, state: EstimatorState) -> Expected:
         """Return what is known about a sample without a usable past."""
         nothing = np.full(self._model.d, np.nan)
-        return Expected(self._afresh(state), None, nothing, nothing, begins=True)
+        return Expected(self._reset(state), None, nothing, nothing, begins=True)
 
     def _is_lost(self, state: EstimatorState) -> bool:
         return not (np.diag(state["covariance"])[: self._model.d] <= self._lost).all()

@@ -76,7 +76,7 @@ class SupervisedEstimator(Estimator):
         self._measured = np.zeros(model.d, dtype=bool)
         self._measured[measured] = True
         self._well = max(WELL_SAMPLES, round(WELL / model.period))
-        self._unseen = cache(self._words_of_unseen)
+        self._unseen = cache(self._describe_unobservable)
 
     def initial_state(self) -> EstimatorState:
         nothing = np.zeros(self._model.d)
@@ -207,11 +207,11 @@ class SupervisedEstimator(Estimator):
             leapt &= leaps == 0
         return leapt, np.where(leapt & (leaps == 0), innovation, state["leap"])
 
-    def _words_of_unseen(self, believed: tuple[int, ...]) -> str:
+    def _describe_unobservable(self, trusted: tuple[int, ...]) -> str:
         """Describe the effect on the states whose sensors are not among the trusted ones."""
-        if not believed:
+        if not trusted:
             return "nothing is measured any more"
-        unseen = unobservable(self._model, np.array(believed))
+        unseen = unobservable(self._model, np.array(trusted))
         if not unseen:
             return "what it measures is estimated from the others"
         names = ", ".join(self._model.plant.states[i] for i in unseen)

@@ -152,9 +152,9 @@ def _logarithm(A: np.ndarray, B: np.ndarray, units: np.ndarray) -> np.ndarray | 
     block = block.real
     block[d:] = 0.0
     size = np.abs(whole).max()
-    believed = np.abs(expm(block) - whole).max() <= BACK * size
+    accurate = np.abs(expm(block) - whole).max() <= BACK * size
     half = np.abs(expm(0.5 * block)).max()
-    return block * units[:, None] / units if believed and half <= EXCURSION * max(size, 1.0) else None
+    return block * units[:, None] / units if accurate and half <= EXCURSION * max(size, 1.0) else None
 
 
 def balanced(plant: Description) -> np.ndarray:

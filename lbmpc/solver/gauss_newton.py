@@ -120,8 +120,7 @@ class Solver:
             oracle_parameters: theta, as packed by the oracle.
             warm_start: initial c, (N, m), for example that of an earlier solution; it may be infeasible.
             xr, ur: references over the horizon, (N + 1, d) and (N, m), or one row for the whole horizon; the
-            equilibrium
-                by default.
+                equilibrium by default.
             first: hard bounds on v_0 for this solve, (m,) each, inside U; U by default.
             previous: the present input, (m,), as v_{-1} and u_{-1}; the equilibrium input by default. It has no effect
                 without rate limits and S.

@@ -194,7 +194,7 @@ class Inbox(Generic[M]):
         sent = None if self._sent is None else self._sent(message)
         followed = self.follower.run_id
         leapt = sent is not None and message.run_id == followed and not self._ages.plausible(sent, arrived)
-        # After a silence the sender's clock is accepted as it is, so that the sender is not rejected for ever.
+        # After a silence the sender's clock is accepted as it is, so that the sender is not rejected permanently.
         if leapt and not self.follower.silent(arrived):
             self._bad.count(self.topic.name, "implausible time", f"sent at {sent} s by {message.run_id}")
             return None

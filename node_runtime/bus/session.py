@@ -58,7 +58,7 @@ def session_config(
         more: additional settings, for links with certificates.
 
     Raises:
-        ConfigError: an endpoint is not like `tcp/127.0.0.1:7447`. Zenoh itself would retry it for ever.
+        ConfigError: an endpoint is not like `tcp/127.0.0.1:7447`. Zenoh itself would retry it without end.
     """
     for key, place in (("endpoint", endpoint), ("remote", remote)):
         if place is not None and not ENDPOINT.fullmatch(place):
@@ -151,8 +151,7 @@ def connect(
     Raises:
         OpenInterrupted: `stop` was set.
         ConfigError: the endpoint is not valid, our certificate cannot be used, or either side refuses the other, so
-        that
-            waiting cannot help. The text says why.
+            that waiting cannot help. The text says why.
     """
     tls = None
     if secure(config.bus.endpoint):

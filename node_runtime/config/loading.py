@@ -78,9 +78,9 @@ def from_tree(
         origins_folder: the same for keys in `origins`; None for the current folder.
     """
     fail = strict.failing(where, origins)
-    config = _at_home(_checked(tree, where, origins), fail)
+    config = _with_home_folder(_checked(tree, where, origins), fail)
     places = {**dict.fromkeys(origins or {}, origins_folder or Path.cwd()), "": folder}
-    return _written_out(config, fail, places)
+    return _with_absolute_references(config, fail, places)
 
 
 def _checked(tree: dict[str, Any], where: str, origins: Mapping[str, str] | None = None) -> Config:
@@ -161,7 +161,7 @@ def _check_texts(value: Any, fail: Fail, key: str = "") -> None:
         fail(key, f"{key} = '{said}' is not UTF-8, which a configuration must be; choose another name")
 
 
-def _at_home(config: Config, fail: Fail) -> Config:
+def _with_home_folder(config: Config, fail: Fail) -> Config:
     """Replace `~` by the home folder, as a shell would have done."""
 
     def found(key: str, section: Section) -> Any:
@@ -183,7 +183,7 @@ def _at_home(config: Config, fail: Fail) -> Config:
     return msgspec.structs.replace(config, controller=controller, bus=bus, trainer=trainer, log=log)
 
 
-def _written_out(config: Config, fail: Fail, places: Mapping[str, Path | None]) -> Config:
+def _with_absolute_references(config: Config, fail: Fail, places: Mapping[str, Path | None]) -> Config:
     """Make references absolute, so that every process of a run finds the same file from any folder.
 
     places: base folders by key; "" is the key of all others.

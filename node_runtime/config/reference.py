@@ -148,20 +148,22 @@ def _from_file(path: Path) -> tuple[ModuleType, str]:
         del sys.modules[name]
         if not isinstance(error, Exception | SystemExit):
             raise
-        raise _told(error, str(path)) from error
+        raise _user_code_error(error, str(path)) from error
     return module, sha256
 
 
 def _from_package(package: str, name: str) -> tuple[ModuleType, str]:
     if not all(part.isidentifier() for part in package.split(".")):
         raise ConfigError(
-            f"{package}: neither a file that ends in .py nor the name of a package{_rather(package, name)}"
+            f"{package}: neither a file that ends in .py nor the name of a package{_suggestion(package, name)}"
         )
     top = package.partition(".")[0]
     with _installed_only():
         found = next(filter(None, (finder.find_spec(top, None) for finder in sys.meta_path)), None)
         if found is None:
-            raise ConfigError(f"{package}: no package called {top!r} is installed{_rather(package, name)}")
+            raise ConfigError(
+                f"{package}: no package called {top!r} is installed{_suggestion(package, name)}"
+            )
         try:
             module = importlib.import_module(package)
         except (Exception, SystemExit) as error:
@@ -169,12 +171,12 @@ def _from_package(package: str, name: str) -> tuple[ModuleType, str]:
             if absent is not None and f"{package}.".startswith(f"{absent}."):
                 inside, _, last = absent.rpartition(".")
                 raise ConfigError(f"{package}: {inside} has no module called {last!r}") from None
-            raise _told(error, found.origin or package) from error
+            raise _user_code_error(error, found.origin or package) from error
     file = Path(module.__file__ or "")
     return module, hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
-def _rather(place: str, name: str) -> str:
+def _suggestion(place: str, name: str) -> str:
     """Suggest the file that may have been meant instead of a package, as the end of a message."""
     file = os.path.splitext(place)[0] + ".py"
     if os.path.isfile(os.path.expanduser(file)):
@@ -201,7 +203,7 @@ def _installed_only() -> Iterator[None]:
         sys.path[:] = [*before, *(entry for entry in sys.path if entry not in before)]
 
 
-def _told(error: BaseException, file: str) -> ConfigError:
+def _user_code_error(error: BaseException, file: str) -> ConfigError:
     """Describe an exception of user code in one line, with the last line of the user's code that led to it."""
     folder = os.path.dirname(file)
     lines = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]

@@ -162,7 +162,9 @@ class ControllerConfig(Section, frozen=True):
     """Estimate of h: "linear" (none), "constant" (filtered offset), "l2nw" (kernel regression), "dnn" (neural network)
     or "perfect" (the true h, for experiments)."""
     tightening: literals.TighteningName = "first_step"
-    """How W tightens the nominal constraints."""
+    """How W tightens the nominal constraints. "none": not at all. "first_step": the next predicted state stays in
+    X - W. "tube": every step of the plan is tightened, and its sets may be empty. "invariant": the next state stays in
+    certified sets."""
     sets: str | None = None
     """File of certified sets for "invariant". Without it those that `tandem sets compute` left in the cache."""
     W: Annotated[list[NonNegative] | None, unit("plant units per second")] = None
@@ -258,18 +260,18 @@ class TrialConfig(Section, frozen=True):
     enabled: bool = True
     """Try new hidden weights before they are adopted."""
     seconds: Seconds | None = None
-    """How far back the samples reach on which an offered set is tried. Without it four time scales of the plant."""
+    """Time that the samples cover on which an offered set is tried. Without it four time scales of the plant."""
     samples: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 80
-    """Number of these samples. A fast loop takes one every few ticks, and a slow one reaches further back."""
+    """Number of these samples. A fast loop takes one of every few ticks. A slow loop covers more time with them."""
     confirm: Seconds | None = None
     """Time after an adoption in which a set that predicts worse than the one before is rolled back. Without it one
     time scale, and at least 20 samples."""
     margin: NonNegative = 0.2
     """Share by which the mean squared error of a new set may exceed the old one's."""
     floor: Annotated[NonNegative, unit("output scale")] = 0.003
-    """RMS error below which an offered set is good enough in any case."""
+    """RMS error below which an offered set is accepted, whatever the error of the set in use."""
     floor_after: Annotated[NonNegative, unit("output scale")] = 0.1
-    """The same for an adopted set, so that an error that K has not learned yet is no reason to roll back."""
+    """The same for an adopted set. It is larger, because K needs samples until it fits the new layers."""
 
 
 class KalmanConfig(Section, frozen=True):
@@ -349,7 +351,9 @@ class TrainerConfig(Section, frozen=True):
     capacity: Annotated[Count, unit("samples")] = 2000
     """p_max, the capacity of the replay buffer."""
     strategy: literals.Strategy = "fifo"
-    """Which sample a full buffer drops."""
+    """Which sample a full buffer drops. "fifo": the oldest. "reservoir": a random one, so that all samples so far
+    are kept with the same probability. "novelty": the younger of the two closest samples, which suits a plant that does
+    not change."""
     train_every: Annotated[Count, unit("samples")] = 10
     """New samples between two trainings."""
     min_samples: Annotated[Count, unit("samples")] = 20
@@ -378,16 +382,18 @@ class BusConfig(Section, frozen=True):
     """The bus, Zenoh."""
 
     endpoint: str = "tcp/127.0.0.1:7447"
-    """Where the router listens; all other processes are its clients. tls/HOST:PORT needs `tls.keys`
-    (docs/tutorials/remote.md)."""
+    """Address of the router. All other processes connect to it as clients. tls/HOST:PORT needs `tls.keys`
+    (docs/tutorials/remote.md). `tandem run` picks a free port if the key is not given."""
     remote: str | None = None
     """Additional address of the router for other machines, such as tls/0.0.0.0:7448. Only the router uses it."""
     insecure: bool = False
-    """true: no warning that anyone who reaches a tcp/ endpoint beyond this machine may command the plant."""
+    """true: do not warn of a tcp/ endpoint that other machines can reach. Any program that connects to such an endpoint
+    can command the plant."""
     tls: TlsConfig = TlsConfig()
     """The certificate."""
     lease_ms: Milliseconds = 1500
-    """A controller or plant that sends nothing for so long counts as disconnected; readers after at least 10 s."""
+    """A controller or plant that sends nothing for this time counts as disconnected. For all other processes the time
+    is at least 10 s."""
     follow_silence: Seconds = 1.0
     """Silence after which another run of a process may take over its topics."""
 
@@ -423,8 +429,8 @@ class RealtimeConfig(Section, frozen=True):
     awake: literals.AwakeMode = "auto"
     """Keep the cores from sleeping between slots. "auto": with a priority and a period below 10 ms."""
     cores: Literal["auto", "any"] | list[Annotated[int, msgspec.Meta(ge=0, le=8191)]] = "auto"
-    """Core of the controller's loop and core of the plant's. "auto": two of their own where `awake` would be needed.
-    "any": as the scheduler likes."""
+    """Cores of the controller's loop and of the plant's, in this order. "auto": one core for each loop where `awake`
+    would be needed and the process may use two. "any": the scheduler chooses."""
 
 
 class Config(Section, frozen=True):

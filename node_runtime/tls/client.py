@@ -1,6 +1,6 @@
 """A client's TLS link: its certificate, checked first, and the reason if client and router refuse each other.
 
-Zenoh's client retries a refused link for ever and does not report the reason. A separate TLS handshake finds the
+Zenoh's client retries a refused link without end and does not report the reason. A separate TLS handshake finds the
 reason.
 """
 

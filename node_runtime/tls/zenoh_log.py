@@ -31,19 +31,19 @@ READ_BYTES = 256 * 1024
 MAX_NAMES = 1000
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_OURS = re.compile(
+_ZENOH_LINE = re.compile(
     r"^\d{4}-\d\d-\d\dT\S+ +[A-Z]+ .*?(?P<thread>ThreadId\(\d+\)) (?P<module>zenoh\S*): (?P<text>.*)$"
 )
 _TAIL = re.compile(r" Hint: increase the system open file limit\.?$| at /\S+:\d+\.?$")
-_STRANGER = re.compile(r"^[0-9a-f]+ did not match any configured ACL subject")
+_UNKNOWN_CLIENT = re.compile(r"^[0-9a-f]+ did not match any configured ACL subject")
 _NAMED = re.compile(r"^(?P<zid>[0-9a-f]+) on \S*CertCommonName\((?P<name>[^)]*)\)")
 _DENIED = re.compile(
     r"^(?:Using cached result: )?(?P<zid>[0-9a-f]+) (?:on \S+ )?is unauthorized to "
     r"(?P<what>.+?) \(ingress\) on (?P<key>.+)$"
 )
 # Before the first message on a key, Zenoh checks all permissions for it, in this order and with this end.
-_WONDERING, _LAST_QUESTION = "caching permissions for", "Declare Liveliness Subscriber ("
-_TOLD = (b"unauthorized", b"caching permissions", b"Declare Liveliness Subscriber")
+_CHECKING, _LAST_QUESTION = "caching permissions for", "Declare Liveliness Subscriber ("
+_RELEVANT = (b"unauthorized", b"caching permissions", b"Declare Liveliness Subscriber")
 _KNOWN = {*topics.BY_NAME, topics.OUTBOX_QUERY, topics.HIDDEN_QUERY}
 _REASONS = (
     ("peer sent no certificates", "it has no certificate"),
@@ -62,12 +62,12 @@ class Refusals:
 
     def __init__(self, bad: RejectedMessages):
         self._bad = bad
-        self._wondering: set[str] = set()
+        self._checking: set[str] = set()
         self._names: OrderedDict[str, str] = OrderedDict()
 
     def read(self, line: str) -> bool:
         """Process a line; return whether it belongs to Zenoh's log."""
-        found = _OURS.match(_COLOUR.sub("", line).rstrip())
+        found = _ZENOH_LINE.match(_COLOUR.sub("", line).rstrip())
         if found is None:
             return False
         thread, module, text = found["thread"], found["module"], found["text"]
@@ -84,13 +84,13 @@ class Refusals:
             self._names.move_to_end(named["zid"])
             if len(self._names) > MAX_NAMES:
                 self._names.popitem(last=False)
-        if _STRANGER.match(text):
+        if _UNKNOWN_CLIENT.match(text):
             self._bad.count("TLS link", "a certificate without rights here", text)
-        elif _WONDERING in text:
-            self._wondering.add(thread)
-        elif thread in self._wondering and not text.startswith("Using"):
+        elif _CHECKING in text:
+            self._checking.add(thread)
+        elif thread in self._checking and not text.startswith("Using"):
             if _LAST_QUESTION in text:
-                self._wondering.discard(thread)
+                self._checking.discard(thread)
         elif (denied := _DENIED.match(text)) is not None:
             name = self._names.get(denied["zid"], "no certificate known here")
             what, key = denied["what"].split("/")[0].lower(), denied["key"]
@@ -138,7 +138,7 @@ def _read(reading: int, real: int, refusals: Refusals) -> None:
         *lines, rest = (rest + chunk).split(b"\n")
         for line in lines:
             # Most lines are about allowed messages, so skipping them must be cheap.
-            if b"is authorized to" in line and not any(mark in line for mark in _TOLD):
+            if b"is authorized to" in line and not any(mark in line for mark in _RELEVANT):
                 continue
             text = line.decode(errors="replace")
             if not refusals.read(text):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from lbmpc.plants import Description
@@ -43,19 +42,20 @@ class Views:
     Args:
         config: the resolved configuration.
         plant: its names and units label the views.
-        most_hz: views a second of one topic, where `Topic.view_hz` allows more. Events are made of all messages.
+        most_hz: views a second of one topic; None: as many as `Topic.view_hz` says, and `topics.VIEW_HZ` of a user's.
+            Events are made of all messages.
     """
 
-    def __init__(self, config: Config, plant: Description, most_hz: float = math.inf):
+    def __init__(self, config: Config, plant: Description, most_hz: float | None = None):
         self._views = views(plant)
         self._bounds, self._targets, self._events = Bounds(config, plant), Targets(plant), Events()
         self._lost = LostTicks(config.bus.follow_silence)
         self._times = SendTimes()
         self._users: dict[str, UserView] = {}
         self._every_ns: dict[str, int] = {
-            name: int(1e9 / min(view.topic.view_hz, most_hz)) for name, view in self._views.items()
+            name: int(1e9 / (most_hz or view.topic.view_hz)) for name, view in self._views.items()
         }
-        self._user_every_ns = int(1e9 / min(topics.VIEW_HZ, most_hz))
+        self._user_every_ns = int(1e9 / (most_hz or topics.VIEW_HZ))
         self._due: dict[str, int] = {}
         """When, in ns, a topic's next view is due; what comes earlier has none."""
 

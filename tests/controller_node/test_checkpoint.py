@@ -1,4 +1,4 @@
-"""The checkpoint: whole at every moment, used only where it belongs, and the memory of a killed controller."""
+"""The checkpoint: complete at every moment, used only by its controller, and the memory of a killed controller."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def batch(run_id: str, seqs: range) -> m.Samples:
     return m.Samples(run_id=run_id, seq=seqs[-1], samples=[sample(seq) for seq in seqs])
 
 
-class Anybody:
-    """A controller that goes on with everything that belongs to it."""
+class AnyController:
+    """A controller that continues with any checkpoint that belongs to it."""
 
     def __init__(self, belongs: dict[str, str]):
         self._belongs = belongs
@@ -64,11 +64,11 @@ class Anybody:
         assert run_id == "controller-a"
 
 
-ME = Anybody(BELONGS)
+ME = AnyController(BELONGS)
 
 
 def counts() -> dict[str, int]:
-    return {"checkpoints written": 0, "checkpoints failed": 0}
+    return {"checkpoints_written": 0, "checkpoints_failed": 0}
 
 
 def memory(seq: int = 7) -> Snapshot:
@@ -84,7 +84,7 @@ def written(path: Path, outbox: Outbox | None = None, samples: int = 100) -> Che
 # -- the file ------------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
     outbox = Outbox("controller-b", earlier=[batch("controller-a", range(3))])
     for seq in range(5):
         outbox.add(sample(seq))
@@ -105,9 +105,9 @@ def test_only_the_newest_samples_are_saved(tmp_path: Path) -> None:
             outbox.add(sample(seq))
             if seq % 10 == 9:
                 wait_for(lambda: writer.wanted)
-                done = counted["checkpoints written"]
+                done = counted["checkpoints_written"]
                 writer.offer(memory(seq))
-                wait_for(lambda done=done: counted["checkpoints written"] > done)
+                wait_for(lambda done=done: counted["checkpoints_written"] > done)
     saved = [codec.decode_as(m.Samples, payload) for payload in read(tmp_path / "memory", BELONGS).samples]
     assert [each.seq for one in saved for each in one.samples] == list(range(30, 60))
     assert {one.run_id for one in saved} == {"controller-b"}
@@ -125,7 +125,7 @@ def spoilt(content: bytes, how: str) -> bytes:
 
 
 @pytest.mark.parametrize("how", ["truncated", "empty", "garbage", "one bit", "longer"])
-def test_a_damaged_file_is_named_and_kept_aside(
+def test_a_damaged_file_is_reported_and_renamed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
     path = tmp_path / "memory"
@@ -140,21 +140,21 @@ def test_a_damaged_file_is_named_and_kept_aside(
     assert (tmp_path / "memory.damaged").read_bytes() == bad
 
 
-def test_another_controllers_file_is_refused_says_what_differs_and_is_kept(
+def test_another_controllers_file_is_refused_with_the_differences_and_renamed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "memory"
     written(path)
     with pytest.raises(OtherController):
         read(path, {**BELONGS, "rate": "50.0"})
-    assert resume(Anybody({**BELONGS, "rate": "50.0"}), path) is None
+    assert resume(AnyController({**BELONGS, "rate": "50.0"}), path) is None
     assert "rate is 20.0 there and 50.0 here" in caplog.text
     assert "plant" not in caplog.text
     assert (tmp_path / "memory.other").exists()
-    assert resume(ME, path) is None, "nothing is left under the first name"
+    assert resume(ME, path) is None, "no file remains under the first name"
 
 
-def test_numbers_that_are_not_finite_are_no_memory(tmp_path: Path) -> None:
+def test_nonfinite_numbers_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "memory"
     with CheckpointWriter(path, BELONGS, Outbox("controller-a"), 10, counts()) as writer:
         writer.offer(Snapshot(0, {"K": m.Array.of(np.array([1.0, np.nan]))}, {}))
@@ -162,7 +162,7 @@ def test_numbers_that_are_not_finite_are_no_memory(tmp_path: Path) -> None:
         read(path, BELONGS)
 
 
-def test_a_full_disk_is_warned_of_once_counted_and_leaves_the_old_file(
+def test_a_full_disk_is_logged_once_counted_and_leaves_the_old_file(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -181,7 +181,7 @@ def test_a_full_disk_is_warned_of_once_counted_and_leaves_the_old_file(
         for failures in range(3):
             wait_for(lambda: writer.wanted)
             writer.offer(memory(failures))
-            wait_for(lambda failures=failures: counted["checkpoints failed"] > failures)
+            wait_for(lambda failures=failures: counted["checkpoints_failed"] > failures)
         assert path.read_bytes() == before
         assert caplog.text.count("No space left on device") == 1
         full.clear()
@@ -192,14 +192,14 @@ def test_a_full_disk_is_warned_of_once_counted_and_leaves_the_old_file(
     assert [file.name for file in tmp_path.iterdir()] == ["memory"]
 
 
-# -- a controller that goes on -------------------------------------------------------------------------------
+# -- a controller that continues -----------------------------------------------------------------------------
 
 
 def config(*more: str) -> Config:
     return load(None, [*SMALL, "trainer.steps=5", *more])
 
 
-def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> None:
+def test_a_controller_continues_with_its_memory_and_its_log_replays() -> None:
     before = ControllerCore(config(), "controller-a")
     run = simulate(config(), 80)
     for entry in run.entries(topics.TICK)[:60]:
@@ -220,7 +220,7 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
     assert then is not None
     assert snapshot.hidden_sha256 == then.hidden_sha256
     assert snapshot.hidden_sha256 == hash_layers([layer.numpy() for layer in snapshot.layers])
-    # The new run, from its first tick: its log says where it came from, and replays.
+    # The log of the new run contains its origin from the first tick on, and can be replayed.
     log: list[tuple[topics.Topic, m.Message, int]] = [
         (topics.RUN_INFO["controller"], after.run_info(0.0), 0),
         (topics.KEYFRAME, first, 0),
@@ -231,7 +231,7 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
         )
         outputs = after.step(tick)
         if tick.seq == 1:
-            # The sample that the new process sees whole is the one that the old one would have learned next.
+            # The first complete sample of the new process is the next one that the old process would have learned.
             assert outputs.result.h_hat == run.results[60].h_hat
         log += [(topics.TICK, tick, tick.seq), (topics.COMMAND, outputs.command, tick.seq)]
         log += [(topics.RESULT, outputs.result, tick.seq)]
@@ -241,7 +241,7 @@ def test_a_controller_goes_on_with_what_it_had_learned_and_its_log_replays() -> 
     assert any("goes on from the memory of controller-a" in note for note in found.notes)
 
 
-def test_memory_of_another_shape_is_named() -> None:
+def test_memory_of_another_shape_is_reported() -> None:
     core, other = ControllerCore(config(), "a"), ControllerCore(config("network.hidden=[9, 8]"), "b")
     with pytest.raises(ValueError, match=r"array oracle\.W1 is"):
         core.memory.go_on(other.memory.lasting(), "b")
@@ -266,7 +266,7 @@ def test_what_a_checkpoint_belongs_to(change: str, word: str) -> None:
     assert word in differing
 
 
-def test_the_outbox_gives_earlier_runs_to_who_asks_for_all() -> None:
+def test_the_outbox_includes_earlier_runs_in_a_query_for_all() -> None:
     outbox = Outbox(
         "controller-b", earlier=[batch("controller-a", range(5)), batch("controller-a", range(5, 8))]
     )
@@ -286,7 +286,7 @@ def test_the_outbox_gives_earlier_runs_to_who_asks_for_all() -> None:
 
 
 def play(bus: Bus, states: list[m.PlantState], period: float) -> None:
-    """A plant that was recorded: whatever is commanded, it goes on where it was."""
+    """Play a recorded plant, which ignores commands."""
     due = clock.now()
     for state in states:
         due = max(due + period, clock.now())
@@ -295,7 +295,7 @@ def play(bus: Bus, states: list[m.PlantState], period: float) -> None:
 
 
 @pytest.mark.live
-def test_a_killed_controller_comes_back_with_its_memory(tmp_path: Path) -> None:
+def test_a_killed_controller_is_restarted_with_its_memory(tmp_path: Path) -> None:
     path = tmp_path / "memory"
     live = live_config(*SMALL, f'controller.checkpoint="{path}"', "rate=50", "trainer.enabled=false")
     states: list[m.PlantState] = simulate(live, 140).plant_states
@@ -338,12 +338,14 @@ def test_a_killed_controller_comes_back_with_its_memory(tmp_path: Path) -> None:
     assert [one.run_id for one in asked] == sorted((one.run_id for one in asked), key=killed.__ne__)
     assert {one.run_id for one in asked} == {killed, new[0].run_id}
     assert last.run_id == new[0].run_id
-    assert last.counters["checkpoints failed"] == 0
+    assert last.counters["checkpoints_failed"] == 0
 
 
 @pytest.mark.live
 @pytest.mark.parametrize("content", ["garbage", "other"])
-def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: Path, content: str) -> None:
+def test_a_controller_starts_without_memory_beside_an_unusable_checkpoint(
+    tmp_path: Path, content: str
+) -> None:
     path = tmp_path / "memory"
     live = live_config(*SMALL, f'controller.checkpoint="{path}"', "rate=50", "trainer.enabled=false")
     if content == "garbage":
@@ -372,23 +374,23 @@ def test_a_controller_starts_afresh_beside_a_checkpoint_it_cannot_use(tmp_path: 
     (aside,) = [file for file in tmp_path.iterdir() if file.suffix in (".damaged", ".other")]
     assert aside.suffix == (".damaged" if content == "garbage" else ".other")
     assert ear.of(topics.KEYFRAME)[0].resumed == ""
-    # At its orderly end it left a checkpoint of its own.
+    # At its orderly end it wrote a checkpoint of its own.
     assert read(path, ControllerCore(live, "x").memory.belongs()).run_id == ear.of(topics.TICK)[0].run_id
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere")])
-def test_a_pipe_or_a_link_as_checkpoint_blocks_nothing_and_keeps_its_place(
+def test_a_pipe_or_a_link_as_checkpoint_does_not_block_and_is_kept(
     make: Callable[[Path], None], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "elsewhere").write_bytes(b"not a checkpoint")
     path = tmp_path / "checkpoint"
     make(path)
     kind = path.lstat().st_mode
-    assert resume(Anybody(BELONGS), path) is None
+    assert resume(AnyController(BELONGS), path) is None
     counts_ = counts()
     with CheckpointWriter(path, BELONGS, Outbox("controller-1"), 100, counts_) as writer:
         writer.offer(memory())
-    assert counts_["checkpoints failed"] == 1
+    assert counts_["checkpoints_failed"] == 1
     assert path.lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_bytes() == b"not a checkpoint"
     assert caplog.text.count("only regular files are read, replaced or moved") == 2

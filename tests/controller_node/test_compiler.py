@@ -1,4 +1,4 @@
-"""Compiled kernels: the same numbers, cached by content, and never a reason to fail."""
+"""Compiled kernels: equal numbers, a cache by content, and no failures."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_second_start_compiles_nothing(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
 
 
-def test_another_function_is_another_library_although_its_name_is_the_same(tmp_path: Path) -> None:
+def test_functions_of_one_name_have_separate_libraries(tmp_path: Path) -> None:
     x = ca.MX.sym("x")
     twice, thrice = (ca.Function("f", [x], [factor * x]) for factor in (2, 3))
     compiler = Compiler(tmp_path)
@@ -88,7 +88,7 @@ def test_another_function_is_another_library_although_its_name_is_the_same(tmp_p
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_concurrent_starts_leave_one_whole_library(tmp_path: Path) -> None:
+def test_concurrent_starts_leave_one_complete_library(tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
         "from tests.controller_node.test_compiler import small, is_compiled, Compiler; import numpy as np;"
@@ -118,7 +118,7 @@ def script(path: Path, body: str) -> str:
         ("", "does not say its version"),
     ],
 )
-def test_a_broken_compiler_costs_speed_and_one_line(
+def test_a_broken_compiler_gives_one_warning_and_slower_functions(
     body: str, reason: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     compiler = Compiler(tmp_path / "cache", script(tmp_path / "cc", body))
@@ -134,7 +134,7 @@ def test_a_broken_compiler_costs_speed_and_one_line(
     assert compiler.note.startswith("not compiled")
 
 
-def test_without_a_compiler_one_line_says_so(
+def test_without_a_compiler_there_is_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -143,7 +143,9 @@ def test_without_a_compiler_one_line_says_so(
     assert "no C compiler" in caplog.text
 
 
-@pytest.mark.skipif(os.geteuid() == 0 and not Path("/proc").exists(), reason="needs a directory that refuses")
+@pytest.mark.skipif(
+    os.geteuid() == 0 and not Path("/proc").exists(), reason="needs a directory that is not writable"
+)
 def test_a_cache_that_cannot_be_written_is_replaced_by_a_temporary_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,7 +155,7 @@ def test_a_cache_that_cannot_be_written_is_replaced_by_a_temporary_one(
     assert is_compiled(Compiler(blocked / "cache")(small()))
 
 
-def test_new_weights_rebuild_nothing_and_are_written_in_place(tmp_path: Path) -> None:
+def test_new_weights_recompile_nothing(tmp_path: Path) -> None:
     oracle = oracle_named("dnn", MODEL)
     bound = Bound(Compiler(tmp_path)(function(oracle)))
     rng = np.random.default_rng(1)
@@ -166,28 +168,28 @@ def test_new_weights_rebuild_nothing_and_are_written_in_place(tmp_path: Path) ->
     assert len(list(tmp_path.iterdir())) == 1
 
 
-# -- what is loaded ------------------------------------------------------------------------------------------
+# -- damaged libraries ---------------------------------------------------------------------------------------
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
-SOMEBODY = 12345
+OTHER_USER = 12345
 
 
 def built(cache: Path) -> Path:
-    """The library of `small` in a cache."""
+    """Return the library of `small` in a cache."""
     assert is_compiled(Compiler(cache)(small()))
     (library,) = cache.glob("small-*.so")
     return library
 
 
 def replaced(library: Path, content: bytes) -> None:
-    """As another inode: this process may have the old one in its memory."""
+    """Replace a file by a new inode, because this process may have the old one mapped."""
     library.unlink()
     library.write_bytes(content)
     library.chmod(0o600)
 
 
 def runs_compiled(cache: Path, caplog: pytest.LogCaptureFixture) -> bool:
-    """Whether a start uses compiled code; the answer is right in any case. `caplog` has what it said."""
+    """Return whether a start uses compiled code, after checking its results; `caplog` has the log lines."""
     caplog.clear()
     with caplog.at_level(logging.INFO):
         f = Compiler(cache)(small())
@@ -202,12 +204,12 @@ def runs_compiled(cache: Path, caplog: pytest.LogCaptureFixture) -> bool:
         lambda whole: b"",
         lambda whole: os.urandom(len(whole)),
         lambda whole: whole[: len(whole) // 2] + b"\0" * 64 + whole[len(whole) // 2 + 64 :],
-        lambda whole: whole[:-100],  # what a version without checksums left
+        lambda whole: whole[:-100],  # as written by a version without checksums
         lambda whole: whole[:-1],
     ],
     ids=["cut", "empty", "garbage", "one block of zeros", "no checksum", "cut checksum"],
 )
-def test_a_damaged_library_is_seen_before_it_is_loaded_and_compiled_again(
+def test_a_damaged_library_is_detected_and_compiled_again(
     damaged: Callable[[bytes], bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     library = built(tmp_path)
@@ -233,9 +235,7 @@ def test_a_library_cut_in_place_does_not_end_the_next_process(tmp_path: Path) ->
     assert is_sealed(library.read_bytes(), library.name)
 
 
-def test_one_library_under_the_name_of_another_is_not_loaded(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_library_under_another_name_is_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     x = ca.MX.sym("x")
     Compiler(tmp_path)(ca.Function("f", [x], [2 * x]))
     (other,) = tmp_path.iterdir()
@@ -244,7 +244,9 @@ def test_one_library_under_the_name_of_another_is_not_loaded(
     assert f"{library}: its content has changed" in caplog.text
 
 
-def test_several_damaged_libraries_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_several_damaged_libraries_give_one_log_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     x = ca.MX.sym("x")
     functions = [ca.Function("f", [x], [factor * x]) for factor in (2, 3)]
     for one in functions:
@@ -257,7 +259,7 @@ def test_several_damaged_libraries_are_one_line(tmp_path: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("elsewhere")])
-def test_what_is_no_file_keeps_its_place_and_costs_no_speed(
+def test_other_kinds_of_files_are_kept_and_avoided(
     make: Callable[[Path], None], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     library = built(tmp_path)
@@ -270,7 +272,7 @@ def test_what_is_no_file_keeps_its_place_and_costs_no_speed(
     assert sorted(tmp_path.iterdir()) == sorted([library, library.with_suffix(".2.so")])
 
 
-def test_what_a_broken_compiler_made_is_not_found_by_a_better_one(tmp_path: Path) -> None:
+def test_the_output_of_a_broken_compiler_is_not_reused(tmp_path: Path) -> None:
     cache, name = tmp_path / "cache", 'if [ "$1" = --version ]; then cc --version'
     command = script(tmp_path / "cc", f'{name}; else echo garbage > "$3"; fi')
     assert not is_compiled(Compiler(cache, command)(small()))
@@ -278,10 +280,10 @@ def test_what_a_broken_compiler_made_is_not_found_by_a_better_one(tmp_path: Path
     assert is_compiled(Compiler(cache, command)(small()))
 
 
-# -- whose it is ---------------------------------------------------------------------------------------------
+# -- ownership -----------------------------------------------------------------------------------------------
 
 
-def test_the_cache_is_for_its_owner_alone_whatever_the_umask(tmp_path: Path) -> None:
+def test_only_the_owner_can_use_the_cache_for_any_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
         library = built(tmp_path / "new" / "cache")
@@ -299,8 +301,8 @@ def all_may_write(path: Path) -> None:
     path.chmod(0o777)
 
 
-def somebody_elses(path: Path) -> None:
-    os.chown(path, SOMEBODY, -1)
+def of_another_user(path: Path) -> None:
+    os.chown(path, OTHER_USER, -1)
 
 
 def a_link(path: Path) -> None:
@@ -316,12 +318,12 @@ def a_link(path: Path) -> None:
         ("folder", a_link, "is a link"),
         ("above", all_may_write, "which all users can write to"),
         ("library", group_may_write, "can be written by others (mode 0620): chmod go-w"),
-        pytest.param("folder", somebody_elses, "belongs to user 12345", marks=needs_root),
-        pytest.param("above", somebody_elses, "which belongs to user 12345", marks=needs_root),
-        pytest.param("library", somebody_elses, "belongs to user 12345", marks=needs_root),
+        pytest.param("folder", of_another_user, "belongs to user 12345", marks=needs_root),
+        pytest.param("above", of_another_user, "which belongs to user 12345", marks=needs_root),
+        pytest.param("library", of_another_user, "belongs to user 12345", marks=needs_root),
     ],
 )
-def test_what_others_can_write_is_not_loaded_and_one_line_says_so(
+def test_files_that_others_can_write_are_not_loaded(
     what: str, change: Callable[[Path], None], reason: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     cache = tmp_path / "above" / "cache"
@@ -341,8 +343,8 @@ def test_a_cache_of_our_own_below_a_sticky_folder_is_used(
     assert runs_compiled(tmp_path / "cache", caplog)
 
 
-@pytest.mark.parametrize("change", [a_link, pytest.param(somebody_elses, marks=needs_root), all_may_write])
-def test_the_last_resort_in_tmp_is_looked_at_without_following_links(
+@pytest.mark.parametrize("change", [a_link, pytest.param(of_another_user, marks=needs_root), all_may_write])
+def test_the_temporary_folder_is_checked_without_following_links(
     change: Callable[[Path], None],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -359,7 +361,7 @@ def test_the_last_resort_in_tmp_is_looked_at_without_following_links(
     assert f"{wanted} cannot be written, and {built_there}" in caplog.text
 
 
-def test_a_cache_mounted_noexec_is_named_with_the_remedy(
+def test_a_cache_mounted_noexec_is_reported_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     real = os.statvfs(tmp_path)

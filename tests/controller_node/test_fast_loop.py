@@ -1,4 +1,4 @@
-"""What changes in a fast loop: what a tick publishes and when, how far it lies behind its sample."""
+"""The controller in a fast loop: its publications and their times, and the phase after the samples."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from trainer_node.training import Trainer
 
 
 class BusThatWritesDown:
-    """In place of a bus: what would be published, in order."""
+    """Replaces a bus and records the published messages in order."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -61,7 +61,7 @@ class BusThatWritesDown:
 
 
 class Loop:
-    """A controller's node without a clock; `tick` is one turn."""
+    """A controller's node without a clock; `tick` runs one turn."""
 
     def __init__(self, *assignments: str):
         small = ("controller.horizon=4", "network.hidden=[4]", "controller.solver.compile=never")
@@ -95,33 +95,33 @@ class Loop:
             self.node._tick(Slot(k, k * period, 0), 0.0, Latched("fresh", received, 0.0))
 
 
-def test_ticks_are_complete_at_any_rate_and_weights_come_fifty_times_a_second() -> None:
+def test_every_tick_is_published_and_weights_fifty_times_a_second() -> None:
     loop = Loop("rate=1000")
     loop.tick(250)
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.TIMING):
         assert loop.bus.seqs(topic) == list(range(250))
     assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == list(range(0, 250, 20))
-    # Samples travel a tenth of a second together.
+    # Samples of a tenth of a second are sent together.
     assert loop.bus.seqs(topics.SAMPLES) == [99, 199]
 
 
-def test_at_twenty_hertz_every_tick_says_everything() -> None:
+def test_at_twenty_hertz_every_tick_publishes_everything() -> None:
     loop = Loop("rate=20")
     loop.tick(11)
     assert loop.bus.seqs(topics.OUTPUT_WEIGHTS) == list(range(11))
     assert loop.bus.seqs(topics.SAMPLES) == [4, 9]
 
 
-def test_who_begins_to_hear_gets_the_memory_before_each_tick_still_to_come() -> None:
+def test_a_new_listener_gets_a_keyframe_before_each_pending_tick() -> None:
     loop = Loop("rate=20")
     keyframes = loop.node._keyframes
     loop.bus.heard(0)
     keyframes.begin()
     loop.tick(6)
     keyframes.greet(5, now=1.0)
-    # He heard it begin.
+    # This listener was present from the start.
     assert loop.bus.seqs(topics.KEYFRAME) == [-1]
-    # Two ticks and a half were not sent yet, and one more may have followed.
+    # Two and a half ticks were not sent yet, and one more may have followed.
     loop.bus.heard(7)
     keyframes.greet(5, now=2.0)
     assert loop.bus.seqs(topics.KEYFRAME) == [-1, 1, 2, 3, 4, 5]
@@ -138,7 +138,7 @@ def test_who_begins_to_hear_gets_the_memory_before_each_tick_still_to_come() -> 
     assert loop.bus.seqs(topics.KEYFRAME)[6:] == [6]
 
 
-def test_the_trainer_hears_of_an_adoption_at_once() -> None:
+def test_an_adoption_is_published_at_once() -> None:
     loop = Loop("rate=1000", "adaptation.trial.enabled=false")
     loop.tick(5)
     description = loop.core.controller.oracle.description
@@ -162,7 +162,7 @@ def test_the_trainer_hears_of_an_adoption_at_once() -> None:
 
 
 @pytest.mark.parametrize(("rate", "times"), [("20.0", 3), ("100.0", 3), ("200.0", 0)])
-def test_a_backup_follows_each_command_where_there_is_time(rate: str, times: int) -> None:
+def test_a_backup_follows_each_command_at_low_rates(rate: str, times: int) -> None:
     loop = Loop(f"rate={rate}")
     loop.tick(3)
     assert loop.bus.seqs(topics.BACKUP) == list(range(times))
@@ -171,13 +171,13 @@ def test_a_backup_follows_each_command_where_there_is_time(rate: str, times: int
 
 
 @pytest.mark.parametrize(("measured", "times"), [('["z", "y"]', 0), ('["z", "y", "r", "rdot"]', 2)])
-def test_a_backup_feeds_back_no_state_that_nobody_measures(measured: str, times: int) -> None:
+def test_no_backup_with_unmeasured_states(measured: str, times: int) -> None:
     loop = Loop("rate=20.0", "estimator.kind=kalman", f"estimator.measured={measured}")
     loop.tick(2)
     assert loop.bus.seqs(topics.BACKUP) == list(range(times))
 
 
-def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else() -> None:
+def test_the_next_tick_is_prepared_right_after_the_command() -> None:
     loop = Loop("controller.solver.mode=real_time", "controller.backup.enabled=false")
     loop.tick(3)
     loop.bus.said.clear()
@@ -186,7 +186,7 @@ def test_the_next_tick_is_prepared_when_the_command_is_out_and_before_all_else()
     assert loop.core.controller._prepared_for is loop.core.memory.state
 
 
-def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
+def test_trainings_have_a_minimum_interval(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = override(Config(), ["rate=1000"])
@@ -202,12 +202,12 @@ def test_however_many_samples_come_a_training_begins_at_most_every_so_often(
             node.rest(now, took=0.01)
     assert len(began) == pytest.approx(2.0 / TRAIN_EVERY, abs=1)
     assert min(np.diff(began)) >= TRAIN_EVERY - 1e-9
-    # At 20 Hz, ten samples take longer than that: nothing is held back there.
+    # At 20 Hz ten samples take longer than this interval, so it has no effect.
     assert Config().trainer.train_every * Config().period > TRAIN_EVERY
 
 
 class Notes:
-    """In place of a health publisher: what was said, in order."""
+    """Replaces a health publisher and records its notes in order."""
 
     def __init__(self) -> None:
         self.said: list[tuple[str, str]] = []
@@ -216,7 +216,7 @@ class Notes:
         self.said.append((status, note))
 
 
-def test_health_and_log_say_what_a_training_was_good_for(caplog: pytest.LogCaptureFixture) -> None:
+def test_health_and_log_report_the_benefit_of_a_training(caplog: pytest.LogCaptureFixture) -> None:
     config = override(Config(), ["trainer.steps=3"])
     bus, counts, notes = cast(Bus, BusThatWritesDown(config)), dict.fromkeys(COUNTERS, 0), Notes()
     node = TrainerNode(config, bus, cast(HealthPublisher, notes), counts, cast(Executor, None))
@@ -240,7 +240,7 @@ def test_health_and_log_say_what_a_training_was_good_for(caplog: pytest.LogCaptu
             node.finish(draw, descend(draw.problem, 3, 1e-3))
     nothing = "following ; training has nothing to gain (0.0% of the labels' variance)"
     assert notes.said == [("running", "following "), ("running", nothing), ("running", nothing)]
-    # Said once, not after every training.
+    # It is logged once, and not after every training.
     assert [record.getMessage() for record in caplog.records] == [nothing]
 
 
@@ -248,9 +248,7 @@ def test_health_and_log_say_what_a_training_was_good_for(caplog: pytest.LogCaptu
     ("assignments", "seconds"),
     [(["rate=20"], 1e-3), (["rate=1000"], 2.5e-4), (["rate=1000", "controller.phase_ms=0.3"], 3e-4)],
 )
-def test_a_slot_lies_a_millisecond_behind_its_sample_or_a_quarter_of_a_period(
-    assignments: list[str], seconds: float
-) -> None:
+def test_the_phase_is_a_millisecond_or_a_quarter_of_a_period(assignments: list[str], seconds: float) -> None:
     assert phase(override(Config(), assignments)) == pytest.approx(seconds)
 
 
@@ -263,15 +261,15 @@ def test_a_slot_lies_a_millisecond_behind_its_sample_or_a_quarter_of_a_period(
         (["controller.input_delay_ms=7"], 7.0),
     ],
 )
-def test_live_the_delay_begins_at_what_an_answer_usually_takes(assignments: list[str], ms: float) -> None:
+def test_the_initial_live_delay_is_the_usual_response_time(assignments: list[str], ms: float) -> None:
     settled = with_input_delay(override(Config(), assignments))
     assert settled.controller.input_delay_ms == pytest.approx(ms)
-    # In the log, so that a replay begins with it.
+    # The delay is in the log, so a replay starts with it.
     assert from_json(to_json(settled)) == settled
 
 
 @pytest.mark.parametrize(("rate", "every"), [(1, 1), (20, 1), (50, 1), (51, 2), (100, 2), (1000, 20)])
-def test_a_limit_in_the_topic_table_is_kept(rate: float, every: int) -> None:
+def test_the_rate_in_the_topic_table_is_kept(rate: float, every: int) -> None:
     assert topics.OUTPUT_WEIGHTS.every(1 / rate) == every
     assert topics.TICK.every(1 / rate) == 1
 
@@ -292,14 +290,14 @@ def command(*plan: float) -> m.Command:
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("place", [0, 1, 19])
-def test_one_number_that_is_not_finite_is_found_wherever_it_is(bad: float, place: int) -> None:
+def test_a_single_nonfinite_number_is_found(bad: float, place: int) -> None:
     plan = [1.0] * 20
     plan[place] = bad
     with pytest.raises(codec.BadMessage, match="not finite"):
         codec.decode(topics.COMMAND, codec.encode(command(*plan)))
 
 
-def test_numbers_whose_sum_overflows_are_finite_all_the_same() -> None:
+def test_finite_numbers_with_an_overflowing_sum_are_accepted() -> None:
     message = command(*[1e308] * 20)
     assert codec.decode(topics.COMMAND, codec.encode(message)) == message
 

@@ -1,4 +1,4 @@
-"""What counts as much h is a matter of the plant's own time."""
+"""The scale of the network follows the plant's time scale."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLOWER = 64.0
 
 @pytest.fixture
 def slow(monkeypatch: pytest.MonkeyPatch) -> Config:
-    """The compressor with 64 times as long a second."""
+    """Return the compressor with time slowed down by a factor of 64."""
     plant = replace(
         MOORE_GREITZER,
         name="slow",
@@ -32,7 +32,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Config:
     return load(None, ["plant.model=slow", f"rate={20 / SLOWER}"])
 
 
-def test_a_slower_plant_that_is_sampled_as_often_gets_the_same_network(slow: Config) -> None:
+def test_a_slower_plant_at_the_same_relative_rate_gets_the_same_network(slow: Config) -> None:
     quick, other = build_model(Config()), build_model(slow)
     assert (quick.time_scale, other.time_scale) == (1.0, SLOWER)
     own, same = build_network_oracle(Config(), quick), build_network_oracle(slow, other)
@@ -41,7 +41,7 @@ def test_a_slower_plant_that_is_sampled_as_often_gets_the_same_network(slow: Con
     assert np.array_equal(own.initial_scale, same.initial_scale)
 
 
-def test_a_plant_that_is_sampled_seldom_begins_with_a_small_network(slow: Config) -> None:
+def test_a_plant_with_a_low_sampling_rate_starts_with_a_small_network(slow: Config) -> None:
     seldom = load(None, ["plant.model=slow", "rate=0.078125", "controller.horizon=10"])
     oracle = build_network_oracle(seldom, build_model(seldom))
     assert np.array_equal(oracle.initial_scale, 1.2e-2 * 0.05 * MOORE_GREITZER.x_scale)

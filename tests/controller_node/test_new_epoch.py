@@ -1,4 +1,4 @@
-"""A plant whose state jumps: its gateway says so, and the controller learns nothing of it and goes on."""
+"""A plant whose state jumps: its gateway reports it, and the controller skips the label and continues."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AWAY = np.array([0.05, 0.02, 0.0, 0.0])
 
 
 def jumping(oracle: str, told: bool) -> tuple[LockStep, Run]:
-    """A run whose plant is elsewhere at tick `JUMP`; its gateway is told, or not."""
+    """Return a run whose plant jumps at tick `JUMP`; `told` says whether its gateway reports it."""
     loop = LockStep(
         override(Config(), [*SETTINGS, f"controller.oracle={oracle}"]), Faults(command_seconds=0.004)
     )
@@ -34,7 +34,7 @@ def jumping(oracle: str, told: bool) -> tuple[LockStep, Run]:
             loop.step()
             continue
         if told:
-            # As `Gateway.new_epoch` does.
+            # `Gateway.new_epoch` does the same.
             loop.plant._shield.jump()
         loop.step(loop.core.plant.x_e + AWAY)
     return loop, loop.so_far()
@@ -47,7 +47,7 @@ def run(request: pytest.FixtureRequest) -> tuple[LockStep, Run]:
 
 def test_no_label_spans_the_jump_and_the_next_is_right(run: tuple[LockStep, Run]) -> None:
     loop, ran = run
-    # For a part of the first period the plant was held.
+    # The plant was held for part of the first period.
     assert [result.seq for result in ran.results if result.h is None] == [0, 1, JUMP]
     assert JUMP - 1 not in {sample.seq for sample in ran.samples}
     model, plant = loop.core.controller.model, loop.core.plant
@@ -57,12 +57,12 @@ def test_no_label_spans_the_jump_and_the_next_is_right(run: tuple[LockStep, Run]
     pieces = [(piece.seconds, np.array(piece.u) - plant.u_e) for piece in state.pieces]
     h = model.label(before, np.array(state.applied) - plant.u_e, after, tuple(pieces))
     assert ran.results[JUMP + 1].h == pytest.approx(h.tolist(), abs=1e-12)
-    # Small, as everywhere else: what the jump itself would have been is not among them.
+    # All labels are small, so the jump itself is not among them.
     largest = max(max(map(abs, result.h)) for result in ran.results if result.h is not None)
     assert largest < 0.1 * np.abs(AWAY).max()
 
 
-def test_what_acts_at_the_jump_is_known_so_that_the_answer_is_predicted_ahead(
+def test_the_input_at_the_jump_is_known_and_used_for_the_prediction(
     run: tuple[LockStep, Run],
 ) -> None:
     _loop, ran = run
@@ -75,8 +75,8 @@ def test_what_acts_at_the_jump_is_known_so_that_the_answer_is_predicted_ahead(
     assert results[JUMP].input_delay == results[JUMP - 1].input_delay > 0.0
 
 
-def test_an_untold_jump_would_be_learned() -> None:
-    """The rule is not idle: without it the controller books the jump as the plant's own motion."""
+def test_an_unreported_jump_would_be_learned() -> None:
+    """The rule matters: without it the controller takes the jump as the plant's own motion."""
     _loop, ran = jumping("l2nw", told=False)
     h = ran.results[JUMP].h
     assert h is not None
@@ -84,14 +84,14 @@ def test_an_untold_jump_would_be_learned() -> None:
 
 
 @pytest.mark.parametrize("from_tick", [None, JUMP, JUMP + 1])
-def test_a_log_with_a_jump_replays_to_the_byte(run: tuple[LockStep, Run], from_tick: int | None) -> None:
+def test_a_log_with_a_jump_replays_byte_for_byte(run: tuple[LockStep, Run], from_tick: int | None) -> None:
     _loop, ran = run
     replayed = replay(ran, from_tick)
     assert replayed.equal
     assert replayed.lost_ticks == 0
 
 
-def test_a_controller_that_died_at_the_jump_goes_on_with_what_it_knew(run: tuple[LockStep, Run]) -> None:
+def test_a_controller_restarted_at_the_jump_continues_with_its_memory(run: tuple[LockStep, Run]) -> None:
     loop, ran = run
     ahead = LockStep(loop.config, loop.faults)
     for _ in range(JUMP):
@@ -102,7 +102,7 @@ def test_a_controller_that_died_at_the_jump_goes_on_with_what_it_knew(run: tuple
     other.memory.go_on(ahead.core.memory.lasting(), "controller-before")
     first = other.step(ran.ticks[JUMP + 1])
     second = other.step(ran.ticks[JUMP + 2])
-    # Its own first sample has none before it; from the second on it learns.
+    # Its first sample has no predecessor, so learning starts with the second.
     assert first.sample is None
     assert second.sample is not None
     assert second.result.h == ran.results[JUMP + 2].h

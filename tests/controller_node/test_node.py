@@ -1,4 +1,4 @@
-"""The live controller, as a process on a real bus: what it publishes, whose weights it takes, and how it ends."""
+"""The live controller as a process on a real bus: its messages, the weights it accepts, and its end."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SETTINGS = ("controller.horizon=20", "controller.keyframe_every=20", "network.hi
 
 @dataclass
 class Run:
-    """What was heard of one run, and the answers to the queries near its end."""
+    """The messages of one run, and the answers to the queries near its end."""
 
     config: Config
     ear: BusListener
@@ -49,7 +49,7 @@ class Run:
 
 
 def weights(snapshot: m.HiddenSnapshot, version: int, **changes: object) -> m.HiddenWeights:
-    """A trainer's answer to the controller's present hidden weights."""
+    """Return a trainer's answer to the controller's present hidden weights."""
     description = msgspec.json.decode(snapshot.description, type=NetworkDescription)
     layers = [array.numpy() * np.float32(1.0001) for array in snapshot.layers]
     good = m.HiddenWeights(
@@ -79,7 +79,7 @@ def tick_with_weights(message: m.Message) -> bool:
 
 
 def command(config: Config) -> None:
-    """A set-point, one that is outside X, and a thousand a second for a while."""
+    """Send a set-point, one that is outside X, and a thousand per second for some time."""
     with commanding(config, topics.RESULT) as commander:
         asked = [set_point({"y": y}) for y in (1.7, 5.0)]
         for one in asked:
@@ -112,7 +112,7 @@ def run() -> Iterator[Run]:
             ear.until(tick_with_weights)
             wait_for(lambda: snapshot_of(trainer).judged_version == 2)
             after_refusal = snapshot_of(trainer)
-            # Nothing is adopted before there are samples to try it on.
+            # Adoption needs samples for the trial.
             ear.until(lambda message: isinstance(message, m.Samples) and message.seq >= 15)
             trainer.publish(topics.HIDDEN_WEIGHTS, weights(snapshot, 3))
             ear.until(tick_with_weights)
@@ -129,7 +129,7 @@ def run() -> Iterator[Run]:
 
 
 @pytest.mark.live
-def test_every_tick_has_its_command_and_all_else(run: Run) -> None:
+def test_every_tick_has_all_its_messages(run: Run) -> None:
     ticks = run.of(topics.TICK)
     count = len(ticks)
     assert [tick.seq for tick in ticks] == list(range(count))
@@ -146,30 +146,30 @@ def test_every_tick_has_its_command_and_all_else(run: Run) -> None:
 
 
 @pytest.mark.live
-def test_the_slots_lie_behind_the_plants_samples(run: Run) -> None:
+def test_the_slots_have_a_constant_phase_after_the_samples(run: Run) -> None:
     ticks = [tick for tick in run.of(topics.TICK) if tick.state_verdict == "fresh"]
     # Both clocks are this machine's, so a slot minus its sample's time is the delay plus the phase.
     behind = np.array([tick.t - tick.state.t for tick in ticks[10:]])
-    # One that came late, or one that waited for its plant, says nothing of the grid; slots without one would lie
-    # anywhere, a quarter of a period off in the middle.
+    # Late slots, and those that waited for the plant, do not show the grid. Slots without phase control would differ by
+    # a quarter of a period in the median.
     assert np.median(np.abs(behind - np.median(behind))) < 0.1 * run.config.period
     answered = [tick.state.seq for tick in ticks]
     assert answered == sorted(set(answered))
 
 
 @pytest.mark.live
-def test_keyframes_frame_the_run(run: Run) -> None:
+def test_a_run_starts_and_ends_with_keyframes(run: Run) -> None:
     last = run.of(topics.TICK)[-1].seq
     expected = [-1, *range(19, last + 1, 20)]
     assert [frame.seq for frame in run.of(topics.KEYFRAME)] == expected + [last] * (expected[-1] != last)
 
 
 @pytest.mark.live
-def test_samples_come_in_batches_and_the_outbox_has_them_all(run: Run) -> None:
+def test_samples_are_sent_in_batches_and_the_outbox_has_all(run: Run) -> None:
     batches = run.of(topics.SAMPLES)
     *sizes, last = (len(batch.samples) for batch in batches)
     assert max(*sizes, last) == 5
-    # A smaller one goes out where the controller waits for its plant again; on a busy machine it may have to.
+    # Smaller batches are sent when the controller waits for its plant, which can happen on a busy machine.
     without_state = sum(tick.state_verdict != "fresh" for tick in run.of(topics.TICK))
     assert sum(size < 5 for size in sizes) <= without_state // run.config.controller.horizon
     published = [one for batch in batches for one in batch.samples]
@@ -179,7 +179,7 @@ def test_samples_come_in_batches_and_the_outbox_has_them_all(run: Run) -> None:
 
 
 @pytest.mark.live
-def test_the_ticks_alone_give_every_command_again(run: Run) -> None:
+def test_the_ticks_alone_reproduce_every_command(run: Run) -> None:
     with one_blas_thread():
         core = ControllerCore(run.config, run.run_id)
         core.memory.restore(run.of(topics.KEYFRAME)[0])
@@ -197,16 +197,16 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     assert len(verdicts) == 2
     assert verdicts[0].startswith("refused: ")
     assert verdicts[1] == "adopted"
-    assert run.counters["weights adopted"] == 1
-    assert run.counters["weights refused"] == 1
-    assert run.counters["bad trainer/hidden_weights: for another run"] == 1
-    assert run.counters["bad trainer/hidden_weights: refused"] == 1
+    assert run.counters["weights_adopted"] == 1
+    assert run.counters["weights_refused"] == 1
+    assert run.counters["bad_trainer_hidden_weights_for_another_run"] == 1
+    assert run.counters["bad_trainer_hidden_weights_refused"] == 1
     assert run.said.count("for another run") == 1
     assert run.snapshot.hidden_version == 3
 
 
 @pytest.mark.live
-def test_a_commander_is_answered_and_a_flood_of_references_is_one_a_tick(run: Run) -> None:
+def test_references_are_answered_and_a_flood_is_reduced_to_one_per_tick(run: Run) -> None:
     verdicts = [r.reference_verdict for r in run.of(topics.RESULT) if r.reference_verdict != "none"]
     assert verdicts[0] == "taken"
     assert any(verdict.startswith("refused: y = 5 is outside X") for verdict in verdicts)
@@ -214,15 +214,15 @@ def test_a_commander_is_answered_and_a_flood_of_references_is_one_a_tick(run: Ru
     assert run.of(topics.RESULT)[-1].reference == pytest.approx({"y": 1.7})
     lost = [
         run.counters.get(name, 0)
-        for name in ("overflow operator/reference", "bad operator/reference: superseded")
+        for name in ("overflow_operator_reference", "bad_operator_reference_superseded")
     ]
     assert sum(lost) > FLOOD // 2
-    assert run.counters["bad operator/reference: refused"] == len([v for v in verdicts if v != "taken"])
-    assert run.counters["references taken"] == verdicts.count("taken")
+    assert run.counters["bad_operator_reference_refused"] == len([v for v in verdicts if v != "taken"])
+    assert run.counters["references_taken"] == verdicts.count("taken")
 
 
 @pytest.mark.live
-def test_who_asks_is_told_which_weights_were_judged_last(run: Run) -> None:
+def test_a_query_returns_the_last_decision_on_weights(run: Run) -> None:
     refused, adopted = run.after_refusal, run.snapshot
     assert (refused.judged_version, refused.judged_sha256) == (2, "0" * 64)
     assert (refused.hidden_version, refused.hidden_sha256 != "0" * 64) == (0, True)
@@ -230,7 +230,7 @@ def test_who_asks_is_told_which_weights_were_judged_last(run: Run) -> None:
 
 
 @pytest.mark.live
-def test_a_run_says_what_it_is(run: Run) -> None:
+def test_a_run_publishes_its_run_info(run: Run) -> None:
     (info, *_) = run.of(topics.RUN_INFO["controller"])
     assert (info.process, info.run_id) == ("controller", run.run_id)
     assert info.config
@@ -244,7 +244,7 @@ def test_a_run_says_what_it_is(run: Run) -> None:
 
 
 @pytest.mark.live
-def test_a_controller_ends_though_the_router_is_frozen() -> None:
+def test_a_controller_ends_with_a_frozen_router() -> None:
     config = live_config(*SETTINGS)
     with Process("node_runtime.router", config) as router, Bus(config, "recorder", "recorder-a") as bus:
         ear = BusListener(bus)
@@ -256,7 +256,7 @@ def test_a_controller_ends_though_the_router_is_frozen() -> None:
             assert "Traceback" not in process.said
 
 
-def test_a_configuration_without_a_controller_is_a_message_for_a_person(
+def test_a_configuration_without_a_controller_gives_a_readable_error(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     assert node.main(live_config("controller.phase_ms=40.0")) == 2

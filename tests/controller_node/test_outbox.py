@@ -1,4 +1,4 @@
-"""The ring of samples answers what a list of them would, takes its memory at the first one, and is asked on the bus."""
+"""The ring of samples: it answers like a list, allocates its memory at the first sample, and answers queries."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def sample(seq: int, pairs: int = 1) -> Sample:
     capacity=st.integers(1, 10),
     pairs=st.integers(1, 3),
 )
-def test_the_newest_after_a_number(
+def test_since_returns_the_newest_samples_after_a_number(
     steps: list[int], since: int, last: int, capacity: int, pairs: int
 ) -> None:
     outbox, told, seq = Outbox("run", capacity), [], -1
@@ -38,7 +38,7 @@ def test_the_newest_after_a_number(
     assert outbox.since(since) == wanted
 
 
-def test_a_controller_that_runs_for_hours_needs_no_more_memory() -> None:
+def test_the_memory_does_not_grow_with_time() -> None:
     outbox = Outbox("run", 2000)
     outbox.add(sample(0))
     tracemalloc.start()
@@ -47,7 +47,7 @@ def test_a_controller_that_runs_for_hours_needs_no_more_memory() -> None:
         outbox.add(sample(seq))
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    # Two thousand Samples would be over a megabyte.
+    # Two thousand `Sample` objects would take over a megabyte.
     assert after - before < 20_000
 
 
@@ -57,7 +57,7 @@ def seqs(answer: list[bytes]) -> list[int]:
     return [one.seq for batch in batches if isinstance(batch, Samples) for one in batch.samples]
 
 
-def test_the_outbox_gives_what_is_newer_and_the_newest_of_that() -> None:
+def test_the_outbox_returns_the_newest_of_the_later_samples() -> None:
     outbox = Outbox("controller-a", capacity=1500)
     assert outbox.answer({}) == []
     for seq in range(0, 4000, 2):
@@ -73,6 +73,6 @@ def test_the_outbox_gives_what_is_newer_and_the_newest_of_that() -> None:
 
 
 @pytest.mark.parametrize("parameters", [{"since": "seven"}, {"last": "1.5"}, {"sinse": "7"}])
-def test_a_wrong_question_to_the_outbox_is_a_message_for_a_person(parameters: dict[str, str]) -> None:
+def test_a_wrong_query_to_the_outbox_gives_a_readable_error(parameters: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"whole number|unknown parameter 'sinse'"):
         Outbox("controller-a").answer(parameters)

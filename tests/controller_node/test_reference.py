@@ -1,4 +1,4 @@
-"""A reference in the whole loop, in lock-step: no offset where h_hat is right at rest, and replay byte for byte."""
+"""A reference in the loop, in lock-step: no offset if h_hat is correct at rest, and replay byte for byte."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def constant() -> Run:
     return run_of("constant", *TO_Y)
 
 
-def test_who_is_right_at_rest_leaves_no_offset_at_a_new_set_point(constant: Run) -> None:
+def test_an_oracle_that_is_correct_at_rest_has_no_offset(constant: Run) -> None:
     found = summarise(constant)
     assert found.offset["y"] < 0.002
     assert (found.unreached_ticks, found.constraint_violations, found.fallback_ticks) == (0, 0, 0)
     assert summarise(run_of("dnn", *TO_Y)).offset["y"] < 0.002
-    # Knows of no h, and so takes for a rest what is none.
+    # The linear oracle assumes h = 0, so its target is no rest of the plant.
     assert summarise(run_of("linear", *TO_Y)).offset["y"] > 0.1
 
 
-def test_the_rest_that_costs_least_is_better_than_what_is_no_rest() -> None:
+def test_the_rest_of_least_cost_is_better_than_a_point_without_rest() -> None:
     rest, equilibrium = (
         summarise(run_of("perfect", *reference, "controller.Q=[1.0, 1.0, 1.0, 1.0]", "controller.R=[1.0]"))
         for reference in (["reference.outputs=[]"], [])
@@ -62,14 +62,14 @@ def test_the_rest_that_costs_least_is_better_than_what_is_no_rest() -> None:
     assert (rest.offset, rest.target_distance, equilibrium.target_distance) == ({}, 0.0, None)
 
 
-def test_every_command_comes_back_from_the_middle_too(constant: Run) -> None:
+def test_every_command_is_replayed_also_from_the_middle(constant: Run) -> None:
     assert replay(constant).equal
     later = replay(constant, from_tick=60)
     assert later.equal
     assert later.first_tick == 50
 
 
-def test_the_real_time_iteration_aims_there_too_and_replays_whether_prepared_in_time_or_not() -> None:
+def test_the_real_time_iteration_follows_and_replays_with_and_without_preparation() -> None:
     run = run_of("constant", *TO_Y, "controller.solver.mode=real_time")
     assert sum(result.status == "real-time iteration" for result in run.results) > STEPS - 5
     assert summarise(run).offset["y"] < 0.002
@@ -82,7 +82,7 @@ def test_the_real_time_iteration_aims_there_too_and_replays_whether_prepared_in_
         core.prepare()
 
 
-def test_a_tick_says_where_it_aims_and_a_keyframe_where_the_search_goes_on(constant: Run) -> None:
+def test_ticks_contain_the_target_and_keyframes_the_start_of_the_search(constant: Run) -> None:
     last = constant.results[-1]
     assert last.target_status == "reached"
     assert last.target_x[1] == pytest.approx(1.75, abs=1e-6)
@@ -92,7 +92,7 @@ def test_a_tick_says_where_it_aims_and_a_keyframe_where_the_search_goes_on(const
     np.testing.assert_allclose(constant.keyframes[-1].arrays["target"].numpy()[:4], off, atol=1e-15)
 
 
-def test_out_of_reach_is_counted_and_nothing_else_happens() -> None:
+def test_an_unreachable_reference_is_only_counted() -> None:
     run = run_of("constant", 'reference.outputs=["y"]', "reference.values=[2.1875]", steps=60)
     found = summarise(run)
     assert found.unreached_ticks == 60
@@ -102,7 +102,7 @@ def test_out_of_reach_is_counted_and_nothing_else_happens() -> None:
     assert (found.constraint_violations, found.fallback_ticks) == (0, 0)
 
 
-def test_the_table_speaks_of_a_reference_where_there_is_one(constant: Run) -> None:
+def test_the_table_contains_an_existing_reference(constant: Run) -> None:
     named, without = (
         set(table(summarise(run)).columns[0].cells) for run in (constant, run_of("constant", steps=3))
     )
@@ -110,7 +110,7 @@ def test_the_table_speaks_of_a_reference_where_there_is_one(constant: Run) -> No
     assert without < named
 
 
-def test_without_a_reference_nothing_is_said_or_remembered() -> None:
+def test_without_a_reference_nothing_is_published_or_stored() -> None:
     core = ControllerCore(config("controller.oracle=constant"), "c-1")
     assert "target" not in core.memory.keyframe(-1).arrays
     state = m.PlantState(
@@ -124,7 +124,7 @@ def test_without_a_reference_nothing_is_said_or_remembered() -> None:
     assert (result.target_status, result.target_x, result.target_distance) == ("none", [], None)
 
 
-def test_a_memory_from_before_there_was_a_reference_is_gone_on_with() -> None:
+def test_a_memory_without_a_reference_can_be_restored() -> None:
     before = ControllerCore(config("controller.oracle=constant"), "c-1")
     after = ControllerCore(config("controller.oracle=constant", *TO_Y), "c-2")
     assert after.memory.belongs() == before.memory.belongs()
@@ -132,7 +132,7 @@ def test_a_memory_from_before_there_was_a_reference_is_gone_on_with() -> None:
     assert after.memory.keyframe(-1).arrays["target"].shape == [5]
 
 
-def test_without_a_state_or_a_plan_the_input_is_the_targets(constant: Run) -> None:
+def test_without_a_state_or_a_plan_the_input_is_that_of_the_target(constant: Run) -> None:
     keyframe = next(k for k in constant.keyframes if k.seq == 49)
     core = ControllerCore(constant.config, constant.commands[0].run_id)
     spent = {**keyframe.arrays, "plan.left": m.Array.of(np.zeros(1), "<i8")}
@@ -144,7 +144,7 @@ def test_without_a_state_or_a_plan_the_input_is_the_targets(constant: Run) -> No
     assert abs(outputs.result.target_u[0] - core.plant.u_e[0]) > 0.01
 
 
-def test_the_backup_policy_leads_there_too(constant: Run) -> None:
+def test_the_backup_policy_leads_to_the_reference(constant: Run) -> None:
     core = ControllerCore(constant.config, constant.commands[0].run_id)
     for tick in constant.ticks:
         outputs = core.step(tick)
@@ -155,6 +155,6 @@ def test_the_backup_policy_leads_there_too(constant: Run) -> None:
     np.testing.assert_allclose(held, [outputs.result.target_u] * len(held), atol=5e-3)
 
 
-def test_a_reference_is_part_of_the_configuration_of_the_log(constant: Run) -> None:
+def test_the_configuration_in_the_log_contains_the_reference(constant: Run) -> None:
     assert constant.config.reference.values == [1.75]
     assert override(constant.config, ["reference.values=[1.7]"]).reference.outputs == ["y"]

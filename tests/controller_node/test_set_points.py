@@ -1,4 +1,4 @@
-"""Set-points while the loop runs, in lock-step: reached, previewed, refused, leased, held, replayed and remembered."""
+"""Set-points while the loop runs, in lock-step: reached, previewed, refused, leased, held, replayed and stored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def config(*settings: str) -> Config:
 
 
 def run_of(asked: dict[int, m.Reference], steps: int, *settings: str) -> Run:
-    """With what is asked before so many steps."""
+    """Run with requests before the given steps."""
     loop = LockStep(config(*settings))
     for step in range(steps):
         if step in asked:
@@ -51,7 +51,7 @@ def run_of(asked: dict[int, m.Reference], steps: int, *settings: str) -> Run:
 
 
 def off(run: Run) -> np.ndarray:
-    """|y - r| of each tick, of the half-width."""
+    """Return |y - r| of each tick, relative to the half-width."""
     return np.array([abs(result.x[1] - result.reference["y"]) / HALF for result in run.results])
 
 
@@ -71,26 +71,26 @@ def test_each_set_point_is_reached(steps: Run) -> None:
     assert (steps.results[0].reference_verdict, steps.results[1].reference_verdict) == ("taken", "none")
 
 
-def test_every_command_comes_back_from_the_middle_too(steps: Run) -> None:
+def test_every_command_is_replayed_also_from_the_middle(steps: Run) -> None:
     assert replay(steps).equal
     later = replay(steps, from_tick=60)
     assert (later.equal, later.first_tick) == (True, 50)
 
 
-def test_a_change_is_no_new_origin(steps: Run) -> None:
-    """Of every period there is a label, that of the change too."""
+def test_a_change_does_not_move_the_origin(steps: Run) -> None:
+    """Every period has a label, including the period of the change."""
     assert [entry.message.seq for entry in steps.entries(topics.SAMPLES)] == [*range(219)]
 
 
-def test_a_report_knows_where_the_outputs_should_be(steps: Run) -> None:
+def test_a_report_contains_the_references(steps: Run) -> None:
     r = traces(steps).reference
     assert r.shape == (220, 4)
     assert r[219, 1] == pytest.approx(1.7)
     assert np.isnan(r[:, [0, 2, 3]]).all()
 
 
-def test_with_a_preview_a_ramp_is_followed_twice_as_well() -> None:
-    """Without: in each period the value of now, of which nobody knows what follows."""
+def test_preview_halves_the_error_on_a_ramp() -> None:
+    """Without preview each period has only the present value."""
     times, y = [0.0, 3.0, 6.0], [1.65, 1.65, 1.75]
     blind = {step: set_point({"y": float(np.interp(step * 0.05, times, y))}) for step in range(120)}
     with_preview, without = (
@@ -99,7 +99,7 @@ def test_with_a_preview_a_ramp_is_followed_twice_as_well() -> None:
     assert with_preview < 0.5 * without
 
 
-def test_the_real_time_iteration_follows_too_and_replays_whether_prepared_in_time_or_not() -> None:
+def test_the_real_time_iteration_follows_and_replays_with_and_without_preparation() -> None:
     run = run_of({0: STEPS}, 120, "controller.solver.mode=real_time")
     assert off(run)[90] < 0.005
     assert replay(run, from_tick=60).equal
@@ -109,7 +109,7 @@ def test_the_real_time_iteration_follows_too_and_replays_whether_prepared_in_tim
         core.prepare()
 
 
-def test_after_its_lease_the_configured_one_is_back() -> None:
+def test_after_the_lease_the_configured_reference_applies() -> None:
     to_y = ('reference.outputs=["y"]', "reference.values=[1.6]")
     run = run_of({5: set_point({"y": 1.7}, lease=0.5)}, 20, *to_y)
     values = [result.reference["y"] for result in run.results]
@@ -132,7 +132,7 @@ def test_a_pause_holds_the_plant_where_it_is() -> None:
     assert off(run)[-1] < 0.01
 
 
-def test_without_outputs_of_its_own_a_pause_holds_the_performance_states() -> None:
+def test_without_configured_outputs_a_pause_holds_the_performance_states() -> None:
     run = run_of({3: m.Reference(run_id="x", seq=0, kind="hold")}, 5)
     assert run.results[3].reference == pytest.approx({"z": run.results[3].x[0], "y": run.results[3].x[1]})
 
@@ -163,14 +163,14 @@ ABSURD = {
 
 
 @pytest.mark.parametrize("reason", ABSURD)
-def test_what_this_plant_cannot_have_is_refused_by_name(reason: str) -> None:
+def test_an_invalid_reference_is_refused_with_the_reason(reason: str) -> None:
     with pytest.raises(RefusedReference) as refused:
         change_of(ABSURD[reason], PLANT, 0.05)
     assert reason in str(refused.value)
 
 
-def test_the_loop_does_not_notice_what_is_refused(steps: Run) -> None:
-    """Not a bit of a command, a keyframe or a result is another, but for the verdict."""
+def test_a_refused_reference_does_not_affect_the_loop(steps: Run) -> None:
+    """Commands, keyframes and results are bit for bit the same except for the verdict."""
     run = run_of({0: STEPS} | dict(enumerate(ABSURD.values(), 20)), 60)
     for topic in (topics.COMMAND, topics.KEYFRAME, topics.SAMPLES):
         at, other = ([e.payload for e in one.entries(topic) if e.message.seq < 60] for one in (run, steps))
@@ -180,14 +180,14 @@ def test_the_loop_does_not_notice_what_is_refused(steps: Run) -> None:
     assert replay(run).equal
 
 
-def test_out_of_reach_is_the_nearest_rest_and_says_how_far_off_it_is() -> None:
+def test_an_unreachable_set_point_gives_the_nearest_rest_and_its_distance() -> None:
     run = run_of({0: set_point({"y": 2.1875})}, 40)
     assert {result.target_status for result in run.results} == {"nearest"}
     assert (run.results[-1].target_distance or 0.0) > 0.01
     assert {result.mode for result in run.results} == {"solver"}
 
 
-def test_the_memory_has_it_only_where_one_was_given_and_another_process_goes_on_with_it(steps: Run) -> None:
+def test_the_memory_contains_a_given_reference_and_can_be_continued(steps: Run) -> None:
     fresh = ControllerCore(config(), "c-2")
     assert not [name for name in fresh.memory.keyframe(-1).arrays if name.startswith(("reference", "target"))]
     before = ControllerCore(config(), steps.commands[0].run_id)
@@ -199,13 +199,13 @@ def test_the_memory_has_it_only_where_one_was_given_and_another_process_goes_on_
     assert state.passed == 60
     result = fresh.step(msgspec.structs.replace(steps.ticks[60], run_id="c-2")).result
     assert result.reference == pytest.approx({"y": 1.65})
-    # And back to one that has none.
+    # A memory without a reference can be restored afterwards.
     fresh.memory.restore(ControllerCore(config(), "c-3").memory.keyframe(-1))
     assert fresh.memory.state.reference is None
 
 
 @pytest.mark.parametrize("name", ["reference.times", "reference.count", "reference.more"])
-def test_a_keyframe_with_a_reference_that_is_none_is_refused(steps: Run, name: str) -> None:
+def test_a_keyframe_with_an_invalid_reference_is_refused(steps: Run, name: str) -> None:
     core = ControllerCore(config(), "c-1")
     good = next(frame for frame in steps.keyframes if frame.seq == 49)
     bad = msgspec.structs.replace(good, arrays={**good.arrays, name: m.Array.of(np.array([2.0, 1.0, 0.0]))})
@@ -214,7 +214,7 @@ def test_a_keyframe_with_a_reference_that_is_none_is_refused(steps: Run, name: s
     core.memory.restore(good)
 
 
-def test_skipped_periods_pass_too(steps: Run) -> None:
+def test_skipped_periods_advance_the_reference(steps: Run) -> None:
     core = ControllerCore(config(), steps.commands[0].run_id)
     core.step(steps.ticks[0])
     core.step(msgspec.structs.replace(steps.ticks[1], skipped=108))
@@ -223,8 +223,8 @@ def test_skipped_periods_pass_too(steps: Run) -> None:
     assert core.step(steps.ticks[2]).result.reference == pytest.approx({"y": 1.7})
 
 
-def test_a_silent_controllers_plant_goes_on_along_the_way() -> None:
-    """The backup policy previews: it leads to where the reference will be, not to where it was."""
+def test_the_plan_and_the_policy_follow_the_preview_without_a_controller() -> None:
+    """The backup policy uses the preview, so it leads to the future reference and not to the past one."""
     loop = LockStep(config("plant.x0=[0.44, 1.65, 1.11, 0.0]"))
     loop.ask(trajectory([0.0, 1.0], {"y": [1.65, 1.75]}))
     for _ in range(8):
@@ -241,7 +241,7 @@ def test_a_silent_controllers_plant_goes_on_along_the_way() -> None:
     assert onward.states[-1, 1] > stays.states[-1, 1] + 0.01
 
 
-def test_in_python_too() -> None:
+def test_the_python_interface_accepts_set_points() -> None:
     loop = Loop(oracle="constant", config=config())
     loop.set_point({"y": 1.7}, over=0.2)
     reached = [loop.step().result.reference["y"] for _ in range(6)]

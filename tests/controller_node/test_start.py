@@ -1,4 +1,4 @@
-"""A controller that died is away until it has imported everything: what it does not need it does not import."""
+"""The start of a controller: it imports only what it needs, because imports delay a restart."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lbmpc.pole_placement import place
 SLOW = ("scipy.signal", "scipy.integrate", "scipy.optimize", "scipy.stats", "scipy.spatial", "rich.console")
 
 
-def test_a_controller_loads_nothing_slow_that_it_does_not_need() -> None:
+def test_a_controller_imports_no_unnecessary_slow_modules() -> None:
     code = (
         "import sys, tandem.cli, tandem.terminal, controller_node.node\n"
         "from controller_node.core import ControllerCore\n"
@@ -31,7 +31,7 @@ def test_a_controller_loads_nothing_slow_that_it_does_not_need() -> None:
 
 @pytest.mark.parametrize("complex_pairs", [0, 1, 2])
 @pytest.mark.parametrize("d", [4, 5])
-def test_K_is_scipys_to_the_last_bit(d: int, complex_pairs: int) -> None:
+def test_K_equals_scipys_bit_for_bit(d: int, complex_pairs: int) -> None:
     rng = np.random.default_rng([d, complex_pairs])
     for _ in range(5):
         A, B = rng.standard_normal((d, d)), rng.standard_normal((d, 1))
@@ -44,7 +44,7 @@ def test_K_is_scipys_to_the_last_bit(d: int, complex_pairs: int) -> None:
         assert np.abs(np.sort_complex(np.linalg.eigvals(A + B @ K)) - np.sort_complex(poles)).max() < 1e-6
 
 
-def test_several_inputs_leave_the_choice_to_scipy() -> None:
+def test_several_inputs_use_scipy() -> None:
     rng = np.random.default_rng(0)
     A, B, poles = rng.standard_normal((4, 4)), rng.standard_normal((4, 2)), [0.1, 0.2, 0.3, 0.4]
     assert np.abs(np.sort(np.linalg.eigvals(A + B @ place(A, B, poles)).real) - poles).max() < 1e-8
@@ -58,11 +58,11 @@ def test_several_inputs_leave_the_choice_to_scipy() -> None:
         ([0.1, 0.2 + 0.1j, 0.3], "conjugates"),
     ],
 )
-def test_poles_that_are_none_are_named(poles: list[complex], says: str) -> None:
+def test_invalid_poles_are_reported(poles: list[complex], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         place(np.eye(3), np.ones((3, 1)), poles)
 
 
-def test_what_cannot_be_controlled_cannot_be_placed() -> None:
+def test_poles_of_an_uncontrollable_plant_cannot_be_placed() -> None:
     with pytest.raises(ValueError, match="placed"):
         place(np.diag([0.5, 0.6, 0.7]), np.zeros((3, 1)), [0.1, 0.2, 0.3])

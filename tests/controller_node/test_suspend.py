@@ -1,4 +1,4 @@
-"""All processes stand still for a while, and go on: what was recorded before and after can be replayed."""
+"""All processes are stopped for some time and continue; the ticks recorded before and after can be replayed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SETTINGS = (
     f"bus.lease_ms={LEASE_S * 1e3:.0f}",
     "controller.horizon=20",
     "controller.solver.compile=never",
-    # What a gap costs without a keyframe of its own is all the rest of the run.
+    # Without a keyframe of its own, a gap would make the rest of the run unusable for a replay.
     "controller.keyframe_every=100000",
     "network.hidden=[8, 8]",
 )
@@ -43,7 +43,7 @@ def test_after_a_standstill_every_recorded_tick_replays(tmp_path: Path) -> None:
 
         ear.until(health_of("recorder", status="running"))
         before = ticked(-1)
-        # The router stands still first and goes on last: ticks between are lost, and the links to it.
+        # The router stops first and continues last, so the ticks in between and the links are lost.
         router.signal(signal.SIGSTOP)
         while ear.listen(4 * LEASE_S) is not None:
             pass
@@ -52,7 +52,7 @@ def test_after_a_standstill_every_recorded_tick_replays(tmp_path: Path) -> None:
         for process in (*nodes, router):
             process.signal(signal.SIGCONT)
         ticked(ticked(before))
-        # The recorder last.
+        # The recorder continues last.
         for node in (nodes[1], nodes[0], nodes[2]):
             node.signal(signal.SIGINT)
             assert node.end() == 0
@@ -64,14 +64,14 @@ def test_after_a_standstill_every_recorded_tick_replays(tmp_path: Path) -> None:
 
 
 @pytest.mark.live
-def test_all_that_a_late_recorder_hears_replays(tmp_path: Path) -> None:
+def test_everything_a_late_recorder_receives_can_be_replayed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     config = live_config(*SETTINGS, f"log.path={path}")
     with ExitStack() as stack:
         stack.enter_context(Process("node_runtime.router", config))
         nodes = [stack.enter_context(Process(module, config)) for module in STOPPED[:2]]
         with Bus(config, "monitor", "monitor-a") as bus:
-            # Nobody listens any more when this one has left.
+            # There is no other listener after this one has left.
             BusListener(bus).until(lambda message: isinstance(message, m.Tick) and message.seq > 5)
         recorder = stack.enter_context(Process(STOPPED[2], config))
         next(line for line in recorder.lines() if "writing" in line)

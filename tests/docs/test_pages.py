@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.generators.generated import GENERATED
 from tandem.cli import main
 from tests.helpers.paths import INSTALLED, ROOT
 
 PACKAGES = (*INSTALLED, "benchmarks", "verification", "examples", "tests")
+GENERATED_PAGES = {ROOT / "docs" / uri for uri in GENERATED}
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")])
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)
@@ -24,7 +26,9 @@ MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
 TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+(?:-[a-z]+)* ?){1,2})([^`\n|]*)", re.MULTILINE)
 # What a page may name that is made when something runs, or is an example of the reader's own.
 MADE = ("tandem/jet",)
-OWN = {"gru.py", "tanks.py", "true.py"}
+METADATA = {"tandem.configuration"}
+"""Keys of an exported file, which look like modules."""
+OWN = {"gru.py", "tanks.py", "tank.py", "true.py", "my.py"}
 
 
 def code(text: str) -> str:
@@ -65,12 +69,18 @@ def help_of(*words: str) -> str | None:
         return said.getvalue() if main([*words, "--help"]) == 0 else None
 
 
+def leads_somewhere(page: Path, link: str) -> bool:
+    """Whether a link leads to a file, or to a page that the site makes from the code."""
+    target = (page.parent / link).resolve()
+    return target.exists() or target in GENERATED_PAGES
+
+
 @pytest.mark.parametrize("page", PAGES, ids=relative)
 def test_paths_and_links_of_a_page_exist(page: Path) -> None:
     text = source(page)
     named = {path for path in PATH.findall(code(text)) if not path.startswith(MADE)}
     missing = {path for path in named if not (ROOT / path).exists()}
-    missing |= {link for link in LINK.findall(text) if not (page.parent / link).exists()}
+    missing |= {link for link in LINK.findall(text) if not leads_somewhere(page, link)}
     names = {path.name for path in SOURCES}
     missing |= {name for name in FILE.findall(text) if name not in names | OWN}
     assert missing == set()
@@ -79,7 +89,7 @@ def test_paths_and_links_of_a_page_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=relative)
 def test_modules_and_targets_of_a_page_exist(page: Path) -> None:
     text = code(source(page))
-    wrong = {name for name in MODULE.findall(text) if not is_a_module(name)}
+    wrong = {name for name in set(MODULE.findall(text)) - METADATA if not is_a_module(name)}
     wrong |= {name for name in RUN.findall(text) if name.startswith(PACKAGES) and not is_a_module(name)}
     targets = re.findall(r"^([a-z-]+):", source(ROOT / "Makefile"), re.MULTILINE)
     wrong |= {f"make {name}" for name in MAKE.findall(text) if name not in targets}

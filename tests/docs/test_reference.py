@@ -45,7 +45,7 @@ def test_every_command_is_on_the_page_with_its_options() -> None:
         assert read.text, f"{words}: no description"
         assert all(meaning for _, meaning in read.options)
     assert page.count("\n## tandem ") == len(AnyCommand.__args__)
-    assert "| `--seconds S` | 20; with --no-plant until Ctrl-C | How long" in page
+    assert "| `--seconds S` | 20; with --no-plant until Ctrl-C |" in page
 
 
 def test_a_help_text_is_read_by_its_boxes() -> None:

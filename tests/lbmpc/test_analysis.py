@@ -1,4 +1,4 @@
-"""What is said of a model: against what can be computed by hand."""
+"""The analysis of a model, compared with hand computations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.helpers.plants.pendulum import PENDULUM, pendulum
 
 
 def with_heat() -> Model:
-    """A pendulum beside a state that the torque does not move."""
+    """A pendulum, and a state that the torque does not move."""
     beside = replace(
         PENDULUM,
         states=("angle", "rate", "heat"),
@@ -49,8 +49,8 @@ def test_poles_are_those_of_the_equations() -> None:
     assert poles(np.zeros((1, 1)), 1.0)[0].real == -np.inf
 
 
-def test_reach_is_what_full_inputs_do() -> None:
-    """By hand: the best input for a state follows the sign of its response."""
+def test_reach_equals_the_effect_of_full_inputs() -> None:
+    """The best input for a state follows the sign of its response."""
     model = pendulum()
     responses = [np.linalg.matrix_power(model.A, k) @ model.B for k in range(20)]
     for i in range(2):
@@ -61,7 +61,7 @@ def test_reach_is_what_full_inputs_do() -> None:
     assert reach(with_heat(), 20)[2] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_growth_and_the_longest_horizon_are_those_that_a_controller_is_held_to() -> None:
+def test_growth_and_longest_horizon_match_the_controllers_limit() -> None:
     model = pendulum()
     assert growth(model, 60) == pytest.approx(np.exp(2.0 * 6.0))
     most = longest_horizon(model)
@@ -86,7 +86,7 @@ def test_after_the_settling_time_every_corner_is_near_rest_and_before_it_one_is_
 
 
 def test_the_largest_disturbance_is_found_at_the_corners() -> None:
-    """h of a pendulum over a period is about 4 (sin th - th) T: largest where |th| is 1."""
+    """h of a pendulum over a period is about 4 (sin th - th) T, and is largest for |th| = 1."""
     model = pendulum()
     found = sample_disturbance(model, Truth(PENDULUM).step, 400, np.random.default_rng(0))
     assert found.largest[1] == pytest.approx(4.0 * (1.0 - np.sin(1.0)), rel=0.45)
@@ -104,19 +104,19 @@ def test_states_outside_the_equations_domain_are_counted() -> None:
     assert sample_disturbance(model, Truth(deep).step, 50, np.random.default_rng(0)).lost > 5
 
 
-def test_the_safe_input_keeps_tanks_and_drops_a_pendulum() -> None:
+def test_the_safe_input_holds_tanks_but_not_a_pendulum() -> None:
     tanks = build_model(TANKS, 5.0)
     assert under_safe_input(tanks, Truth(TANKS).step, TANKS.x0, 100.0).left == ""
     kept = under_safe_input(pendulum(), Truth(PENDULUM).step, PENDULUM.x0, 5.0)
     assert kept.left == "angle"
-    # th grows as 0.5 cosh 2t: beyond 1 rad between 0.6 and 0.7 s, sine taken into account.
+    # th grows as 0.5 cosh 2t, and with the sine it exceeds 1 rad between 0.6 and 0.7 s.
     assert kept.seconds == pytest.approx(0.7)
     held = replace(PENDULUM, safe_gain=np.array([[-8.0, -4.0]]))
     model = build_model(held, 0.1)
     assert under_safe_input(model, Truth(held).step, PENDULUM.x0, 5.0).left == ""
 
 
-def test_where_the_motion_cannot_be_followed_the_reason_is_given() -> None:
+def test_the_reason_is_given_if_the_motion_cannot_be_computed() -> None:
     dry = replace(TANKS, safe_input=np.zeros(1), x_min=np.array([-5.0, -5.0]), positive=TANKS.positive)
     kept = under_safe_input(build_model(dry, 5.0), Truth(dry).step, TANKS.x0, 5000.0)
     assert "upper level h1" in kept.left

@@ -1,4 +1,4 @@
-"""A, B, c and W from samples: exact where they say it, and refused in a person's words where they do not."""
+"""Identification of A, B, c and W from samples: exact where possible, with readable refusals otherwise."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RNG = np.random.default_rng
 def moved(
     count: int, noise: float = 0.0, feedback: np.ndarray | None = None, push: float = 0.3, seed: int = 0
 ) -> Transitions:
-    """Motion of the plant above; `feedback` in half-widths, `push` and `noise` are standard deviations, likewise."""
+    """Return motion of the plant above; `feedback`, `push` and `noise` (standard deviations) are in half-widths."""
     rng = RNG(seed)
     x, u = np.zeros((count + 1, 2)), np.zeros((count, 1))
     x[0] = 0.5 * TWO.x_scale
@@ -63,8 +63,8 @@ def test_a_linear_plant_is_found_to_rounding_with_its_offset() -> None:
     assert (found.held_out.largest < 1e-10).all()
 
 
-def test_standard_errors_are_those_that_many_logs_show() -> None:
-    """Noise that drives the plant: the scatter over 60 logs is what each one says of itself, to a third."""
+def test_standard_errors_match_the_scatter_of_many_logs() -> None:
+    """With process noise the scatter over 60 logs equals the error stated for each, to a third."""
     logs = [identify(moved(300, noise=0.02, seed=seed), PERIOD, TWO) for seed in range(60)]
     for value, error in (("A", "A_error"), ("B", "B_error"), ("offset", "offset_error")):
         scatter = np.std([getattr(log, value) for log in logs], axis=0)
@@ -72,13 +72,13 @@ def test_standard_errors_are_those_that_many_logs_show() -> None:
         np.testing.assert_allclose(said / scatter, 1.0, atol=0.33)
 
 
-def test_w_is_above_every_residual_of_a_sample_that_no_fit_had_seen() -> None:
+def test_w_exceeds_every_held_out_residual() -> None:
     samples = moved(400, noise=0.02)
     found = identify(samples, PERIOD, TWO)
     np.testing.assert_array_less(MARGIN * found.held_out.largest * TWO.x_scale * (1 - 1e-12), found.W)
     np.testing.assert_array_less(found.W, 1.11 * MARGIN * found.held_out.largest * TWO.x_scale)
     assert [float(f"{w:.2g}") for w in found.W] == pytest.approx(found.W.tolist(), rel=1e-12)
-    # By hand, and in the plant's units: each block from a fit of the others.
+    # Computed by hand in the plant's units: each block with a fit of the others.
     z = np.column_stack([samples.x, samples.u, np.ones(len(samples))])
     missed = []
     for block in np.array_split(np.arange(len(samples)), BLOCKS):
@@ -90,8 +90,8 @@ def test_w_is_above_every_residual_of_a_sample_that_no_fit_had_seen() -> None:
     np.testing.assert_allclose(found.held_out.largest, by_hand.largest, rtol=1e-9)
 
 
-def test_blocks_of_time_see_what_random_ones_would_hide() -> None:
-    """A plant that changes in the middle of the log: neighbours in time do not stand for what comes later."""
+def test_blocks_of_time_detect_a_change_of_the_plant() -> None:
+    """The plant changes in the middle of the log. Random blocks would hide that."""
     first, later = moved(200), moved(200, seed=1)
     later = Transitions(later.x, later.u, later.after + 0.05 * TWO.x_scale)
     joined = first.then(later)
@@ -101,21 +101,21 @@ def test_blocks_of_time_see_what_random_ones_would_hide() -> None:
     assert (slow > 2.0 * identify(mixed, PERIOD, TWO).offset_error).all()
 
 
-def test_a_fed_back_plant_is_found_where_something_else_moves_the_input_too() -> None:
+def test_a_plant_under_feedback_is_identified_with_an_added_signal() -> None:
     found = identify(moved(400, noise=1e-3, feedback=np.array([-0.3, -0.2]), push=0.1), PERIOD, TWO)
     assert (np.abs(found.A - A_PLANT) < 4.0 * found.A_error + 1e-12).all()
     assert (np.abs(found.B - B_PLANT) < 4.0 * found.B_error + 1e-12).all()
 
 
-def test_a_plant_that_is_only_fed_back_is_refused_with_its_feedback() -> None:
+def test_a_plant_under_fixed_feedback_is_refused() -> None:
     said = refused(moved(400, noise=0.05, feedback=np.array([-0.3, -0.2]), push=0.0))
     assert "pump = -0.75 level -1e-05 pressure + constant, to" in said
     assert "as under one fixed feedback" in said
     assert "several x0" in said
 
 
-def test_what_a_nonlinear_plant_does_along_one_path_is_not_taken_for_an_effect_of_the_input() -> None:
-    """A cart with drag comes home ten times on the same way, under one feedback that is not quite linear."""
+def test_a_repeated_path_of_a_nonlinear_plant_gives_large_errors() -> None:
+    """A cart with drag returns ten times along the same path under one slightly nonlinear feedback."""
     T, gain = 0.05, 0.7
     cart = Variables(("position", "speed"), ("force",), np.ones(2), np.array([3.0]), np.zeros(2), np.zeros(1))
     rng, runs = RNG(0), []
@@ -132,20 +132,20 @@ def test_what_a_nonlinear_plant_does_along_one_path_is_not_taken_for_an_effect_o
         samples = samples.then(later)
     found = identify(samples, T, cart)
     assert abs(found.B[1, 0] - gain * T) < 2.0 * found.B_error[1, 0]
-    # At rest it does not move.
+    # The estimated offset is zero within its error, because the cart does not move at rest.
     assert abs(found.offset[1]) < 3.0 * found.offset_error[1]
-    # More of the same does not make it better known.
+    # More samples of the same path do not reduce the error.
     once = identify(runs[0], T, cart)
     assert found.B_error[1, 0] > 0.4 * once.B_error[1, 0]
 
 
-def test_a_constant_input_is_named() -> None:
+def test_a_constant_input_is_reported() -> None:
     said = refused(moved(400, noise=0.05, push=0.0))
     assert "pump hardly moves: by 0 % of its half-width (RMS)" in said
     assert "feedback, so" not in said
 
 
-def test_a_state_that_rests_is_named_and_nothing_else() -> None:
+def test_a_constant_state_is_reported_alone() -> None:
     samples = moved(400)
     level = samples.x * [1, 0]
     said = refused(Transitions(level, samples.u, 0.9 * level))
@@ -153,7 +153,7 @@ def test_a_state_that_rests_is_named_and_nothing_else() -> None:
     assert "pressure hardly moves" in said
 
 
-def test_states_that_move_together_are_named() -> None:
+def test_states_that_move_together_are_reported() -> None:
     rng = RNG(0)
     level = rng.standard_normal(300)
     x = np.column_stack([level, 5e4 * level])
@@ -163,14 +163,14 @@ def test_states_that_move_together_are_named() -> None:
     assert "they move only together" in said
 
 
-def test_too_few_samples_are_counted() -> None:
+def test_too_few_samples_are_reported() -> None:
     assert "39 samples are too few: each row of the model has 4 numbers (level, pressure, pump" in refused(
         moved(39)
     )
     assert identify(moved(40), PERIOD, TWO).samples == 40
 
 
-def test_motion_that_drowns_in_measuring_noise_is_refused() -> None:
+def test_motion_below_the_measurement_noise_is_refused() -> None:
     true = moved(2000, push=0.005)
     true = Transitions(true.x[200:], true.u[200:], true.after[200:])
     seen = 0.02 * TWO.x_scale * RNG(1).standard_normal((len(true) + 1, 2))
@@ -179,7 +179,7 @@ def test_motion_that_drowns_in_measuring_noise_is_refused() -> None:
 
 
 def test_a_log_whose_parts_disagree_is_refused() -> None:
-    """All that moves the pressure happens within one block: without it nothing is known."""
+    """The pressure moves within one block only, so without that block its effect is unknown."""
     rng = RNG(0)
     x, u = rng.standard_normal((500, 2)) * TWO.x_scale, rng.standard_normal((500, 1)) * TWO.u_scale
     x[60:, 1] = 0.0

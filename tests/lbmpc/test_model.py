@@ -16,7 +16,7 @@ from tests.helpers.plants.pendulum import PENDULUM
 from tests.helpers.science import compressor
 
 
-def test_the_jacobian_is_that_of_the_equations_by_hand() -> None:
+def test_the_jacobian_matches_the_equations() -> None:
     _rest, a, b = PLANT.linearised()
     z, y, r = PLANT.x_e[:3]
     w2, damping = 1000.0, 2 / np.sqrt(2) * 10 * np.sqrt(10)
@@ -57,20 +57,20 @@ def test_discretisation_is_exact() -> None:
     np.testing.assert_allclose(model.A @ x + model.B @ u, fine, atol=1e-10)
 
 
-def test_K_is_that_of_the_published_example() -> None:
-    # Aswani et al. (2013) at T = 0.01 s, and the same continuous poles at 0.05 s.
+def test_K_matches_the_published_example() -> None:
+    # Aswani et al. (2013) at T = 0.01 s, and the same continuous-time poles at 0.05 s.
     np.testing.assert_allclose(compressor(0.01).K[0], [-3.0742, 2.0958, 0.1194, -0.00895], atol=5e-5)
     np.testing.assert_allclose(compressor(0.05).K[0], [-2.7709, 1.9127, 0.1605, 0.00005], atol=5e-5)
 
 
 def lqr_gain(model: Model) -> np.ndarray:
-    """The gain that is greedy for |x|_P^2 as the cost-to-go, (m, d)."""
+    """Return the greedy gain for |x|_P^2 as cost-to-go, (m, d)."""
     A, B, P = model.A, model.B, model.P
     return -np.linalg.solve(model.R + B.T @ P @ B, B.T @ P @ A)
 
 
 def decrease(model: Model, gain: np.ndarray) -> np.ndarray:
-    """P - A_f'P A_f - (Q + K_f'R K_f), by the definition."""
+    """Return P - A_f'P A_f - (Q + K_f'R K_f)."""
     closed = model.A + model.B @ gain
     return model.P - closed.T @ model.P @ closed - model.Q - gain.T @ model.R @ gain
 
@@ -80,7 +80,7 @@ def least(matrix: np.ndarray) -> float:
 
 
 def test_weights_are_per_second() -> None:
-    """A cost is an integral: what a motion costs does not depend on how often it is sampled."""
+    """The cost is an integral, so the cost of a motion does not depend on the sampling rate."""
     for period in (0.05, 0.01):
         model = build_model(PLANT, period, Q=np.array([1.0, 2.0, 0.5, 0.0]), R=np.array([3.0]))
         np.testing.assert_allclose(np.diag(model.Q), period * np.array([1.0, 2.0, 0.5, 0.0]))
@@ -89,10 +89,10 @@ def test_weights_are_per_second() -> None:
     np.testing.assert_allclose(coarse.P[:2, :2], fine.P[:2, :2], rtol=2e-3)
 
 
-def test_P_is_by_default_the_cost_of_the_lqr() -> None:
+def test_the_default_P_is_the_cost_of_the_lqr() -> None:
     model = compressor()
     np.testing.assert_allclose(decrease(model, lqr_gain(model)), 0.0, atol=1e-10)
-    # No other gain costs less; the placed K, for one, costs more.
+    # No other gain costs less; the placed K costs more.
     assert least(-decrease(model, model.K)) > -1e-10
     assert least(decrease(model, model.K)) < -0.1
 
@@ -104,25 +104,25 @@ def test_P_can_be_the_cost_of_K() -> None:
 
 
 def test_the_published_P_is_not_multiplied_by_the_period() -> None:
-    """Of (A + BK, B) with weights of 1 a sample, as the reimplementation of Aswani et al. has it at 100 Hz."""
+    """It belongs to (A + BK, B) with weights of 1 per sample, as in the reimplementation of Aswani et al. at 100 Hz."""
     model = build_model(PLANT, 0.01, terminal="published")
     closed, B, P = model.closed_loop, model.B, model.P
     gain = np.linalg.solve(np.eye(1) + B.T @ P @ B, B.T @ P @ closed)
     np.testing.assert_allclose(closed.T @ P @ (closed - B @ gain) + np.eye(4), P, rtol=1e-7)
-    # The input that counts there is c = v - K x, so P bounds what comes after N with room to spare.
+    # Its input is c = v - K x, so P exceeds the cost after N.
     assert least(decrease(model, lqr_gain(model))) > 0
     assert least(decrease(model, model.K)) < -1.0
 
 
-def test_a_terminal_cost_that_bounds_nothing_is_refused_with_what_helps() -> None:
+def test_an_invalid_terminal_cost_is_refused_with_a_remedy() -> None:
     with pytest.raises(
         ModelError, match=r"'published' at a period of 0\.5 s does not bound .* take 'riccati'"
     ):
         build_model(PLANT, 0.5, terminal="published")
 
 
-def test_numbers_that_give_no_P_are_refused() -> None:
-    """A plant that grows by e^12 to e^15 a period: what the equations give is not even positive."""
+def test_numbers_without_a_valid_P_are_refused() -> None:
+    """The plant grows by e^12 to e^15 per period, and the solution of the equations is not positive."""
     for growth in (120.0, 150.0):
         steep = dataclasses.replace(
             PENDULUM,
@@ -144,7 +144,7 @@ def test_without_poles_K_is_the_lqr_gain() -> None:
     np.testing.assert_allclose(lqr_gain(model), model.K, atol=1e-7)
 
 
-def test_what_is_no_equilibrium_is_refused() -> None:
+def test_a_point_that_is_not_an_equilibrium_is_refused() -> None:
     moved = dataclasses.replace(PLANT, x_e=PLANT.x_e + np.array([0.1, 0, 0, 0]))
     with pytest.raises(ModelError, match="not an equilibrium"):
         build_model(moved, 0.05)
@@ -155,14 +155,14 @@ def test_weights_of_the_wrong_length_are_refused() -> None:
         build_model(PLANT, 0.05, Q=np.ones(3))
 
 
-def test_the_answer_to_one_piece_is_B_u_and_pieces_compose() -> None:
+def test_the_response_to_one_piece_is_B_u_and_pieces_compose() -> None:
     model, u = compressor(), np.array([0.3])
     np.testing.assert_allclose(model.within.answer(((0.05, u),)), model.B @ u, atol=1e-15)
     np.testing.assert_allclose(model.within.answer(((0.02, u), (0.03, u))), model.B @ u, atol=1e-14)
 
 
-def test_a_label_with_pieces_is_free_of_the_commands_timing() -> None:
-    """Near the equilibrium h is tiny; the mean input would book a late command as an h many times that size."""
+def test_a_label_with_pieces_does_not_depend_on_the_commands_timing() -> None:
+    """Near the equilibrium h is tiny. With the mean input, a late command would look like an h many times larger."""
     model, truth = compressor(), Truth(PLANT)
     early, late = np.array([0.02]), np.array([-0.05])
     x = np.array([0.01, -0.01, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""What `lbmpc` and `tandem` say is public: there, lazy, and as their docstrings show it."""
+"""The public names of `lbmpc` and `tandem`: they exist, are imported lazily, and match the docstrings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_solve_of_the_docstring_and_of_the_page_gives_an_input() -> None:
 
 
 @pytest.mark.parametrize("package", [lbmpc, tandem])
-def test_every_public_name_is_there_and_is_the_one_that_type_checkers_see(package: ModuleType) -> None:
+def test_every_public_name_exists_and_matches_the_type_checkers_import(package: ModuleType) -> None:
     tree = ast.parse(Path(package.__file__ or "").read_text())
     (checked,) = [node for node in tree.body if isinstance(node, ast.If)]
     imported = {
@@ -46,5 +46,5 @@ def test_every_public_name_is_there_and_is_the_one_that_type_checkers_see(packag
         _ = package.Lop
 
 
-def test_nothing_is_imported_before_it_is_asked_for() -> None:
+def test_names_are_imported_on_first_use() -> None:
     assert not imported("import lbmpc, tandem") & {"numpy", "casadi", "torch", "matplotlib", "scipy"}

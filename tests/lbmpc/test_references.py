@@ -1,4 +1,4 @@
-"""A reference in time: where it is, what a horizon sees of it, how it changes, and how it is frozen."""
+"""References in time: values, preview, changes, saving and restoring."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def go(times: list[float], values: list[float], **more: int) -> Change:
 @pytest.mark.parametrize(
     ("t", "r"), [(-1.0, 0.0), (0.0, 0.0), (0.25, 0.25), (1.0, 2.0), (2.0, 1.0), (3.0, 0.0), (9.0, 0.0)]
 )
-def test_it_is_linear_between_its_points_and_a_step_where_two_are_at_one_time(t: float, r: float) -> None:
+def test_it_is_linear_between_its_points_and_steps_at_equal_times(t: float, r: float) -> None:
     assert RAMP.at(t) == pytest.approx([r])
     assert between(RAMP.times, RAMP.values, np.array([t]))[0] == pytest.approx([r])
 
 
-def test_a_horizon_sees_the_points_within_it_and_where_it_is_at_its_ends() -> None:
+def test_a_preview_has_the_knots_within_the_horizon_and_its_ends() -> None:
     seen = preview(RAMP, 0.0, PERIOD, 4)
     np.testing.assert_allclose(seen.positions, [0.0, 2.0, 2.0, 4.0])
     np.testing.assert_allclose(seen.values[:, 0], [0.0, 1.0, 2.0, 1.0])
-    # A step at its end is not yet one.
+    # A step at the end of the horizon is not included.
     np.testing.assert_allclose(preview(RAMP, 0.0, PERIOD, 2).values[:, 0], [0.0, 1.0])
     later = preview(replace(RAMP, passed=1), 0.25, PERIOD, 4)
     np.testing.assert_allclose(later.positions, [0.0, 0.5, 0.5, 4.0])
@@ -38,14 +38,14 @@ def test_a_horizon_sees_the_points_within_it_and_where_it_is_at_its_ends() -> No
 
 
 @pytest.mark.parametrize("passed", [6, 7, 10**9])
-def test_where_nothing_changes_a_horizon_sees_one_point(passed: int) -> None:
+def test_a_constant_preview_has_one_point(passed: int) -> None:
     seen = preview(replace(RAMP, passed=passed), 0.0, PERIOD, 4)
     assert (seen.positions.tolist(), seen.values.tolist()) == ([0.0], [[0.0]])
     held = Reference((1,), np.array([0.0, 100.0, 100.0]), np.array([[1.0], [1.0], [3.0]]))
     assert preview(held, 0.0, PERIOD, 4).values.tolist() == [[1.0]]
 
 
-def test_of_many_points_a_horizon_sees_a_few() -> None:
+def test_a_preview_is_limited_to_a_few_knots() -> None:
     times = np.arange(1000) * 1e-3
     seen = preview(Reference((0,), times, np.sin(times)[:, None]), 0.0, PERIOD, 4)
     assert len(seen.positions) == PREVIEWED
@@ -53,13 +53,13 @@ def test_of_many_points_a_horizon_sees_a_few() -> None:
     assert seen.values[-1] == np.sin(0.999)
 
 
-def test_a_new_one_begins_where_the_present_one_is() -> None:
+def test_a_new_reference_starts_at_the_present_value() -> None:
     present = replace(RAMP, passed=1)
     new = changed(present, go([2.0], [3.0]), PERIOD, X, AIM, (0,))
     assert new is not None
     np.testing.assert_allclose(new.values[:, 0], [0.5, 3.0])
     np.testing.assert_allclose(new.times, [0.0, 2.0])
-    # Where there was none of this output, where the plan leads.
+    # An output without a reference starts at the plan's target.
     new = changed(None, go([2.0], [3.0]), PERIOD, X, AIM, (0,))
     assert new is not None
     np.testing.assert_allclose(new.values[:, 0], [0.25, 3.0])
@@ -68,7 +68,7 @@ def test_a_new_one_begins_where_the_present_one_is() -> None:
     assert at_once.values.tolist() == [[3.0]]
 
 
-def test_who_says_it_again_renews_the_lease_and_does_not_begin_again() -> None:
+def test_a_repeated_reference_only_renews_the_lease() -> None:
     asked = go([2.0], [3.0], lease=4, source=7)
     first = changed(None, asked, PERIOD, X, AIM, (0,))
     assert first is not None
@@ -84,7 +84,7 @@ def test_who_says_it_again_renews_the_lease_and_does_not_begin_again() -> None:
         assert another.passed == 0
 
 
-def test_the_plant_is_held_where_it_was_when_that_was_first_said() -> None:
+def test_hold_keeps_the_state_of_the_first_request() -> None:
     hold = Change("hold", lease=2, source=7)
     held = changed(RAMP, hold, PERIOD, X, AIM, (0,))
     assert held is not None
@@ -98,7 +98,7 @@ def test_the_plant_is_held_where_it_was_when_that_was_first_said() -> None:
     assert changed(held, Change("configured"), PERIOD, X, AIM, (0,)) is None
 
 
-def test_a_lease_is_over_after_so_many_periods_and_without_one_it_never_is() -> None:
+def test_a_lease_ends_after_its_periods_and_no_lease_never_ends() -> None:
     leased = replace(RAMP, left=3)
     assert leased.advanced(2) is not None
     assert leased.advanced(3) is None
@@ -108,7 +108,7 @@ def test_a_lease_is_over_after_so_many_periods_and_without_one_it_never_is() -> 
     assert for_ever.to_arrays()["count"][0] > 2**50
 
 
-def test_it_is_frozen_and_thawed() -> None:
+def test_a_reference_is_saved_and_restored() -> None:
     before = replace(RAMP, passed=3, left=9, held=True, source=2**55)
     after = Reference.from_arrays({name: array.copy() for name, array in before.to_arrays().items()}, 2)
     for name, array in before.to_arrays().items():
@@ -135,7 +135,7 @@ def test_it_is_frozen_and_thawed() -> None:
         ("more", np.zeros(1)),
     ],
 )
-def test_what_is_no_reference_is_refused_by_name(name: str, array: np.ndarray) -> None:
+def test_invalid_arrays_of_a_reference_are_refused_by_name(name: str, array: np.ndarray) -> None:
     with pytest.raises(ValueError, match=name):
         Reference.from_arrays(RAMP.to_arrays() | {name: array}, 2)
     if name != "more":

@@ -1,4 +1,4 @@
-"""Targets: rests of the learned model inside X and U, as near to the reference as any, whatever the numbers are."""
+"""Targets: rests of the learned model inside X and U nearest to the reference, for any numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def selector(
 
 
 def found(finder: Find, theta: np.ndarray, searches: int = 3) -> SteadyState:
-    """As tick after tick finds it."""
+    """Return the target after several searches, as in successive ticks."""
     target = finder(theta, NOWHERE)
     for _ in range(searches - 1):
         target = finder(theta, target.xu)
@@ -43,7 +43,7 @@ def found(finder: Find, theta: np.ndarray, searches: int = 3) -> SteadyState:
 
 
 def motion(oracle: Oracle, theta: np.ndarray, xu: np.ndarray) -> np.ndarray:
-    """How far the learned model goes from x under u in a period, in half-widths, if it has stood there before."""
+    """Return the motion of the learned model from x under u in one period, in half-widths, after a rest at x."""
     x, u = xu[:4], xu[4:]
     s = np.concatenate([x, np.tile(xu, oracle.pairs - 1)])
     assert len(s) == 4 + remembered(oracle)
@@ -52,7 +52,7 @@ def motion(oracle: Oracle, theta: np.ndarray, xu: np.ndarray) -> np.ndarray:
 
 
 def is_inside(oracle: Oracle, xu: np.ndarray) -> bool:
-    """In X, tightened as for the first step, and in U."""
+    """Return whether it is in X, tightened as for the first step, and in U."""
     problem = build_problem(MODEL, oracle, 10)
     return problem.states[0].contains(xu[:4], 1e-7) and problem.inputs[0].contains(xu[4:], 1e-7)
 
@@ -72,7 +72,7 @@ def theta_of(oracle: Oracle, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     if isinstance(oracle, PerfectOracle):
         return np.array([1.0, 0.0, rng.uniform(1.35, 1.65)])
-    # Labels of the size that a wrong model has: a percent of a half-width.
+    # Labels of the size of a model error, a percent of a half-width.
     return trained_theta(oracle, rng, size=0.002)
 
 
@@ -94,12 +94,12 @@ def test_a_target_is_a_rest_of_the_learned_model_inside_its_bounds(
         off = np.abs(target.xu[list(outputs)] - r) / PLANT.x_scale[list(outputs)]
         assert target.distance == pytest.approx(off.max(initial=0.0), abs=1e-12)
         assert (target.status == "reached") == (target.distance < REACHED)
-    # Two outputs cannot be where they like by one input.
+    # One input cannot bring two outputs to arbitrary values.
     assert reached == 0 if len(outputs) > 1 and name != "linear" else reached >= 3
 
 
 def by_another_method(oracle: Oracle, theta: np.ndarray, cost: Any) -> np.ndarray:
-    """The least of a cost over the rests inside X and U, (d + m,), by scipy's SLSQP."""
+    """Return the minimum of a cost over the rests inside X and U, (d + m,), by scipy's SLSQP."""
     problem = build_problem(MODEL, oracle, 10)
     bounds = [*zip(problem.states[0].lower, problem.states[0].upper, strict=True)]
     bounds += [*zip(problem.inputs[0].lower, problem.inputs[0].upper, strict=True)]
@@ -114,14 +114,14 @@ def by_another_method(oracle: Oracle, theta: np.ndarray, cost: Any) -> np.ndarra
         method="SLSQP",
         options=options,
     )
-    # It may find no way to get any better, and calls that no success.
+    # SLSQP reports no success if it cannot improve the start.
     assert np.abs(rests["fun"](done.x)).max() < 1e-6
     return done.x * SCALE
 
 
 @pytest.mark.parametrize("name", ["constant", "dnn", "rnn", "perfect"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_without_outputs_it_is_the_rest_that_costs_least(name: str, seed: int) -> None:
+def test_without_outputs_the_target_is_the_rest_of_least_cost(name: str, seed: int) -> None:
     oracle = ORACLES[name]
     theta = theta_of(oracle, seed)
     target = found(selector(oracle, (), ()), theta)
@@ -134,10 +134,8 @@ def test_without_outputs_it_is_the_rest_that_costs_least(name: str, seed: int) -
 
 @pytest.mark.parametrize("name", ["linear", "constant", "dnn"])
 @pytest.mark.parametrize("y", [0.4999, -0.4999, 3.0])
-def test_where_the_reference_cannot_be_reached_it_is_the_nearest_rest_and_says_how_far(
-    name: str, y: float
-) -> None:
-    """X less W ends before y does, and so, on the other side, does the throttle."""
+def test_an_unreachable_reference_gives_the_nearest_rest_and_its_distance(name: str, y: float) -> None:
+    """X less W limits y at one end, and the throttle limits it at the other."""
     oracle = ORACLES[name]
     theta = theta_of(oracle, 0)
     target = found(selector(oracle, (Y,), (y,)), theta)
@@ -152,9 +150,7 @@ def test_where_the_reference_cannot_be_reached_it_is_the_nearest_rest_and_says_h
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e300, -1e160])
 @pytest.mark.parametrize("name", ["constant", "l2nw", "dnn"])
 @pytest.mark.parametrize("outputs", [(Y,), ()])
-def test_numbers_that_cannot_be_used_lead_to_the_equilibrium_and_do_no_harm(
-    name: str, number: float, outputs: tuple[int, ...]
-) -> None:
+def test_unusable_numbers_give_the_equilibrium(name: str, number: float, outputs: tuple[int, ...]) -> None:
     oracle = ORACLES[name]
     finder, good = selector(oracle, outputs, (0.05,) * len(outputs)), theta_of(oracle, 0)
     before = found(finder, good)
@@ -169,7 +165,7 @@ def test_numbers_that_cannot_be_used_lead_to_the_equilibrium_and_do_no_harm(
     np.testing.assert_allclose(again.xu, before.xu, atol=1e-7)
 
 
-def test_where_no_rest_is_inside_it_says_so_and_stays_inside() -> None:
+def test_without_a_rest_inside_the_status_says_so_and_the_target_stays_inside() -> None:
     finder = selector(ConstantOracle(4, 1, 0.5))
     target = found(finder, np.array([0.2, 0.2, 0.0, 0.0]))
     assert target.status == "no rest"
@@ -192,8 +188,8 @@ def test_a_model_without_h_rests_at_the_equilibrium() -> None:
         np.testing.assert_allclose(target.xu, 0.0, atol=1e-12)
 
 
-def test_one_selector_serves_one_reference_after_another() -> None:
-    """Bit for bit as one that knows no other: nothing is left of the last one."""
+def test_a_selector_can_be_reused_for_other_references() -> None:
+    """The result is bit for bit that of a new selector, so nothing remains of the last reference."""
     oracle = ORACLES["dnn"]
     theta, selects = theta_of(oracle, 2), TargetSelector(build_problem(MODEL, oracle, 10))
     for outputs, r in (((Y,), (0.05,)), ((0,), (-0.1,)), ((), ()), ((0, Y), (0.0, 0.1)), ((Y,), (0.05,))):

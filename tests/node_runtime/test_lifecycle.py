@@ -63,7 +63,7 @@ def test_run_ids_are_fresh_and_fit_a_message() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_first_signal_asks_and_a_later_one_ends(number: signal.Signals) -> None:
+def test_a_first_signal_requests_a_stop_and_a_later_one_ends_the_process(number: signal.Signals) -> None:
     with subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -72,7 +72,7 @@ def test_a_first_signal_asks_and_a_later_one_ends(number: signal.Signals) -> Non
             process.send_signal(number)
             process.send_signal(number)
             assert process.stdout.readline() == "told\n"
-            # What comes at once is the same wish, so the process must still be there.
+            # An immediate repetition counts as the same signal, so the process must still run.
             assert process.poll() is None or clock.now() - first > REPEATED_SIGNAL_S
             while process.poll() is None:
                 assert clock.now() - first < HANG_S
@@ -84,7 +84,7 @@ def test_a_first_signal_asks_and_a_later_one_ends(number: signal.Signals) -> Non
             process.kill()
 
 
-def test_signals_are_as_before_afterwards() -> None:
+def test_signal_handlers_are_restored() -> None:
     before = signal.getsignal(signal.SIGINT)
     with stopped_by_signals() as stop:
         os.kill(os.getpid(), signal.SIGINT)
@@ -92,7 +92,7 @@ def test_signals_are_as_before_afterwards() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_outside_the_main_thread_signals_are_left_alone() -> None:
+def test_outside_the_main_thread_signals_are_not_handled() -> None:
     given, seen = threading.Event(), []
 
     def work() -> None:
@@ -105,7 +105,7 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     assert seen == [given]
 
 
-def test_a_process_ends_well_when_told_to_stop_before_there_is_a_router() -> None:
+def test_a_process_without_a_router_can_be_stopped() -> None:
     def body(stopping: threading.Event) -> int:
         with Bus(live_config(), "plant", "plant-a", stopping):
             return 7
@@ -115,7 +115,7 @@ def test_a_process_ends_well_when_told_to_stop_before_there_is_a_router() -> Non
     assert run_process(body, stop) == 0
 
 
-def test_a_configuration_that_cannot_be_used_is_an_exit_code(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unusable_configuration_gives_an_exit_code(caplog: pytest.LogCaptureFixture) -> None:
     def body(_stopping: threading.Event) -> int:
         raise ConfigError("rate = -1.0 is not a number above 0")
 
@@ -123,7 +123,7 @@ def test_a_configuration_that_cannot_be_used_is_an_exit_code(caplog: pytest.LogC
     assert "rate = -1.0 is not a number above 0" in caplog.text
 
 
-def test_without_the_privilege_one_warning_and_a_note() -> None:
+def test_without_the_privilege_there_are_one_warning_and_a_note() -> None:
     done = subprocess.run([sys.executable, "-c", UNPRIVILEGED], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert "no privilege for SCHED_FIFO priority 50" in done.stdout
@@ -131,7 +131,7 @@ def test_without_the_privilege_one_warning_and_a_note() -> None:
     assert "CAP_SYS_NICE" in done.stderr
 
 
-def test_the_cores_stay_awake_for_as_long_as_the_loop_runs(tmp_path: Path) -> None:
+def test_the_cores_are_kept_awake_while_the_loop_runs(tmp_path: Path) -> None:
     device = tmp_path / "cpu_dma_latency"
     device.touch()
     with awake(device=str(device)) as note:
@@ -143,7 +143,7 @@ def test_the_cores_stay_awake_for_as_long_as_the_loop_runs(tmp_path: Path) -> No
     assert str(device) not in opened
 
 
-def test_where_cores_may_sleep_the_loop_runs_and_says_so(
+def test_without_permission_the_loop_runs_with_a_note(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with awake(device=str(tmp_path / "missing")) as note:
@@ -166,7 +166,7 @@ def test_where_cores_may_sleep_the_loop_runs_and_says_so(
         (["rate=20", "realtime.awake=always", "realtime.priority=0"], True),
     ],
 )
-def test_cores_are_kept_awake_where_it_pays(assignments: list[str], awake: bool) -> None:
+def test_cores_are_kept_awake_at_high_rates(assignments: list[str], awake: bool) -> None:
     assert override(Config(), assignments).awake is awake
 
 
@@ -183,7 +183,7 @@ def test_cores_are_kept_awake_where_it_pays(assignments: list[str], awake: bool)
         (["rate=20", "realtime.cores=[1,1]"], {0, 1}, 1, 1),
     ],
 )
-def test_loops_have_cores_of_their_own_where_it_pays(
+def test_loops_have_cores_of_their_own_at_high_rates(
     assignments: list[str], allowed: set[int], controller: int | None, plant: int | None
 ) -> None:
     config = override(Config(), assignments)
@@ -192,13 +192,13 @@ def test_loops_have_cores_of_their_own_where_it_pays(
 
 
 @pytest.mark.parametrize("cores", ["[0,9]", "[0]", "[0,1,0]"])
-def test_a_core_that_is_not_there_is_refused(cores: str) -> None:
+def test_a_missing_core_is_refused(cores: str) -> None:
     config = override(Config(), [f"realtime.cores={cores}"])
     with pytest.raises(ConfigError, match=r"write \[controller's core, plant's core\].* may use 0, 1"):
         core_for(config, "plant", {0, 1})
 
 
-def test_a_loop_stays_on_its_core_and_only_the_loop() -> None:
+def test_only_the_loop_stays_on_its_core() -> None:
     before = os.sched_getaffinity(0)
     core = max(before)
     with on_core(core):
@@ -208,7 +208,7 @@ def test_a_loop_stays_on_its_core_and_only_the_loop() -> None:
         assert os.sched_getaffinity(0) == before
 
 
-def test_everything_is_as_before_after_a_punctual_loop() -> None:
+def test_a_punctual_loop_restores_all_settings() -> None:
     before = os.sched_getscheduler(0), sys.getswitchinterval(), gc.get_freeze_count()
     with punctual(1) as note:
         assert (os.sched_getscheduler(0) == os.SCHED_FIFO) == (note == "")
@@ -230,14 +230,14 @@ def test_a_child_does_not_inherit_its_supervisors_priority() -> None:
     assert done.stderr.split()[-1] == str(os.SCHED_OTHER)
 
 
-def test_threads_give_way_quickly_and_later_as_before() -> None:
+def test_threads_give_way_quickly_during_the_loop() -> None:
     before = sys.getswitchinterval()
     with quick_handover():
         assert sys.getswitchinterval() <= 1e-4
     assert sys.getswitchinterval() == before
 
 
-def test_priority_0_leaves_the_scheduler_alone() -> None:
+def test_priority_0_keeps_the_scheduling() -> None:
     with punctual(0) as note:
         assert note == ""
         assert os.sched_getscheduler(0) == os.SCHED_OTHER
@@ -255,7 +255,7 @@ def test_garbage_is_collected_between_steps_only() -> None:
 
 
 @pytest.mark.live
-def test_health_is_heard_regularly_and_at_every_change() -> None:
+def test_health_is_published_regularly_and_at_every_change() -> None:
     config = live_config()
     with (
         open_router(config),

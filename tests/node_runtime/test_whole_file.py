@@ -1,4 +1,4 @@
-"""A file is whole whenever it is read, has its permissions from the start, and a failure leaves the old one."""
+"""A file is complete whenever it is read and has its permissions from the start; after a failure the old one stays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from node_runtime.whole_file import read_regular, write_whole
 
 
-def test_a_reader_finds_one_whole_file_or_the_other(tmp_path: Path) -> None:
+def test_a_reader_finds_the_old_or_the_new_file_complete(tmp_path: Path) -> None:
     path, known = tmp_path / "missing" / "file", [b"a" * 100_000, b"b" * 200_000]
     write_whole(path, known[0])
     stop = threading.Event()
@@ -36,7 +36,7 @@ def test_a_reader_finds_one_whole_file_or_the_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("durable", [False, True])
-def test_permissions_do_not_come_from_what_lies_there(tmp_path: Path, durable: bool) -> None:
+def test_permissions_do_not_depend_on_existing_files(tmp_path: Path, durable: bool) -> None:
     path = tmp_path / "key"
     for place in (path, path.with_name(f".key.{os.getpid()}.new")):
         place.write_bytes(b"older")
@@ -45,9 +45,7 @@ def test_permissions_do_not_come_from_what_lies_there(tmp_path: Path, durable: b
     assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"secret", 0o600)
 
 
-def test_a_disk_that_fails_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_disk_leaves_only_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file"
     write_whole(path, b"old", durable=True)
 
@@ -60,7 +58,7 @@ def test_a_disk_that_fails_leaves_the_old_file_and_nothing_else(
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("file", b"old")]
 
 
-# -- what is no file -----------------------------------------------------------------------------------------
+# -- anything other than a regular file ----------------------------------------------------------------------
 
 
 def a_socket(path: Path) -> None:
@@ -87,21 +85,21 @@ def test_only_a_regular_file_is_replaced_or_read(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the name of a socket must be short
     path = Path("file")
-    (tmp_path / "elsewhere").write_bytes(b"somebody else's")
+    (tmp_path / "elsewhere").write_bytes(b"another file")
     make(path)
     before = path.lstat()
     with pytest.raises(OSError, match=f"it is {kind}, but only regular files"):
         write_whole(path, b"new")
     assert (path.lstat().st_ino, path.lstat().st_mode) == (before.st_ino, before.st_mode)
-    assert (tmp_path / "elsewhere").read_bytes() == b"somebody else's"
+    assert (tmp_path / "elsewhere").read_bytes() == b"another file"
     if kind == "a link":
-        assert read_regular(path) == b"somebody else's"
+        assert read_regular(path) == b"another file"
     else:
         with pytest.raises(OSError, match=r"only regular files|No such device"):
-            read_regular(path)  # at once: nobody writes into the pipe
+            read_regular(path)  # returns at once, although the pipe has no writer
 
 
-def test_as_much_of_a_file_is_read_as_is_asked_for(tmp_path: Path) -> None:
+def test_at_most_the_requested_bytes_are_read(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"0123456789")
     assert read_regular(tmp_path / "file", 4) == b"0123"
     with pytest.raises(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""Commands as a controller would send them, and a few facts of the compressor."""
+"""Commands as a controller sends them, and some facts about the compressor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ U = float(PLANT.u_e[0])
 def planned(
     seq: int, plan: list[list[float]], answers: int, run_id: str = "plant-a", period: float = PERIOD
 ) -> m.Command:
-    """The first input of a plan, (n, m), and all of it."""
+    """Return the first input of a plan, (n, m), and the whole plan."""
     return m.Command(
         run_id="controller-a",
         seq=seq,
@@ -34,5 +34,5 @@ def command(
     run_id: str = "plant-a",
     period: float = PERIOD,
 ) -> m.Command:
-    """Of one input: u, and the plan behind it."""
+    """Return a command with the input u and the plan behind it."""
     return planned(seq, [[u], *([value] for value in plan or [])], answers, run_id, period)

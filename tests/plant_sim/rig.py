@@ -1,4 +1,4 @@
-"""A stranger's machine: the compressor moves in a thread of its own, and two functions reach it. Also a process."""
+"""A machine with a thread of its own that moves the compressor, and two functions to access it. Also a process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEP = 0.004
 
 
 class Rig:
-    """It moves on its own clock, whether or not anybody calls. A context manager."""
+    """A machine that moves by its own clock, independent of calls. A context manager."""
 
     def __init__(self) -> None:
         plant = get_plant("moore_greitzer")
@@ -53,7 +53,7 @@ class Rig:
 
 
 def main(config: Config) -> int:
-    """The rig behind a gateway; in the end it says what it was left with."""
+    """Run the rig behind a gateway, and log its last input at the end."""
     with Rig() as rig:
         Gateway(None, config).serve(rig.read, rig.write)
         log.warning("left with %s", rig._u.tolist())

@@ -1,4 +1,4 @@
-"""Two functions of a stranger's behind a gateway, live: commanded, attacked, left alone, failing, killed."""
+"""A user's two functions behind a gateway, live: commanded, attacked, without commands, failing, killed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ PERIOD = 0.05
 
 
 class Machine:
-    """Stands still, remembers what it is given, and fails in the way that `fails` says."""
+    """A machine at rest that records its inputs and fails as set in `fails`."""
 
     def __init__(self) -> None:
         self.x: object = PLANT.x_e
@@ -71,7 +71,7 @@ class Machine:
 
 @contextmanager
 def served(machine: Machine, config: Config) -> Iterator[Gateway]:
-    """A gateway in a thread; told to stop at the end of the block."""
+    """Run a gateway in a thread and stop it at the end of the block."""
     gateway, stop = Gateway(None, config), threading.Event()
     thread = threading.Thread(target=gateway.serve, args=(machine.read, machine.write, stop))
     thread.start()
@@ -85,20 +85,20 @@ def served(machine: Machine, config: Config) -> Iterator[Gateway]:
 
 
 class Controller:
-    """Commands by hand, as the controller's bus lets them."""
+    """Sends single commands as a controller does."""
 
     def __init__(self, bus: Bus, ear: BusListener):
         self._bus, self._ear, self._seq = bus, ear, -1
 
     def state(self) -> m.PlantState:
-        """The next sample."""
+        """Return the next sample."""
         self._ear.of(topics.PLANT_STATE)
         state = self._ear.until(lambda message: isinstance(message, m.PlantState))
         assert isinstance(state, m.PlantState)
         return state
 
     def command(self, u: float, plan: int = 0, **changes: object) -> m.Command:
-        """To the next sample; `changes` to what would be obeyed."""
+        """Send a command for the next sample; `changes` make it unacceptable."""
         state = self.state()
         self._seq += 1
         command = m.Command(
@@ -117,17 +117,17 @@ class Controller:
 
 
 @pytest.mark.live
-def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
-    # The stranger must stay one, however slow this machine is.
+def test_a_machine_follows_only_valid_commands_and_is_safe_without() -> None:
+    # The foreign sender must not take over, however slow this machine is.
     config, machine = live_config("bus.follow_silence=60.0"), Machine()
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
         hand = Controller(bus, ear)
-        stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
-        with stranger, served(machine, config):
+        foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        with foreign, served(machine, config):
             ear.until(health_of("plant", status="ready", note="safe input until the first command"))
             wait_for(lambda: matched(bus, topics.COMMAND))
-            # From the start, and known, so that labels can be made of it.
+            # The input is written and known from the start, so that labels can be made.
             assert machine.written[0] == SAFE
             ear.until(lambda message: isinstance(message, m.PlantState) and message.applied == SAFE)
             hand.command(99.0)
@@ -135,7 +135,7 @@ def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
             hand.command(U + 0.01, plan=3)
             wait_for(lambda: machine.written[-1] == [U + 0.01])
             ear.until(lambda message: isinstance(message, m.PlantState) and message.applied == [U + 0.01])
-            # What must not be obeyed: none of it is ever written.
+            # None of these invalid commands is ever written.
             hand.command(0.5, period=0.02)
             hand.command(0.5, state_run_id="plant-b")
             hand.command(0.5, state_seq=0)
@@ -148,7 +148,7 @@ def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
                 codec.encode(msgspec.structs.replace(good, u=[0.5, 0.5], plan=[[0.5, 0.5]])),
             ]
             for payload in payloads:
-                stranger.put(topics.COMMAND.key(config.name), payload)
+                foreign.put(topics.COMMAND.key(config.name), payload)
             reasons = (
                 "wrong period",
                 "foreign",
@@ -158,14 +158,14 @@ def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
                 "not finite",
                 "wrong size",
             )
-            keys = [f"bad controller/command: {reason}" for reason in reasons]
+            keys = [m.counter_name("bad controller/command", reason) for reason in reasons]
             health = ear.until(
                 lambda message: (
                     isinstance(message, m.Health) and all(message.counters.get(key) for key in keys)
                 )
             )
             assert isinstance(health, m.Health)
-            # And then nobody: its plan is over, too.
+            # Without further commands the plan ends too.
             ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
         assert machine.written[-1] == SAFE
         ear.until(health_of("plant", status="stopping"))
@@ -174,11 +174,11 @@ def test_a_machine_obeys_who_may_command_it_and_is_safe_without() -> None:
     sources = list(dict.fromkeys(state.source for state in states))
     assert [source for source in sources if source != "hold"] == ["safe", "command", "plan"]
     assert [state.seq for state in states] == sorted({state.seq for state in states})
-    # Commands act when they come, in the middle of a period, and what acted before them is known.
+    # Commands act on arrival, in the middle of a period, and the input before them is known.
     assert any(len(state.pieces) == 2 for state in states)
 
 
-def test_a_machine_is_safe_before_there_is_anybody_to_command_it() -> None:
+def test_a_machine_is_safe_before_the_first_controller() -> None:
     machine = Machine()
     with served(machine, live_config()):
         wait_for(lambda: machine.written == [SAFE])
@@ -186,7 +186,7 @@ def test_a_machine_is_safe_before_there_is_anybody_to_command_it() -> None:
 
 
 @pytest.mark.live
-def test_functions_that_fail_are_told_in_health_and_nothing_is_made_up() -> None:
+def test_failing_functions_are_reported_in_health_without_invented_data() -> None:
     config, machine = live_config("rate=50.0"), Machine()
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
@@ -208,7 +208,7 @@ def test_functions_that_fail_are_told_in_health_and_nothing_is_made_up() -> None
             assert isinstance(health, m.Health)
             assert "read failed: OSError: no such device" in health.note
             machine.fails, machine.x = "", [1.0, float("nan"), 0.0, 0.0]
-            ear.until(lambda message: isinstance(message, m.Health) and message.counters["reads failed"] > 20)
+            ear.until(lambda message: isinstance(message, m.Health) and message.counters["reads_failed"] > 20)
             machine.x = PLANT.x_e
             after = next_state()
             assert after.seq - before.seq > 20
@@ -225,10 +225,10 @@ def test_functions_that_fail_are_told_in_health_and_nothing_is_made_up() -> None
             gateway.new_epoch()
             only_that = [m.Piece(0.0, SAFE)]
             ear.until(lambda message: isinstance(message, m.PlantState) and message.pieces == only_that)
-            # Where this machine is kept waiting, a sample or two may be too late to say it.
+            # On a busy machine one or two samples may be late and lack this input.
             ear.until(lambda message: isinstance(message, m.PlantState) and message.applied == SAFE)
             well()
-            # The thread that says how it is goes on beside a loop that cannot.
+            # The health thread keeps running while the loop is blocked.
             machine.fails = "read hangs"
             health = ear.until(health_of("plant", status="failed"))
             assert isinstance(health, m.Health)
@@ -242,7 +242,7 @@ def test_functions_that_fail_are_told_in_health_and_nothing_is_made_up() -> None
 
 
 @pytest.mark.live
-def test_a_machine_of_a_strangers_is_killed_and_comes_back() -> None:
+def test_a_users_machine_is_killed_and_restarted() -> None:
     config = live_config(
         "controller.oracle=linear", "controller.horizon=10", "controller.solver.compile=never"
     )
@@ -250,7 +250,7 @@ def test_a_machine_of_a_strangers_is_killed_and_comes_back() -> None:
         ear = BusListener(bus)
 
         def driven(run_ids: list[str]) -> str:
-            """Until a command drives a machine that is none of these; its run."""
+            """Wait until a command drives a machine with another run id; return that id."""
             state = ear.until(
                 lambda message: (
                     isinstance(message, m.PlantState)
@@ -275,7 +275,7 @@ def test_a_machine_of_a_strangers_is_killed_and_comes_back() -> None:
     assert f"left with {SAFE}" in rig.said
     assert "Traceback" not in rig.said
     ticks = {tick.seq: tick for tick in ear.of(topics.TICK)}
-    # No label spans the two.
+    # No label spans the two incarnations.
     for result in ear.of(topics.RESULT):
         now, before = ticks.get(result.seq), ticks.get(result.seq - 1)
         if result.h is not None and now and before and now.state and before.state:
@@ -293,7 +293,7 @@ rig = Rig()
 
 
 @pytest.mark.live
-def test_the_example_serves_a_machine_as_it_stands(tmp_path: Path) -> None:
+def test_the_example_in_the_docstring_runs_unchanged(tmp_path: Path) -> None:
     text = ast.get_docstring(ast.parse(Path(plant_sim.gateway.__file__).read_text()))
     assert text is not None
     example = textwrap.dedent(
@@ -326,7 +326,7 @@ def test_the_example_serves_a_machine_as_it_stands(tmp_path: Path) -> None:
     assert U + 0.02 in written
 
 
-def test_a_machine_that_does_not_fit_its_configuration_is_a_message_for_a_person(tmp_path: Path) -> None:
+def test_a_machine_that_does_not_fit_its_configuration_gives_a_readable_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"plant.x0 has 1 entries"):
         Gateway(PLANT, live_config("plant.x0=[1.0]"))
     (tmp_path / "a.toml").write_text("rates = 3")

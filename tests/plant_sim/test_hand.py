@@ -1,4 +1,4 @@
-"""A hand on the switch: what it takes to begin, what ends it, and that the plant stays in X; no clock, no process."""
+"""Manual override: its start, its end, and the check that the plant stays in X; no clock, no process."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ CART = Known.from_matrices(
     u_min=[-1.0, -1.0],
     u_max=[1.0, 1.0],
 )
-"""It goes on by itself: without a way back in time it leaves X."""
+"""It keeps moving by itself, and leaves X unless it is braked in time."""
 WAY_BACK = way_back_of(Config(rate=1.0 / PERIOD), CART)
 
 
 class Cart:
-    """Behind the rules, in virtual time; who commands it wants `commanded`."""
+    """A cart behind the shield in virtual time; the controller commands `commanded`."""
 
     def __init__(self, x0: tuple[float, float] = (0.0, 0.0), way_back: object = WAY_BACK):
         self.shield = Shield(CART, PERIOD, 1.25, "plant-a", True, way_back)
@@ -42,7 +42,7 @@ class Cart:
         self.blind = False
 
     def next(self, periods: int = 1) -> m.PlantState:
-        """The samples of so many periods, each with its command; the last."""
+        """Advance by some periods, each with its command; return the last sample."""
         for _ in range(periods):
             self.k += 1
             t = self.k * PERIOD
@@ -55,14 +55,14 @@ class Cart:
         return state
 
     def say(self, run_id: str, seq: int, u: float | None = 0.4, lease: float = 1.0) -> str:
-        """A word that arrives in the middle of the period; u None: auto."""
+        """Send a message that arrives in the middle of the period; with u None it is `auto`."""
         both = [] if u is None else [u, 0.0]
         word = m.Override(run_id=run_id, seq=seq, mode="auto" if u is None else "manual", u=both, lease=lease)
         return self.shield.override(word, (self.k + 0.5) * PERIOD)
 
 
 class _Exactly:
-    """As the model says."""
+    """A motion that equals the model."""
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         push = CART.B[1] @ u
@@ -70,13 +70,13 @@ class _Exactly:
 
 
 def _braking(x: np.ndarray) -> list[float]:
-    """What a controller does: to rest at the middle, within its range."""
+    """Brake to rest at the centre within the input's range, as a controller does."""
     wanted = float(np.clip(-2.0 * x[0] - 3.0 * x[1], -1.0, 1.0))
     return [wanted, wanted]
 
 
 def _ended(plant: Known, way_back: WayBack, u: float) -> np.ndarray:
-    """The state in which a hand on `u` is refused, from near an edge on."""
+    """Return the state in which an override with `u` is refused, starting near an edge."""
     shield = Shield(plant, PERIOD, 1.25, "plant-a", True, way_back)
     motion = Motion(_Exactly(), np.array([-0.9, 0.0]), PERIOD, plant.dead_time, np.zeros(2))
     for k in range(200):
@@ -87,10 +87,10 @@ def _ended(plant: Known, way_back: WayBack, u: float) -> np.ndarray:
         if shield.override(m.Override(run_id="a", seq=k, mode="manual", u=[u, 0.0]), t) == "ended":
             return x
         shield.renew(t, x, motion)
-    raise AssertionError("it is never ended")
+    raise AssertionError("the override never ended")
 
 
-def test_it_acts_from_the_next_sample_on_and_when_it_is_given_back_the_newest_command() -> None:
+def test_it_acts_from_the_next_sample_and_is_followed_by_the_newest_command() -> None:
     cart = Cart()
     cart.next(3)
     assert cart.say("a", 0) == "ok"
@@ -100,21 +100,21 @@ def test_it_acts_from_the_next_sample_on_and_when_it_is_given_back_the_newest_co
     cart.next(2)
     assert cart.say("a", 1, None) == "ok"
     last = cart.next()
-    # What was commanded meanwhile acts at once, and is known to be the last.
+    # The command received meanwhile acts at once, and is reported as the last one.
     assert [piece.u for piece in last.pieces] == [[0.4, 0.0], [-0.2, 0.1]]
     after = cart.next()
     assert (last.source, after.source, after.applied) == ("command", "command", [-0.2, 0.1])
     assert (after.command_seq, cart.shield.hand.ended) == (cart.k - 1, "")
 
 
-def test_what_is_beyond_the_actuator_is_clipped() -> None:
+def test_inputs_beyond_the_actuator_are_clipped() -> None:
     cart = Cart()
     cart.next(2)
     cart.say("a", 0, 99.0)
     assert cart.next(2).applied == [1.0, 0.0]
 
 
-def test_it_ends_with_its_lease_to_the_moment_and_does_not_come_back() -> None:
+def test_it_ends_exactly_with_its_lease_and_does_not_resume() -> None:
     cart = Cart()
     cart.next(2)
     cart.say("a", 0, lease=2.25 * PERIOD)
@@ -133,13 +133,13 @@ def test_it_ends_with_its_lease_to_the_moment_and_does_not_come_back() -> None:
     assert cart.next(2).source == "manual"
 
 
-def test_the_last_who_says_something_has_it() -> None:
+def test_the_last_sender_has_precedence() -> None:
     cart = Cart()
     cart.next(2)
     assert cart.say("a", 0, 0.4) == "ok"
     cart.next()
     assert cart.say("b", 0, -0.4) == "ok"
-    # Who was there before only renews what is over.
+    # The earlier sender can only renew an ended intention, which is refused.
     assert [cart.say("a", 1, 0.4), cart.say("a", 2, None), cart.say("b", 1, -0.4)] == ["ended", "ended", "ok"]
     cart.next()
     assert (cart.next().applied, cart.shield.hand.run_id) == ([-0.4, 0.0], "b")
@@ -149,7 +149,7 @@ def test_the_last_who_says_something_has_it() -> None:
     assert cart.shield.hand.ended == "c gave it back"
 
 
-def test_a_gateway_that_was_started_again_takes_no_renewals() -> None:
+def test_a_restarted_gateway_refuses_renewals() -> None:
     cart = Cart()
     cart.next(2)
     assert cart.say("a", 7) == "ended"
@@ -167,7 +167,7 @@ def test_a_new_origin_ends_it() -> None:
     assert cart.next().source != "manual"
 
 
-def test_without_a_controller_it_works_alone_and_the_safe_input_follows() -> None:
+def test_it_works_without_a_controller_and_the_safe_input_follows() -> None:
     cart = Cart()
     cart.commanded = None
     cart.next(2)
@@ -179,7 +179,7 @@ def test_without_a_controller_it_works_alone_and_the_safe_input_follows() -> Non
     assert cart.next().source == "safe"
 
 
-def test_between_controller_and_safe_input_the_plan_is_taken_up_where_it_is() -> None:
+def test_after_it_the_plan_continues_at_its_present_entry() -> None:
     cart = Cart()
     cart.next(3)
     cart.commanded = None
@@ -190,7 +190,7 @@ def test_between_controller_and_safe_input_the_plan_is_taken_up_where_it_is() ->
 
 
 @pytest.mark.parametrize("u", [1.0, -1.0, 0.3])
-def test_where_x_would_be_left_the_controller_has_it_in_time(u: float) -> None:
+def test_it_ends_in_time_before_the_plant_leaves_x(u: float) -> None:
     cart = Cart((0.2, 0.0))
     cart.next(2)
     cart.say("a", 0, u)
@@ -202,7 +202,7 @@ def test_where_x_would_be_left_the_controller_has_it_in_time(u: float) -> None:
         cart.say("a", seq, u)
         assert cart.k < 500
     assert "would leave X within" in cart.shield.hand.ended
-    # Repeated as it is, it does not come back; the controller brakes, and needs what there was left.
+    # Repeated messages do not restart it; the controller brakes and needs the remaining distance.
     for _ in range(100):
         seq += 1
         assert cart.say("a", seq, u) == "ended"
@@ -212,7 +212,7 @@ def test_where_x_would_be_left_the_controller_has_it_in_time(u: float) -> None:
     assert 0.5 < farthest < 1.0
 
 
-def test_an_input_that_keeps_x_for_ever_is_not_ended() -> None:
+def test_an_input_that_keeps_x_does_not_end_it() -> None:
     cart = Cart((0.2, 0.0))
     cart.next(2)
     cart.say("a", 0, 0.0)
@@ -222,7 +222,7 @@ def test_an_input_that_keeps_x_for_ever_is_not_ended() -> None:
     assert cart.shield.hand.acts
 
 
-def test_what_is_not_measured_is_predicted_for_as_long_as_that_is_worth_something() -> None:
+def test_missing_measurements_are_predicted_for_a_limited_time() -> None:
     cart = Cart()
     cart.next(2)
     cart.blind = True
@@ -238,19 +238,19 @@ def test_what_is_not_measured_is_predicted_for_as_long_as_that_is_worth_somethin
         blind += 1
         cart.say("b", blind, 0.0)
         cart.next()
-    # W is half a per cent of X a period in one state and adds up in the other.
+    # W is half a percent of X per period in one state and accumulates in the other.
     assert 10 < blind < 500
     assert "would leave X" in cart.shield.hand.ended
 
 
-def test_a_plant_without_a_model_is_not_driven_by_hand() -> None:
+def test_a_plant_without_a_model_refuses_it() -> None:
     cart = Cart(way_back=None)
     cart.next(2)
     assert cart.say("a", 0) == "no model"
     assert cart.next(2).source == "command"
 
 
-def test_the_way_back_is_asked_of_numbers_that_are_none() -> None:
+def test_the_check_handles_nonfinite_numbers() -> None:
     beyond = WAY_BACK.of(np.array([1e308, 1e308]))
     u = np.array([1e308, 1e308])
     assert WAY_BACK.lost(WAY_BACK.after(beyond, u), u)
@@ -260,14 +260,14 @@ def test_the_way_back_is_asked_of_numbers_that_are_none() -> None:
     assert not free.lost(free.after(free.of(np.array([5.0, 3.0])), u), u)
 
 
-def test_a_slow_actuator_needs_a_longer_way_back() -> None:
+def test_a_slow_actuator_ends_it_earlier() -> None:
     slow = replace(CART, u_rate_max=[1.0, 1.0])
     of_slow = _ended(slow, way_back_of(Config(rate=1.0 / PERIOD), slow), 0.3)
     assert of_slow[0] < _ended(CART, WAY_BACK, 0.3)[0] - 0.05
 
 
-def test_a_row_of_states_ends_it_by_name() -> None:
-    """The way back keeps rows too, where the box alone would let the hand go on."""
+def test_a_row_of_states_ends_it_with_its_name() -> None:
+    """The check includes rows; with the box alone the override would continue."""
     row = {"reach": {"place": 1.0, "speed": 0.1, "max": 0.25}}
     narrow = replace(CART, rows=row)
     there, u = np.array([0.2, 0.3]), np.array([0.3, 0.0])
@@ -279,8 +279,8 @@ def test_a_row_of_states_ends_it_by_name() -> None:
     assert reasons[1].startswith("reach would leave X within")
 
 
-def test_what_is_on_its_way_through_a_dead_time_counts() -> None:
-    """At full speed towards the edge the way back is shorter by the way of two periods and a half."""
+def test_inputs_within_the_dead_time_are_included() -> None:
+    """At full speed towards the edge it ends earlier by the distance of two and a half periods."""
     late = 2.5 * PERIOD
     with_it, without = (_ended(replace(CART, dead_time=seconds), WAY_BACK, 0.2) for seconds in (late, 0.0))
     assert without[0] == pytest.approx(with_it[0] + late * with_it[1], abs=0.05)

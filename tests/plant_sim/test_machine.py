@@ -1,4 +1,4 @@
-"""Two functions that fail in every way: the loop that calls them is told, and goes on."""
+"""Two functions that fail in every way: the loop around them reports it and continues."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def raising(error: BaseException) -> Callable[..., None]:
     return function
 
 
-def test_what_is_read_is_a_copy_and_may_be_any_two_numbers() -> None:
+def test_a_reading_is_copied_and_may_be_any_numbers() -> None:
     mine = np.array([1, 2])
     x = guarded(lambda: mine).read(3.0)
     assert x is not None
@@ -39,7 +39,7 @@ def test_what_is_read_is_a_copy_and_may_be_any_two_numbers() -> None:
     assert x.tolist() == [1.0, 2.0]
 
 
-def test_what_is_done_with_an_input_does_not_change_what_acted() -> None:
+def test_a_function_that_modifies_its_input_does_not_change_the_record() -> None:
     u = np.array([0.5])
     since = guarded(write=lambda given: given.fill(9.0)).write(u, 3.0)
     assert since is not None
@@ -58,15 +58,15 @@ def test_what_is_done_with_an_input_does_not_change_what_acted() -> None:
         (lambda: "flow", "could not convert"),
     ],
 )
-def test_what_is_no_measurement_is_none(
+def test_invalid_measurements_are_rejected(
     read: Callable[[], object], said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     one = guarded(read)
     for _ in range(3):
         assert one.read(0.0) is None
-    assert one.counts["reads failed"] == 3
+    assert one.counts["reads_failed"] == 3
     assert said in one.trouble()
-    # Once for a person, however many there are.
+    # It is logged once, however often it fails.
     assert len(caplog.records) == 1
 
 
@@ -80,14 +80,14 @@ def test_with_an_estimator_some_states_may_have_no_number() -> None:
     assert read([float("inf"), nan]) is None
 
 
-def test_an_input_that_could_not_be_written_is_not_known_to_act() -> None:
+def test_a_failed_write_makes_the_input_unknown() -> None:
     one = guarded(write=raising(TimeoutError("bus")))
     assert one.write(np.zeros(1), 0.0) is None
-    assert one.counts["writes failed"] == 1
+    assert one.counts["writes_failed"] == 1
     assert one.trouble() == "write failed: TimeoutError: bus"
 
 
-def test_a_trouble_is_over_when_it_does_not_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_ends_if_it_does_not_recur(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(clock, "now", lambda: now)
     one = guarded(raising(OSError("a")))
@@ -96,17 +96,17 @@ def test_a_trouble_is_over_when_it_does_not_come_again(monkeypatch: pytest.Monke
     assert one.trouble() == ""
 
 
-def test_what_says_that_the_machine_is_lost_ends_it() -> None:
+def test_a_lost_machine_ends_the_loop() -> None:
     with pytest.raises(PlantError, match="gone"):
         guarded(raising(PlantError("gone"))).read(0.0)
 
 
-def test_an_error_in_a_simulation_is_an_error() -> None:
+def test_an_error_in_a_simulation_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         guarded(raising(ZeroDivisionError("dt")), simulated=True).read(0.0)
 
 
-def test_a_call_takes_effect_when_it_is_made_and_a_simulated_one_when_it_was_due() -> None:
+def test_a_call_takes_effect_when_made_or_in_simulation_when_due() -> None:
     for simulated in (False, True):
         one = guarded(simulated=simulated)
         before = clock.now()
@@ -123,10 +123,10 @@ def test_a_call_takes_effect_when_it_is_made_and_a_simulated_one_when_it_was_due
 def test_a_slow_call_is_counted() -> None:
     one = guarded(write=lambda u: clock.sleep_until(clock.now() + 0.02), period=0.01)
     one.write(np.zeros(1), 0.0)
-    assert (one.counts["writes slow"], one.counts["reads slow"]) == (1, 0)
+    assert (one.counts["writes_slow"], one.counts["reads_slow"]) == (1, 0)
 
 
-def test_a_call_that_does_not_return_is_a_trouble_that_others_see(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_call_that_hangs_is_visible_to_other_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "HANGS_S", 0.05)
     go_on = threading.Event()
     one = guarded(lambda: [go_on.wait(60.0), 1.0])
@@ -140,12 +140,12 @@ def test_a_call_that_does_not_return_is_a_trouble_that_others_see(monkeypatch: p
     assert one.trouble() == ""
 
 
-def test_a_sample_that_is_lost_on_purpose_is_no_failure() -> None:
+def test_a_deliberately_lost_sample_is_not_a_failure() -> None:
     def lost() -> np.ndarray:
         raise NotMeasured
 
     for simulated in (True, False):
         one = Guarded(lost, lambda _u: None, 2, 0.05, simulated)
         assert one.read(0.0) is None
-        assert one.counts["reads failed"] == 0
+        assert one.counts["reads_failed"] == 0
         assert one.trouble() == ""

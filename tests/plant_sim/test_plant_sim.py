@@ -1,4 +1,4 @@
-"""The plant in virtual time, bit for bit: held, driven, going on alone."""
+"""The plant in virtual time, bit for bit: held, commanded, without commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.plant_sim.commands import PERIOD, PLANT, U, command
 def backup(
     seq: int, inputs: list[float], run_id: str = "controller-a", period: float = PERIOD, gain: float = 0.5
 ) -> m.Backup:
-    """u = U + input + gain (z - z_e)."""
+    """Return the policy u = U + input + gain (z - z_e)."""
     offset = U - gain * float(PLANT.x_e[0])
     return m.Backup(
         run_id=run_id,
@@ -38,7 +38,7 @@ def plant(x0: np.ndarray = PLANT.x0, period: float = PERIOD) -> PlantSim:
     return PlantSim(PLANT, Truth(PLANT), period, x0, 1.5, "plant-a")
 
 
-def test_the_process_has_the_true_plant() -> None:
+def test_the_process_uses_the_true_plant() -> None:
     motion = node.motion_of(override(Config(), ["plant.truth.slope=1.4"]))
     motion.read(0.0)
     motion.write(PLANT.u_e, 0.0)
@@ -91,7 +91,7 @@ def test_the_period_in_which_the_plant_is_released_has_no_applied_input() -> Non
     sim.command(command(0, U, [U]), 0.3 * PERIOD)
     first = sim.sample(PERIOD)
     assert first.applied is None
-    # But what acts now is known, so that the answer can be predicted ahead.
+    # The present input is known, so that the response can be predicted.
     assert [piece.u for piece in first.pieces] == [[U]]
     assert first.pieces[0].seconds == pytest.approx(0.7 * PERIOD)
     assert sim.sample(2 * PERIOD).applied == [U]
@@ -104,7 +104,7 @@ def test_without_commands_the_plan_and_then_the_safe_input() -> None:
     sim.command(command(0, U + 0.01, [U + 0.02, U + 0.03, U + 0.04]), 0.0)
     states = [sim.sample(k * PERIOD) for k in range(1, 8)]
     assert [state.source for state in states] == ["command", "plan", "plan", "plan", "safe", "safe", "safe"]
-    # The first entry acts for the patience of 1.5 periods, so half of the second period is still its.
+    # The first entry acts for the patience of 1.5 periods, which includes half of the second period.
     applied = [state.applied[0] - U for state in states if state.applied]
     assert applied[:4] == pytest.approx([0.01, 0.015, 0.03, 0.04], abs=1e-12)
     assert PLANT.safe_gain is not None
@@ -113,7 +113,7 @@ def test_without_commands_the_plan_and_then_the_safe_input() -> None:
     assert all(state.command_seq == 0 for state in states)
 
 
-def test_without_commands_the_backup_policy_acts_on_what_the_plant_measures() -> None:
+def test_without_commands_the_backup_policy_uses_the_plants_measurements() -> None:
     sim, truth = plant(), Truth(PLANT)
     sim.sample(0.0)
     sim.command(command(0, U, [U + 0.5] * 4), 0.0)
@@ -121,19 +121,19 @@ def test_without_commands_the_backup_policy_acts_on_what_the_plant_measures() ->
     states = [sim.sample(k * PERIOD) for k in range(1, 5)]
     assert [state.source for state in states] == ["command", "plan", "plan", "plan"]
     x = truth.step(truth.step(PLANT.x0, np.array([U]), PERIOD), np.array([U]), PERIOD / 2)
-    # Entry 0 belongs to the second period, half of which the command was still waited for.
+    # Entry 0 belongs to the second period; for half of it the command was still expected.
     u = np.array([U + 0.01 + 0.5 * (x[0] - PLANT.x_e[0])])
     x = truth.step(x, u, PERIOD / 2)
     assert states[1].x == pytest.approx(x.tolist(), abs=1e-10)
     u = np.array([U + 0.02 + 0.5 * (x[0] - PLANT.x_e[0])])
     assert states[2].applied == pytest.approx(u.tolist(), abs=1e-10)
-    # Where it has no entry any more, the plan goes on with its own of that period.
+    # After its last entry the plan continues with its own entry for that period.
     assert states[3].applied == [U + 0.5]
 
 
-def test_the_backup_of_the_command_before_serves_until_the_new_one_is_there() -> None:
+def test_the_previous_backup_is_used_until_the_new_one_arrives() -> None:
     def applied(backups: int) -> list[float]:
-        """Over the fourth and the fifth period, after three commands a fifth of a period late."""
+        """Return the inputs over the fourth and fifth period, after three commands a fifth of a period late."""
         sim = plant(PLANT.x_e)
         for k in range(3):
             sim.sample(k * PERIOD)
@@ -144,9 +144,9 @@ def test_the_backup_of_the_command_before_serves_until_the_new_one_is_there() ->
         states = [sim.sample(4 * PERIOD), sim.sample(5 * PERIOD)]
         return [state.applied[0] - U for state in states if state.applied]
 
-    # Command 2 acts until 3.7; then the entries of command 1 that belong to its periods from 3.2 and from 4.2 on.
+    # Command 2 acts until 3.7, followed by the entries of command 1 for its periods from 3.2 and 4.2 on.
     assert applied(backups=2) == pytest.approx([0.3 * 0.02, 0.2 * 0.02 + 0.8 * 0.03], abs=1e-12)
-    # That of two commands ago is not followed.
+    # The policy of two commands ago is not used.
     assert applied(backups=1) == pytest.approx([0.3 * 0.3, 0.3], abs=1e-12)
 
 
@@ -173,7 +173,7 @@ def test_a_backup_whose_numbers_overflow_leaves_the_plant_to_the_plan() -> None:
 
 @pytest.mark.parametrize("period", [0.1, 0.05, 0.01])
 def test_the_safe_input_brings_the_compressor_back(period: float) -> None:
-    """With a constant input it would leave for the surge that the equilibrium is unstable towards."""
+    """With a constant input it would go into surge, because the equilibrium is unstable."""
 
     def after(plant: Plant) -> float:
         x0 = PLANT.x_e + np.array([-0.1, 0.0, 0.0, 0.0])
@@ -209,7 +209,7 @@ def test_a_fresh_command_ends_the_plan() -> None:
     st.floats(0.001, 10.0),
     st.sampled_from([None, PLANT.safe_gain]),
 )
-def test_what_drives_always_moves_on(
+def test_the_source_of_the_input_always_advances(
     patience: float, entries: int, backups: int, arrived: float, period: float, gain: np.ndarray | None
 ) -> None:
     held = replace(PLANT, safe_gain=gain)
@@ -230,19 +230,19 @@ def test_what_drives_always_moves_on(
     assert sources[safe:] == ["safe"] * (len(sources) - safe)
 
 
-def test_the_actuator_clips_and_what_is_reported_is_the_clipped_input() -> None:
+def test_the_clipped_input_is_reported() -> None:
     sim = plant(PLANT.x_e)
     sim.sample(0.0)
     sim.command(command(0, 99.0, [-99.0] * 5), 0.0)
     assert sim.sample(PERIOD).applied == PLANT.u_max.tolist()
-    assert sim.sample(3 * PERIOD).applied is None  # a sample was missed
+    assert sim.sample(3 * PERIOD).applied is None  # one sample was missed
     state = sim.sample(4 * PERIOD)
     assert (state.applied, state.source, state.seq) == (PLANT.u_min.tolist(), "plan", 4)
 
 
-def test_what_must_not_be_obeyed_is_refused() -> None:
+def test_invalid_commands_are_refused() -> None:
     sim = plant()
-    assert sim.command(command(0, U), 0.0) == "foreign"  # there was no sample yet
+    assert sim.command(command(0, U), 0.0) == "foreign"  # there is no sample yet
     sim.sample(0.0)
     assert sim.command(command(0, U, run_id="plant-b"), 0.0) == "foreign"
     assert sim.command(command(0, U, answers=1), 0.0) == "foreign"
@@ -251,7 +251,7 @@ def test_what_must_not_be_obeyed_is_refused() -> None:
     assert not sim.sample(PERIOD).command_seq >= 0
     assert sim.command(command(0, U, answers=1), PERIOD) == "ok"
     assert sim.sample(2 * PERIOD).source == "command"
-    # Nor when it moves: the plan of a controller that hears no states is worse than the policy that the plant has.
+    # The same holds for a moving plant: the plan of a controller without states is worse than the plant's policy.
     assert sim.command(command(1, U, answers=-1, run_id=""), PERIOD) == "answers no sample"
     assert sim.sample(3 * PERIOD).command_seq == 0
 
@@ -267,7 +267,7 @@ def test_old_commands_in_a_burst_are_refused() -> None:
     assert verdicts == ["stale"] * 57 + ["ok"] * 3
 
 
-def test_a_look_at_the_next_sample_changes_nothing() -> None:
+def test_looking_at_the_next_sample_changes_nothing() -> None:
     def states(looked: bool) -> list[m.PlantState]:
         sim, found = plant(), []
         for k in range(6):
@@ -297,7 +297,7 @@ def test_looking_ahead_changes_nothing() -> None:
     assert states(ahead=True) == states(ahead=False)
 
 
-def test_a_sample_that_was_looked_ahead_at_is_not_worked_out_again() -> None:
+def test_a_sample_computed_ahead_is_not_computed_again() -> None:
     truth, steps = Truth(PLANT), []
 
     class Counted:
@@ -307,7 +307,7 @@ def test_a_sample_that_was_looked_ahead_at_is_not_worked_out_again() -> None:
 
     motion = Motion(Counted(), PLANT.x0, PERIOD)
     for k in range(5):
-        # On a grid of large times, rounded as a clock's are.
+        # The grid has large times with the rounding of a clock.
         motion.read(26000.123456789 + k * PERIOD)
         before = len(steps)
         motion.write(PLANT.u_e, 26000.123456789 + (k + 0.1) * PERIOD)
@@ -316,7 +316,7 @@ def test_a_sample_that_was_looked_ahead_at_is_not_worked_out_again() -> None:
     assert len(steps) == 9
 
 
-def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
+def test_a_motion_that_cannot_be_computed_is_an_error() -> None:
     sim = plant(np.array([-1.6, 0.05, 2.0, 0.0]))
     sim.sample(0.0)
     sim.command(command(0, float(PLANT.u_max[0]), [float(PLANT.u_max[0])] * 60), 0.0)
@@ -324,7 +324,7 @@ def test_a_motion_that_cannot_be_followed_is_an_error_that_says_so() -> None:
         sim.sample(PERIOD * 10)
 
 
-def test_what_is_written_acts_a_dead_time_later_within_a_period_too() -> None:
+def test_an_input_acts_a_dead_time_later_also_within_a_period() -> None:
     late, truth = 1.3 * PERIOD, Truth(PLANT)
     motion = Motion(truth, PLANT.x0, PERIOD, late, PLANT.safe_input)
     first, second = np.array([1.1]), np.array([1.3])
@@ -335,14 +335,14 @@ def test_what_is_written_acts_a_dead_time_later_within_a_period_too() -> None:
     motion.write(second, 1.2 * PERIOD)
     motion.look_ahead()
     found = motion.read(3 * PERIOD)
-    # It stands still until the first input is written, and moves by what was there before until that acts.
+    # The plant stands still until the first write, and then moves under the earlier input until the new one acts.
     x = PLANT.x0
     for u, seconds in ((PLANT.safe_input, 1.3), (first, 1.0), (second, 0.5)):
         x = truth.step(x, u, seconds * PERIOD)
     np.testing.assert_allclose(found, x, rtol=1e-9, atol=1e-9)
 
 
-def test_looking_ahead_changes_nothing_behind_a_dead_time_of_whole_periods() -> None:
+def test_looking_ahead_changes_nothing_with_a_dead_time_of_whole_periods() -> None:
     truth, steps = Truth(PLANT), []
 
     class Counted:
@@ -363,5 +363,5 @@ def test_looking_ahead_changes_nothing_behind_a_dead_time_of_whole_periods() -> 
     found, worked_out = states(ahead=True), steps.copy()
     steps.clear()
     assert states(ahead=False) == found
-    # Nothing is worked out that another input overtakes; the last sample is never read.
+    # Nothing is computed that another input makes invalid; the last sample is never read.
     assert len(worked_out) <= len(steps) + 1

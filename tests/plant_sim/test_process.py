@@ -1,4 +1,4 @@
-"""The plant as a real process: it goes on alone, ends cleanly, and says why."""
+"""The plant as a real process: it continues without commands, ends cleanly, and reports the reason."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from tests.plant_sim.commands import PLANT, U, command
 
 
 @pytest.mark.live
-def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
-    # The stranger must stay one, however slow this machine is.
+def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
+    # The foreign sender must not take over, however slow this machine is.
     config = live_config("plant.x0=[0.5, 1.6875, 1.1547, 0.0]", "bus.follow_silence=60.0")
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
         ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
-            stranger = Bus(config, "controller", "controller-b")
-            stranger.open()
-            wait_for(lambda: matched(bus, topics.COMMAND) and matched(stranger, topics.COMMAND))
+            foreign = Bus(config, "controller", "controller-b")
+            foreign.open()
+            wait_for(lambda: matched(bus, topics.COMMAND) and matched(foreign, topics.COMMAND))
             for k in range(5):
                 ear.of(topics.PLANT_STATE)
                 state = ear.until(lambda message: isinstance(message, m.PlantState))
                 assert isinstance(state, m.PlantState)
                 answer = command(k, U + 0.01, [U] * 40, answers=state.seq, run_id=state.run_id)
                 bus.publish(topics.COMMAND, answer)
-                stranger.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
+                foreign.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
             ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
-            foreign = "bad controller/command: foreign"
+            foreign = "bad_controller_command_foreign"
             ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
             process.signal(signal.SIGINT)
             ear.until(health_of("plant", status="stopping"))
             assert process.end() == 0
-            stranger.close()
+            foreign.close()
     states = ear.of(topics.PLANT_STATE)
     order = [source for source, _ in groupby(state.source for state in states)]
     assert order[0] == "hold"
     assert "command" in order
     assert order[-2:] == ["plan", "safe"]
-    # Where this test was kept waiting for longer than a plan lasts, a period may begin under the safe input.
+    # If this test is delayed for longer than a plan, a period may begin with the safe input.
     driven = [after for before, after in pairwise(states) if "safe" not in (before.source, after.source)]
     applied = {state.applied[0] for state in driven if state.applied}
     assert applied
@@ -57,7 +57,7 @@ def test_a_real_plant_goes_on_alone_and_ends_cleanly() -> None:
 
 
 @pytest.mark.live
-def test_a_plant_whose_motion_ends_says_why() -> None:
+def test_a_plant_whose_motion_ends_logs_the_reason() -> None:
     config = live_config("rate=50.0", "plant.x0=[-1.6, 0.05, 2.0, 0.0]")
     high = float(PLANT.u_max[0])
     with open_router(config), Bus(config, "controller", "controller-a") as bus:
@@ -66,7 +66,7 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
             failed = health_of("plant", status="failed")
             wait_for(lambda: matched(bus, topics.COMMAND))
             health, seq = None, 0
-            # Until it has had one in time: a command that answers an old state is refused.
+            # Repeat until a command is in time, because a command for an old state is refused.
             while not isinstance(health, m.Health):
                 health = ear.until(lambda message: isinstance(message, m.PlantState) or failed(message))
                 if isinstance(health, m.PlantState):
@@ -83,7 +83,7 @@ def test_a_plant_whose_motion_ends_says_why() -> None:
             assert "pressure y" in process.said
 
 
-def test_a_wrong_plant_is_a_message_for_a_person(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_plant_gives_a_readable_error(caplog: pytest.LogCaptureFixture) -> None:
     assert node.main(live_config('plant.model="moore"')) == 2
     assert node.main(live_config("plant.x0=[1.0]")) == 2
     assert "did you mean 'moore_greitzer'?" in caplog.text
@@ -101,7 +101,7 @@ def test_a_plant_without_a_router_can_be_stopped() -> None:
 
 
 def wait_for_words(process: Process, words: str) -> None:
-    """Read what the process says up to a line with these words."""
+    """Read the process's output up to a line with these words."""
     for line in process.lines():
         if words in line:
             return

@@ -1,4 +1,4 @@
-"""The input's rate at a gateway: whoever acts, and whenever."""
+"""The rate limit at a gateway, for every source of inputs at any time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIMITED = {"u_rate_max": [RATE], "safe_gain": None}
 
 
 def largest_within_a_period(writes: list[tuple[float, float]]) -> float:
-    """Of any two inputs that acted within one period, the safe one before the first write among them."""
+    """Return the largest difference of inputs within one period, including the safe one before the first write."""
     acted = [(-np.inf, U), *writes]
     largest = 0.0
     for i, (t, u) in enumerate(acted):
@@ -33,8 +33,8 @@ def largest_within_a_period(writes: list[tuple[float, float]]) -> float:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
-    """Commands early, late, in bursts and none at all; backup policies; a feedback as the safe input; failed writes."""
+def test_it_holds_for_every_source_at_any_time(seed: int) -> None:
+    """Commands are early, late, in bursts or absent; with backup policies, a safe feedback and failed writes."""
     rng, bench = np.random.default_rng(seed), Bench(u_rate_max=[RATE])
     applied, sources, silent = [], set(), 0
     for k in range(80):
@@ -59,24 +59,24 @@ def test_it_holds_whoever_acts_and_whenever(seed: int) -> None:
     assert sources == {"hold", "command", "plan", "safe"}
 
 
-def test_a_command_that_comes_early_waits_and_loses_nothing() -> None:
+def test_an_early_command_is_delayed_without_loss() -> None:
     bench = Bench(**LIMITED)
     bench.sample(0)
     bench.command(0, 0.3, U + STEP)
     bench.sample(1)
-    # A twentieth of a period too early: the input before the last is not yet a period old.
+    # The command is a twentieth of a period early, so the input before the last is less than a period old.
     bench.command(1, 1.25, U + 2 * STEP)
     assert bench.writes[-1] == (pytest.approx(1.25 * PERIOD), pytest.approx(U + STEP))
     assert bench.shield.due == pytest.approx(1.3 * PERIOD)
     bench.act_until(1.5 * PERIOD)
     assert bench.writes[-1] == (pytest.approx(1.3 * PERIOD), pytest.approx(U + 2 * STEP))
-    # And a late one acts at once.
+    # A late command acts at once.
     bench.sample(2)
     bench.command(2, 2.6, U + 3 * STEP)
     assert bench.writes[-1] == (pytest.approx(2.6 * PERIOD), pytest.approx(U + 3 * STEP))
 
 
-def test_the_way_to_the_safe_input_goes_on_period_by_period() -> None:
+def test_the_safe_input_is_approached_period_by_period() -> None:
     bench = Bench(**LIMITED)
     for k in range(5):
         bench.sample(k)
@@ -90,7 +90,7 @@ def test_the_way_to_the_safe_input_goes_on_period_by_period() -> None:
     assert bench.writes[-1][1] == pytest.approx(U)
     falling = [state.applied[0] for state in applied if state.applied is not None]
     assert np.abs(np.diff(falling)).max() <= STEP * (1 + 1e-6)
-    # Six periods after the patience it is there.
+    # It is reached six periods after the patience.
     assert falling[-1] == pytest.approx(U)
     assert falling[-3] == pytest.approx(U)
 
@@ -120,8 +120,8 @@ TWO = Known.from_matrices(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_rows_of_inputs_hold_whoever_acts_and_with_them_the_rates(seed: int) -> None:
-    """Commands, plans behind them, the safe input, and one by hand; early and late."""
+def test_rows_and_rates_hold_for_every_source(seed: int) -> None:
+    """The sources are commands, their plans, the safe input and a manual input, early and late."""
     rng = np.random.default_rng(seed)
     limited = replace(TWO, u_rate_max=None) if seed == 3 else TWO
     shield = Shield(limited, PERIOD, 1.25, "plant-a", False, way_back_of(Config(rate=1.0 / PERIOD), limited))

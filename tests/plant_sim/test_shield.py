@@ -1,4 +1,4 @@
-"""The rules at a real machine: what it is given, what its samples say; no clock, no process."""
+"""The shield at a real machine: its writes and its samples; no clock, no process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AWAY = PLANT.x_e + np.array([0.1, 0.0, 0.0, 0.0])
 
 
 class Bench:
-    """A machine that stands at `x`, takes `takes` seconds for a write, and fails when told to."""
+    """A machine at `x` that takes `takes` seconds for a write and fails if told to."""
 
     def __init__(self, **options: object):
         self.shield = Shield(replace(PLANT, **options), PERIOD, 1.5, "plant-a", held=False)
@@ -36,7 +36,7 @@ class Bench:
         return None if self.fails else due + self.takes
 
     def sample(self, k: float, late: float = 0.0) -> m.PlantState | None:
-        """What a gateway does at slot k; `late`: seconds after it x is measured."""
+        """Do what a gateway does at slot k; x is measured `late` seconds after it."""
         t = k * PERIOD
         self.act(t)
         state = None if self.x is None else self.shield.sample(t, self.x, t + late)
@@ -49,13 +49,13 @@ class Bench:
         return state
 
     def command(self, seq: int, at: float, u: float = U, plan: int = 3) -> str:
-        """`sent`, and acting."""
+        """Send a command and let it act."""
         verdict = self.sent(seq, at, u, plan)
         self.act(at * PERIOD)
         return verdict
 
     def sent(self, seq: int, at: float, u: float, plan: int) -> str:
-        """A command for sample `seq` that arrives at that many periods; its plan is u + 0.01, u + 0.02 and so on."""
+        """Send a command for sample `seq` that arrives at time `at` in periods; its plan is u + 0.01, u + 0.02, .."""
         entries = [[u + 0.01 * i] for i in range(1 + plan)]
         return self.shield.command(planned(seq, entries, seq), at * PERIOD)
 
@@ -71,7 +71,7 @@ class Bench:
         )
 
     def act_until(self, t: float) -> None:
-        """All that is due by then, each at its own time."""
+        """Apply all inputs that are due by then, each at its own time."""
         self.shield.advance(t, self)
 
     def act(self, t: float) -> None:
@@ -80,22 +80,22 @@ class Bench:
 
 
 def fed_back(x: np.ndarray) -> float:
-    """The safe input in this state."""
+    """Return the safe input in this state."""
     assert PLANT.safe_gain is not None
     return float((PLANT.safe_input + PLANT.safe_gain @ (x - PLANT.x_e))[0])
 
 
-def test_a_machine_that_cannot_be_held_has_its_safe_input_from_the_start() -> None:
+def test_a_machine_that_cannot_be_held_starts_with_its_safe_input() -> None:
     bench = Bench()
     first, second = bench.sampled(0), bench.sampled(1)
     assert (first.applied, first.pieces) == (None, [])
     assert bench.writes == [(0.0, fed_back(AWAY)), (PERIOD, fed_back(AWAY))]
-    # What acts is known, so that this is a label, though nobody has commanded anything.
+    # The acting input is known, so this gives a label, although there was no command.
     assert (second.applied, second.source, second.command_seq) == ([fed_back(AWAY)], "safe", -1)
     assert not bench.shield.moving
 
 
-def test_the_safe_feedback_follows_the_state_and_does_without_one() -> None:
+def test_the_safe_feedback_uses_the_state_if_there_is_one() -> None:
     bench = Bench()
     bench.sample(0)
     bench.x = PLANT.x_e + np.array([-0.2, 0.0, 0.0, 0.0])
@@ -117,7 +117,7 @@ def test_without_bounds_the_safe_feedback_is_never_infinite() -> None:
     assert np.isfinite(bench.writes[0][1])
 
 
-def test_a_command_acts_from_its_arrival_and_the_sample_says_when_that_was() -> None:
+def test_a_command_acts_from_its_arrival_which_the_sample_reports() -> None:
     bench = Bench()
     bench.sample(0)
     assert bench.command(0, 0.2) == "ok"
@@ -137,7 +137,7 @@ def test_an_input_acts_when_the_write_has_returned() -> None:
     assert [piece.seconds for piece in bench.sampled(1).pieces][-1] == pytest.approx(0.7 * PERIOD)
 
 
-def test_a_write_that_returns_in_the_next_period_belongs_to_that_one() -> None:
+def test_a_write_that_returns_in_the_next_period_belongs_to_it() -> None:
     bench = Bench(safe_gain=None)
     bench.sample(0)
     bench.takes = 0.5 * PERIOD
@@ -148,12 +148,12 @@ def test_a_write_that_returns_in_the_next_period_belongs_to_that_one() -> None:
     assert [piece.u for piece in state.pieces] == [PLANT.safe_input.tolist(), [U + 0.02]]
 
 
-def test_writes_are_less_than_two_periods_apart_also_where_nothing_changes() -> None:
+def test_writes_are_less_than_two_periods_apart() -> None:
     bench = Bench(safe_gain=None)
     for k in range(4):
         bench.sample(k)
         bench.command(k, k + 0.2)
-    # With a command in each period these are all there is.
+    # With a command in each period there are no other writes.
     assert [due / PERIOD for due, _u in bench.writes] == pytest.approx([0.0, 0.2, 1.2, 2.2, 3.2])
     for k in range(4, 16):
         bench.sample(k)
@@ -162,14 +162,14 @@ def test_writes_are_less_than_two_periods_apart_also_where_nothing_changes() -> 
     assert [u for _due, u in bench.writes[-7:]] == [float(PLANT.safe_input[0])] * 7
 
 
-def test_of_a_write_that_failed_nothing_is_known_until_one_succeeds() -> None:
+def test_after_a_failed_write_the_input_is_unknown_until_one_succeeds() -> None:
     bench = Bench()
     bench.sample(0)
     bench.fails = True
     bench.command(0, 0.2)
     state = bench.sampled(1)
     assert (state.applied, state.pieces) == (None, [])
-    # Tried again at once, not only with the next command.
+    # The write is repeated at once, and not only with the next command.
     assert bench.writes[-1] == (PERIOD, U)
     bench.fails = False
     assert bench.sampled(2).applied is None
@@ -189,7 +189,7 @@ def test_without_a_measurement_there_is_no_sample_and_no_label_across_the_gap() 
     assert bench.sampled(4).applied is not None
 
 
-def test_where_no_sample_can_be_taken_for_long_what_acted_is_forgotten() -> None:
+def test_inputs_are_forgotten_after_a_long_time_without_samples() -> None:
     bench = Bench()
     bench.sample(0)
     bench.x = None
@@ -203,14 +203,14 @@ def test_where_no_sample_can_be_taken_for_long_what_acted_is_forgotten() -> None
     assert bench.sampled(3 * MOST_ACTED + 1).applied is not None
 
 
-def test_the_policy_reads_at_the_beginning_of_its_periods_and_without_a_state_the_plan_goes_on() -> None:
+def test_the_policy_reads_at_the_start_of_its_periods_and_without_a_state_the_plan_acts() -> None:
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.2)
     assert bench.backup(0, [U, U + 0.05, U + 0.07], gain=0.5) == "ok"
     bench.sample(1)
     assert bench.reads == []
-    # Patience ends at 1.7, the policy's periods begin at 1.2, 2.2 and so on.
+    # The patience ends at 1.7; the policy's periods begin at 1.2, 2.2 and so on.
     bench.act(1.7 * PERIOD + 1e-9)
     bench.sample(2)
     bench.act(2.2 * PERIOD + 1e-9)
@@ -222,28 +222,28 @@ def test_the_policy_reads_at_the_beginning_of_its_periods_and_without_a_state_th
 
 
 @pytest.mark.parametrize("late", [0.02, 0.3])
-def test_a_measurement_that_came_late_makes_no_label(late: float) -> None:
+def test_a_late_measurement_gives_no_label(late: float) -> None:
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.0, plan=9)
     states = [bench.sampled(k, late * PERIOD if k == 2 else 0.0) for k in range(1, 5)]
-    # Neither that one nor the next: both periods had another length.
+    # Neither this sample nor the next has a label, because both periods had another length.
     assert [state.applied is None for state in states] == [False, late > 0.1, late > 0.1, False]
     assert all(state.pieces for state in states if state.applied is None)
 
 
-def test_after_a_standstill_a_machine_gets_what_acts_now() -> None:
+def test_after_a_standstill_only_the_present_input_is_written() -> None:
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.2, plan=40)
     before = len(bench.writes)
     bench.sample(30)
-    # No burst of thirty entries.
+    # There is no burst of thirty entries.
     assert [u for _due, u in bench.writes[before:]] == pytest.approx([U + 0.29])
 
 
 def jumped(after_command: Callable[[Bench], None] = lambda bench: None) -> tuple[Bench, m.PlantState]:
-    """A machine whose state jumps after its second sample, and the third, the first of the new epoch."""
+    """Return a machine whose state jumps after its second sample, and the third sample, the first of the new epoch."""
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.2)
@@ -254,7 +254,7 @@ def jumped(after_command: Callable[[Bench], None] = lambda bench: None) -> tuple
     return bench, bench.sampled(2)
 
 
-def test_after_a_jump_only_what_acts_is_known() -> None:
+def test_after_a_jump_only_the_present_input_is_known() -> None:
     bench, state = jumped()
     assert (state.seq, state.applied, state.source) == (2, None, "command")
     assert state.pieces == [m.Piece(0.0, [U])]
@@ -262,11 +262,11 @@ def test_after_a_jump_only_what_acts_is_known() -> None:
     assert (after.seq, after.applied is None) == (3, False)
 
 
-def test_what_answers_a_sample_from_before_a_jump_is_not_followed() -> None:
+def test_commands_for_samples_before_a_jump_are_not_followed() -> None:
     bench, _state = jumped(lambda bench: None)
     assert bench.command(1, 2.1) == "stale"
     assert bench.backup(1, [U] * 3) == "stale"
-    # The input stays for its patience; the plan behind it was made for another state.
+    # The input acts until the patience ends; its plan was made for another state.
     assert (bench.writes[-1][1], bench.shield.due) == (U, pytest.approx(2.7 * PERIOD))
     before = len(bench.writes)
     for k in range(3, 6):
@@ -285,7 +285,7 @@ def test_a_policy_from_before_a_jump_is_not_followed() -> None:
     assert {u for _due, u in bench.writes[before:]} == {fed_back(AWAY)}
 
 
-def test_a_jump_while_the_plan_is_followed_ends_it_at_once() -> None:
+def test_a_jump_ends_a_plan_at_once() -> None:
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.2, plan=9)
@@ -297,20 +297,20 @@ def test_a_jump_while_the_plan_is_followed_ends_it_at_once() -> None:
     assert bench.writes[-1] == (5 * PERIOD, fed_back(AWAY))
 
 
-def test_a_command_on_its_way_while_the_state_jumps_is_forgotten() -> None:
+def test_a_pending_command_is_dropped_at_a_jump() -> None:
     bench = Bench()
     bench.sample(0)
     bench.command(0, 0.0)
     bench.sample(1)
     bench.shield.jump()
-    # Taken, but not yet acting when the sample is made.
+    # The command was accepted but does not act yet when the sample is taken.
     assert bench.sent(1, 2.1, 1.0, 0) == "ok"
     bench.sample(2)
     bench.act(2.2 * PERIOD)
     assert all(u != 1.0 for _due, u in bench.writes)
 
 
-def test_the_input_to_leave_a_machine_with_is_the_safe_one_within_its_bounds() -> None:
+def test_the_last_input_is_the_safe_one_within_its_bounds() -> None:
     assert Bench().shield.rest() == PLANT.safe_input
     rest = Bench(safe_input=[99.0]).shield.rest()
     assert rest is not None

@@ -1,4 +1,4 @@
-"""A router of its own for each test that asks for one, and trainings on one thread."""
+"""A router for each test that needs one, and trainings on one thread."""
 
 from __future__ import annotations
 

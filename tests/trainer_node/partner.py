@@ -1,4 +1,4 @@
-"""A trainer in a thread of the test, and the controller beside it that is only its messages."""
+"""A trainer in a thread of the test, and a controller that consists only of its messages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PATIENCE = 60.0
 
 
 class Controller:
-    """Says what a controller says, one `tick` at a time, and adopts what it is sent unless told otherwise."""
+    """Sends a controller's messages, one `tick` at a time, and adopts received weights unless told otherwise."""
 
     def __init__(
         self, config: Config, run_id: str, seed: int = 0, description: NetworkDescription = DESCRIPTION
@@ -85,11 +85,11 @@ class Controller:
         )
 
     def roll_back(self, hidden: list[np.ndarray]) -> None:
-        """The highest version stays what it was."""
+        """Roll back, without changing the highest version."""
         self.hidden = [layer.astype(np.float32).astype(float) for layer in hidden]
 
     def tick(self, times: int = 1, lost: bool = False, miss: int = 0) -> None:
-        """Samples whose h tells which it is, and K. `lost`: they do not arrive. `miss`: ticks left out."""
+        """Send samples whose h identifies them, and K. `lost`: they do not arrive. `miss`: skipped ticks."""
         self.seq += miss
         batch = []
         for _ in range(times):
@@ -123,7 +123,7 @@ class Controller:
         )
 
     def until(self, condition: Callable[[Health], bool], tick: bool = False, ignored: str = "") -> Health:
-        """Wait for a trainer's health that satisfies the condition; `ignored`: another trainer's run id."""
+        """Wait for a trainer's health that satisfies the condition; `ignored` is another trainer's run id."""
         deadline = time.monotonic() + PATIENCE
         health = None
         while time.monotonic() < deadline:
@@ -138,7 +138,7 @@ class Controller:
 
 
 class RunningTrainer:
-    """A trainer in a thread of this process, with its inside open to a test."""
+    """A trainer in a thread of this process whose internals a test can read."""
 
     def __init__(self, config: Config, run_id: str = "trainer-1"):
         self.stop = threading.Event()
@@ -170,7 +170,7 @@ class RunningTrainer:
             self.node.update_counters()
 
     def labels(self) -> list[int]:
-        """Sequence numbers of all that is in the buffer, ascending."""
+        """Return the sequence numbers of all samples in the buffer, ascending."""
         assert self.node.trainer is not None
         return sorted(round(h * 1e6) for h in self.node.trainer.buffer.contents()[1][:, 0])
 

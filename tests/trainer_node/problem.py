@@ -1,4 +1,4 @@
-"""Trainers of a network of the compressor's size, and samples of a smooth h."""
+"""Trainers of a network of the size used for the compressor, and samples of a smooth h."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ K = np.random.default_rng(1).normal(size=(DESCRIPTION.features, 4)) * 0.1
 
 
 def samples(first: int, number: int, seed: int = 2) -> list[Sample]:
-    """Samples of a smooth h of the size that the compressor's has."""
+    """Return samples of a smooth h of the same size as the compressor's."""
     rng = np.random.default_rng([seed, first])
     found = []
     for seq in range(first, first + number):

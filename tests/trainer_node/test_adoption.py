@@ -1,4 +1,4 @@
-"""What is not adopted: refusals, rollbacks, strangers' sets; training goes on from what is in use."""
+"""Refusals, rollbacks and foreign sets; training continues from the weights in use."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from trainer_node import node as trainer_module
 pytestmark = pytest.mark.live
 
 
-def test_a_controller_that_refuses_is_asked_what_it_holds(
+def test_a_controller_that_refuses_is_queried_for_its_weights(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         controller.adopts = False
-        controller.until(lambda h: h.counters["not adopted"] >= 1, tick=True)
+        controller.until(lambda h: h.counters["not_adopted"] >= 1, tick=True)
         base = hash_layers(controller.hidden)
         controller.adopts = True
         controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
@@ -31,27 +31,27 @@ def test_a_controller_that_refuses_is_asked_what_it_holds(
         assert controller.adopted[0].seq >= 2
 
 
-def test_after_every_refusal_training_goes_on_from_what_is_in_use(
+def test_after_a_refusal_training_continues_from_the_weights_in_use(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         for refused in range(1, 4):
             controller.adopts = False
-            controller.until(lambda h, n=refused: h.counters["not adopted"] >= n, tick=True)
+            controller.until(lambda h, n=refused: h.counters["not_adopted"] >= n, tick=True)
             controller.adopts = True
             done = len(controller.adopted)
             health = controller.until(lambda _, n=done: len(controller.adopted) > n, tick=True)
         bases = [hash_layers(initial_hidden(DESCRIPTION, np.random.default_rng(0)))]
         bases += [weights.sha256 for weights in controller.adopted]
         assert [weights.base_sha256 for weights in controller.adopted] == bases[:-1]
-        # Not one version was left out, and nobody was suspected.
+        # No version was skipped, and no other trainer was assumed.
         assert controller.heard <= health.counters["published"] + 1
-        assert health.counters["others' sets"] == 0
+        assert health.counters["others_sets"] == 0
 
 
-@pytest.mark.parametrize("joined_before", [True, False], ids=["its own", "from before it came"])
-def test_after_a_rollback_training_goes_on_at_once_with_the_next_version(
+@pytest.mark.parametrize("joined_before", [True, False], ids=["its own", "from before it joined"])
+def test_after_a_rollback_training_continues_with_the_next_version(
     config: Config, monkeypatch: pytest.MonkeyPatch, joined_before: bool
 ) -> None:
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
@@ -60,14 +60,14 @@ def test_after_a_rollback_training_goes_on_at_once_with_the_next_version(
         controller.until(lambda _: len(controller.adopted) >= 2, tick=True)
         controller.until(lambda h: h.counters["adopted"] >= len(controller.adopted), tick=True)
         before = [layer.numpy().astype(float) for layer in controller.adopted[-2].layers]
-        # What this trainer may never have seen is known by what was judged last.
+        # Sets that this trainer may never have seen are recognised by the controller's last decision.
         controller.roll_back(before if joined_before else [1.01 * layer for layer in first])
         back, newest = controller.snapshot().hidden_sha256, controller.version
         controller.until(lambda _: controller.version > newest, tick=True)
         assert controller.adopted[-1].seq == newest + 1
         assert controller.adopted[-1].base_sha256 == back
-        health = controller.until(lambda h: h.counters["rolled back"] >= 1)
-        assert (health.counters["others' sets"], health.counters["not adopted"]) == (0, 0)
+        health = controller.until(lambda h: h.counters["rolled_back"] >= 1)
+        assert (health.counters["others_sets"], health.counters["not_adopted"]) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -75,10 +75,10 @@ def test_after_a_rollback_training_goes_on_at_once_with_the_next_version(
     [(2 * PATIENCE, 0, True), (2 * PATIENCE, 400, True), (0.3, 400, False)],
     ids=["adopted", "refused", "heard"],
 )
-def test_a_thief_under_its_name_does_not_silence_a_trainer(
+def test_a_trainer_with_a_stolen_name_does_not_block_the_real_one(
     config: Config, monkeypatch: pytest.MonkeyPatch, patience: float, lead: int, judged: bool
 ) -> None:
-    """A stranger's sets are judged, which is known at once; or one is only heard, and versions must pass it."""
+    """Foreign sets are decided on, which shows at once, or only received, and then versions must exceed them."""
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", patience)
     patient = msgspec.structs.replace(
         config, bus=msgspec.structs.replace(config.bus, follow_silence=2 * PATIENCE)
@@ -107,7 +107,7 @@ def test_a_thief_under_its_name_does_not_silence_a_trainer(
             return controller.adopted[-1].sha256 if controller.adopted else ""
 
         def stolen(_: Health) -> bool:
-            # Again and again: what the trainer sent meanwhile is ahead of it.
+            # Repeat it, because the trainer's own sets meanwhile have higher versions.
             if in_use() not in forged:
                 steal(5)
             return in_use() in forged

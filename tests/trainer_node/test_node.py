@@ -1,4 +1,4 @@
-"""The trainer on a real bus, beside a controller that is only its messages: join, restart, lose, follow."""
+"""The trainer on a real bus, with a controller that consists only of its messages: join, restart, loss, follow."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trainer_node import node as trainer_module
 pytestmark = pytest.mark.live
 
 
-def test_it_trains_and_the_controller_adopts_again_and_again(config: Config) -> None:
+def test_it_trains_and_the_controller_adopts_repeatedly(config: Config) -> None:
     with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
         controller.until(lambda h: h.counters.get("adopted", 0) >= 3, tick=True)
         first, second = controller.adopted[:2]
@@ -26,18 +26,18 @@ def test_it_trains_and_the_controller_adopts_again_and_again(config: Config) -> 
         assert trainer.labels() == list(range(controller.seq + 1))
 
 
-def test_a_late_trainer_gets_the_samples_it_missed_once_each(config: Config) -> None:
+def test_a_late_trainer_gets_each_missed_sample_once(config: Config) -> None:
     with Controller(config, "controller-1") as controller:
         for _ in range(60):
             controller.tick(20)
         with RunningTrainer(config) as trainer:
-            # Live samples go on arriving while the old ones are fetched.
+            # Live samples keep arriving while the old ones are fetched.
             controller.until(joined, tick=True)
             controller.until(holds(controller.seq + 1))
             assert trainer.labels() == list(range(controller.seq + 1))
 
 
-def test_a_trainer_may_come_before_the_controller_and_before_the_first_tick(config: Config) -> None:
+def test_a_trainer_can_start_before_the_controller_and_the_first_tick(config: Config) -> None:
     with RunningTrainer(config) as trainer, Controller(config, "controller-1") as controller:
         controller.until(joined)
         controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
@@ -45,7 +45,7 @@ def test_a_trainer_may_come_before_the_controller_and_before_the_first_tick(conf
         assert trainer.labels() == list(range(controller.seq + 1))
 
 
-def test_a_restarted_trainer_goes_on_with_rising_versions(config: Config) -> None:
+def test_a_restarted_trainer_continues_with_rising_versions(config: Config) -> None:
     with Controller(config, "controller-1") as controller:
         with RunningTrainer(config):
             controller.until(lambda h: h.counters["adopted"] >= 2, tick=True)
@@ -55,11 +55,11 @@ def test_a_restarted_trainer_goes_on_with_rising_versions(config: Config) -> Non
             assert controller.adopted[-1].run_id == "trainer-2"
             assert controller.adopted[-1].seq > reached
             health = controller.until(holds(controller.seq + 1), ignored="trainer-1")
-            assert health.counters["not adopted"] == 0
+            assert health.counters["not_adopted"] == 0
             assert trainer.labels() == list(range(controller.seq + 1))
 
 
-def test_lost_samples_are_fetched_and_missed_ticks_are_not_asked_for_again(config: Config) -> None:
+def test_lost_samples_are_fetched_and_missed_ticks_are_queried_once(config: Config) -> None:
     with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
         controller.until(joined)
         controller.tick(10)
@@ -68,22 +68,21 @@ def test_lost_samples_are_fetched_and_missed_ticks_are_not_asked_for_again(confi
         controller.tick(10, lost=True)
         controller.tick(10)
         health = controller.until(holds(30))
-        assert health.counters["gaps filled"] >= 1
+        assert health.counters["gaps_filled"] >= 1
         assert trainer.labels() == list(range(30))
         assert len(controller.questions) == asked + 1
-        # Ticks that never were look the same; their question is settled by its answer, and asked at most once
-        # a second.
+        # Skipped ticks look the same. The answer to their query settles them, and there is at most one query a second.
         for _ in range(5):
             controller.tick(1, miss=2)
             controller.tick(1, miss=2)
         controller.until(holds(40))
-        # They are stamped where they arrive; asked at every gap they would be a tick apart.
+        # Queries are stamped on arrival; one per gap would make them a tick apart.
         assert np.diff(controller.questions).min() > 0.5 * trainer_module.REFILL_EVERY
         expected = [*range(30), *(29 + 3 * made for made in range(1, 11))]
         assert trainer.labels() == expected
 
 
-def test_a_restarted_controller_is_followed_and_its_predecessors_samples_stay(config: Config) -> None:
+def test_a_restarted_controller_is_followed_and_earlier_samples_are_kept(config: Config) -> None:
     with RunningTrainer(config) as trainer:
         with Controller(config, "controller-1") as controller:
             controller.until(lambda h: h.counters["adopted"] >= 2, tick=True)
@@ -100,7 +99,7 @@ def test_a_restarted_controller_is_followed_and_its_predecessors_samples_stay(co
             assert trainer.labels() == sorted([*range(before), *range(controller.seq + 1)])
 
 
-def test_another_network_begins_anew(config: Config) -> None:
+def test_another_network_starts_with_an_empty_buffer(config: Config) -> None:
     other = msgspec.structs.replace(DESCRIPTION, states=3, input_scale=[1.0] * 4, output_scale=[0.01] * 3)
     with RunningTrainer(config) as trainer:
         with Controller(config, "controller-1") as controller:

@@ -1,4 +1,4 @@
-"""The real processes under measurement noise: sets are refused and rolled back, and training goes on."""
+"""The real processes with measurement noise: sets are refused and rolled back, and training continues."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SETTINGS = (
 
 @pytest.mark.live
 @pytest.mark.long
-def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
+def test_refusals_and_rollbacks_do_not_delay_training() -> None:
     config = live_config(*SETTINGS)
     with (
         open_router(config),
@@ -50,6 +50,6 @@ def test_refusals_and_rollbacks_make_no_pause_and_no_leap() -> None:
         versions = [weights.seq for weights in ear.of(topics.HIDDEN_WEIGHTS)]
         assert versions == list(range(1, len(versions) + 1))
         ticks = [tick for tick in ear.of(topics.TICK) if tick.weights is not None]
-        # The median: other work may take this machine's cores away for seconds.
+        # Use the median, because other work may take this machine's cores for seconds.
         waits = [(b.slot - a.slot) * config.period for a, b in itertools.pairwise(ticks)]
         assert float(np.median(waits)) < 0.5 * ADOPTION_PATIENCE

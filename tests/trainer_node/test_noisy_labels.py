@@ -1,4 +1,4 @@
-"""Trainings on labels with a variance: what is noise, where to stop, and how often it pays."""
+"""Trainings on labels with a variance: noise, early stopping, and the pace of trainings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def noisy(number: int, deviation: float, share: float = 1.0) -> list[Sample]:
-    """The samples of a smooth h, `share` of it, whose labels err by so much of the output scale."""
+    """Return samples of `share` of a smooth h whose labels have noise of this deviation in output scales."""
     rng, scale = np.random.default_rng(8), np.array(DESCRIPTION.output_scale)
     variance = ((deviation * scale) ** 2).tolist()
     return [
@@ -36,13 +36,13 @@ def trained_on(labels: list[Sample], weights: np.ndarray) -> tuple[Trainer, Hidd
     return trainer, trainer.train(output(trainer, weights=weights), "controller-1")
 
 
-def test_noise_is_not_trained_on_and_an_h_that_exceeds_it_is() -> None:
+def test_noise_is_not_fitted_but_a_larger_h_is() -> None:
     still = np.zeros_like(K)
     still[1:] = 0.05 * np.random.default_rng(1).normal(size=K[1:].shape)
     trainer, found = trained_on(noisy(80, 1.0, share=0.0), still)
     assert found is None
-    assert trainer.counters["kept: loss not lower"] == 1
-    # The same numbers, and nobody says that they are noise: they are fitted.
+    assert trainer.counters["kept_loss_not_lower"] == 1
+    # The same numbers without a variance are fitted.
     exact = [msgspec.structs.replace(sample, variance=[]) for sample in noisy(80, 1.0, share=0.0)]
     _, fitted = trained_on(exact, still)
     assert fitted is not None
@@ -52,8 +52,8 @@ def test_noise_is_not_trained_on_and_an_h_that_exceeds_it_is() -> None:
     assert learned.loss_after < 0.9 * learned.loss_before
 
 
-def test_what_is_held_out_says_where_to_stop() -> None:
-    """The loss in the message is that of the layers that are sent, on samples that they were not trained on."""
+def test_held_out_samples_determine_where_to_stop() -> None:
+    """The loss in the message is that of the sent layers, on samples that they were not trained on."""
     _, learned = trained_on(noisy(60, 0.3), K)
     assert learned is not None
     assert learned.samples == 45
@@ -68,11 +68,11 @@ def test_what_is_held_out_says_where_to_stop() -> None:
     h_hat = h_hat_of(network, network.tensor(window), network.tensor(K)).numpy(force=True)
     labels = {tuple(sample.x + sample.u): sample.h for sample in noisy(60, 0.3)}
     error = (h_hat - [labels[tuple(row)] for row in window]) / DESCRIPTION.output_scale
-    # As a share of the labels' variance.
+    # The loss is relative to the labels' variance.
     np.testing.assert_allclose(learned.loss_after, np.mean((error / 0.3) ** 2), rtol=1e-4)
 
 
-def test_of_a_few_steps_the_last_one_counts_too() -> None:
+def test_the_last_of_a_few_steps_is_evaluated() -> None:
     trainer = Trainer(DESCRIPTION, msgspec.structs.replace(CONFIG, steps=7), 5, "trainer-1", HIDDEN)
     trainer.add("controller-1", noisy(300, 0.01))
     learned = trainer.train(output(trainer), "controller-1")
@@ -80,7 +80,7 @@ def test_of_a_few_steps_the_last_one_counts_too() -> None:
     assert learned.loss_after < learned.loss_before
 
 
-def test_the_newest_samples_say_whether_labels_are_noisy_and_a_bad_one_says_nothing() -> None:
+def test_the_newest_valid_sample_decides_whether_labels_are_noisy() -> None:
     trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
 
     def holds_out() -> bool:
@@ -91,7 +91,7 @@ def test_the_newest_samples_say_whether_labels_are_noisy_and_a_bad_one_says_noth
     trainer.add("controller-1", samples(0, 40))
     (bad,) = noisy(1, 1.0)
     trainer.add("controller-1", [msgspec.structs.replace(bad, seq=90, h=[float("nan")] * 4)])
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
     assert not holds_out()
     trainer.add("controller-1", [msgspec.structs.replace(bad, seq=91)])
     assert holds_out()
@@ -100,14 +100,14 @@ def test_the_newest_samples_say_whether_labels_are_noisy_and_a_bad_one_says_noth
 
 
 @pytest.mark.parametrize("variance", [[-1.0] * 4, [float("nan")] * 4, [1.0], [1e306] * 4])
-def test_a_variance_that_is_none_is_a_bad_sample(variance: list[float]) -> None:
+def test_an_invalid_variance_makes_a_bad_sample(variance: list[float]) -> None:
     trainer = make(number=30)
     (bad,) = samples(50, 1)
     assert trainer.add("controller-1", [msgspec.structs.replace(bad, variance=variance)]) == 0
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
 
 
-def test_a_set_says_the_newest_sample_that_it_was_trained_on_where_labels_are_noisy() -> None:
+def test_a_set_contains_its_newest_training_sample_with_noisy_labels() -> None:
     trainer, learned = trained_on(noisy(300, 0.1), K)
     assert learned is not None
     assert learned.newest == 299
@@ -119,7 +119,7 @@ def test_a_set_says_the_newest_sample_that_it_was_trained_on_where_labels_are_no
     assert b"newest" not in msgspec.msgpack.encode(exact)
 
 
-def test_a_state_that_nobody_measures_does_not_keep_others_from_being_learned() -> None:
+def test_an_unmeasured_state_does_not_prevent_learning_of_others() -> None:
     scale = np.array(DESCRIPTION.output_scale)
     blind = [
         msgspec.structs.replace(
@@ -135,7 +135,7 @@ def test_a_state_that_nobody_measures_does_not_keep_others_from_being_learned() 
 
 
 def trainings(trainer: Trainer, first: int, number: int, share: float) -> list[int]:
-    """The samples, all of them labels of `share` h with as much noise as h, at which a training began."""
+    """Return the samples at which a training began, for labels of `share` h with as much noise as h."""
     began = []
     rng, scale = np.random.default_rng(first), np.array(DESCRIPTION.output_scale)
     for sample in samples(first, number):
@@ -148,23 +148,23 @@ def trainings(trainer: Trainer, first: int, number: int, share: float) -> list[i
     return began
 
 
-def test_it_trains_less_where_there_is_nothing_to_gain_and_at_once_where_h_changes() -> None:
+def test_trainings_become_rare_without_gain_and_start_at_once_after_a_change() -> None:
     trainer = Trainer(DESCRIPTION, CONFIG, 5, "trainer-1", HIDDEN)
-    # K = 0: no hidden layers predict anything.
+    # With K = 0 no hidden layers predict anything.
     calm = np.diff(trainings(trainer, 0, 600, share=0.0))
     assert list(calm[:3]) == [40, 80, 150]
-    # A quarter of the buffer, at most.
+    # The interval is at most a quarter of the buffer.
     assert set(calm[2:]) == {150}
     assert trainer.worth == Worth(0.0, pays=False)
     assert str(trainer.worth) == "training has nothing to gain (0.0% of the labels' variance)"
     risen = trainings(trainer, 600, 40, share=3.0)
     assert risen[0] < 625
-    # Of another controller's layers nothing is known.
+    # Nothing is known about another controller's layers.
     trainer.resume(HIDDEN)
     assert trainings(trainer, 700, 30, share=0.0)[0] <= 709
 
 
-def test_labels_without_a_variance_are_trained_on_as_often_as_ever() -> None:
+def test_exact_labels_are_trained_on_at_the_usual_pace() -> None:
     trainer = make(number=0)
     began = []
     for sample in samples(0, 100):

@@ -1,4 +1,4 @@
-"""The trainer as a process: killed and replaced, asked to end, without a router, with nothing to train."""
+"""The trainer as a process: killed and replaced, told to stop, without a router, with training disabled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def process(config: Config) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", program, to_json(config)])
 
 
-def test_a_killed_process_is_replaced_and_its_successor_ends_when_asked(config: Config) -> None:
+def test_a_killed_process_is_replaced_and_its_successor_stops_on_request(config: Config) -> None:
     with Controller(config, "controller-1") as controller:
         first = process(config)
         try:
@@ -45,7 +45,7 @@ def test_a_killed_process_is_replaced_and_its_successor_ends_when_asked(config: 
             second.wait(PATIENCE)
 
 
-def test_it_stops_while_there_is_no_router() -> None:
+def test_it_can_be_stopped_without_a_router() -> None:
     config = Config(trainer=TRAINING, bus=BusConfig(endpoint="tcp/127.0.0.1:9"))
     stop = threading.Event()
     codes: list[int] = []
@@ -56,7 +56,7 @@ def test_it_stops_while_there_is_no_router() -> None:
     assert codes == [0]
 
 
-def test_hidden_layers_that_are_not_to_be_trained_are_left_alone(config: Config) -> None:
+def test_with_training_disabled_hidden_layers_are_not_trained(config: Config) -> None:
     config = msgspec.structs.replace(config, trainer=msgspec.structs.replace(TRAINING, enabled=False))
     stop = threading.Event()
     thread = threading.Thread(target=main, args=[config, stop])

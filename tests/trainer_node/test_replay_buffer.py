@@ -1,4 +1,4 @@
-"""The replay buffer: what it keeps, what it never does twice, and that it is the same every time."""
+"""The replay buffer: its contents for each strategy, no repetitions, and reproducibility."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ SCALE = [0.5, 2.0, 1.0]
 
 
 def add(buffer: ReplayBuffer, run: str, seq: int, xu: ArrayLike, h: ArrayLike) -> bool:
-    """One sample; whether it is new."""
+    """Add one sample; return whether it is new."""
     return buffer.add(run, [seq], np.array([xu], dtype=float), np.array([h], dtype=float)) == 1
 
 
 def offer(buffer: ReplayBuffer, points: np.ndarray, run: str = "run-1", first: int = 0) -> None:
-    """Points (n, 3) as (x, u) with 2 states; h tells which one it is."""
+    """Offer points (n, 3) as (x, u) with 2 states; h identifies the point."""
     for i, point in enumerate(points, start=first):
         assert add(buffer, run, i, point, [float(i), -float(i)])
 
 
 def kept(buffer: ReplayBuffer) -> list[int]:
-    """The sequence numbers stored, ascending."""
+    """Return the stored sequence numbers, ascending."""
     return sorted(int(h) for h in buffer.contents()[1][:, 0])
 
 
@@ -50,7 +50,7 @@ def closest_pair(points: np.ndarray) -> float:
         max_size=60,
     ),
 )
-def test_whatever_arrives_nothing_is_stored_twice_or_mixed_up_or_beyond_capacity(
+def test_samples_are_stored_once_consistently_and_within_capacity(
     strategy: Strategy, capacity: int, seed: int, offers: list[tuple[str, int, tuple[int, int, int]]]
 ) -> None:
     buffers = [ReplayBuffer(capacity, strategy, seed, SCALE) for _ in range(2)]
@@ -76,7 +76,7 @@ def test_fifo_keeps_the_newest() -> None:
     assert kept(buffer) == list(range(27, 37))
 
 
-def test_a_restarted_controller_counts_from_zero_and_its_predecessors_samples_stay() -> None:
+def test_samples_before_a_controllers_restart_are_kept() -> None:
     buffer = ReplayBuffer(10, "fifo", 0, SCALE)
     points = np.random.default_rng(0).normal(size=(4, 3))
     offer(buffer, points, "run-1")
@@ -97,13 +97,13 @@ def test_the_reservoir_keeps_every_sample_with_the_same_probability() -> None:
         counts[kept(buffer)] += 1
     p = capacity / offered
     z = (counts - repetitions * p) / np.sqrt(repetitions * p * (1 - p))
-    # The sum of 100 squared standard normal variables is 100 +- 14; of their quarters' means, 1 / 5.
+    # The sum of 100 squared standard normal variables is 100 +- 14.
     assert 60 < np.sum(z**2) < 140
     assert np.abs(z.reshape(4, -1).mean(axis=1)).max() < 0.6
 
 
 def settling(n: int, rng: np.random.Generator) -> np.ndarray:
-    """(n, 3): a spiral into the origin that then stays there, with noise."""
+    """Return (n, 3): a spiral into the origin that then stays there, with noise."""
     t = np.arange(n)
     decay = np.exp(-t / 60.0)
     path = np.stack([decay * np.cos(t / 10), decay * np.sin(t / 10), decay], axis=1)
@@ -111,13 +111,13 @@ def settling(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def spread(buffer: ReplayBuffer) -> float:
-    """Mean distance to the centre, in units of the scale."""
+    """Return the mean distance to the centre, in units of the scale."""
     points = buffer.contents()[0] / np.asarray(SCALE)
     return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
 
 def uncovered(buffer: ReplayBuffer, points: np.ndarray) -> float:
-    """Largest distance of an offered point from the nearest stored one, in units of the scale."""
+    """Return the largest distance of an offered point from the nearest stored one, in units of the scale."""
     stored = buffer.contents()[0] / np.asarray(SCALE)
     return float(np.linalg.norm((points / SCALE)[:, None] - stored[None], axis=2).min(axis=1).max())
 
@@ -128,11 +128,11 @@ def test_novelty_keeps_the_spread_of_a_trajectory_that_settles() -> None:
     for buffer in buffers.values():
         offer(buffer, points)
     assert spread(buffers["novelty"]) > 3 * spread(buffers["reservoir"]) > 3 * spread(buffers["fifo"])
-    # No place it came through is forgotten.
+    # No region of the trajectory is lost.
     assert 2 * uncovered(buffers["novelty"], points) < uncovered(buffers["reservoir"], points)
 
 
-def test_novelty_still_takes_in_what_is_new_after_a_long_rest() -> None:
+def test_novelty_accepts_new_points_after_a_long_rest() -> None:
     buffer = ReplayBuffer(50, "novelty", 0, SCALE)
     rng = np.random.default_rng(0)
     offer(buffer, 1e-3 * rng.normal(size=(500, 3)))
@@ -144,7 +144,7 @@ def test_novelty_still_takes_in_what_is_new_after_a_long_rest() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 15), st.integers(0, 10_000), st.booleans())
 def test_novelty_drops_the_younger_of_the_closest_pair(capacity: int, seed: int, grid: bool) -> None:
-    """Against the rule spelled out: all pairs, every time. On a grid many distances are equal."""
+    """The result is compared with a direct evaluation of all pairs. On a grid many distances are equal."""
     rng = np.random.default_rng(seed)
     points = rng.integers(-2, 3, (60, 3)).astype(float) if grid else rng.normal(size=(60, 3))
     buffer = ReplayBuffer(capacity, "novelty", 0, [1.0] * 3)
@@ -173,12 +173,12 @@ def test_a_novelty_insertion_takes_time_proportional_to_the_capacity() -> None:
         start = time.thread_time()
         offer(buffer, rng.normal(size=(300, 3)) * 3, first=capacity)
         taken.append((time.thread_time() - start) / 300)
-    # 8 times the capacity; all pairs would be 64 times.
+    # For 8 times the capacity; evaluating all pairs would take 64 times as long.
     assert taken[1] / taken[0] < 24, taken
     assert taken[1] < 5e-3
 
 
-def test_a_drawn_sample_is_not_drawn_again_while_there_are_enough() -> None:
+def test_samples_are_drawn_without_replacement() -> None:
     buffer = ReplayBuffer(50, "fifo", 0, SCALE)
     offer(buffer, np.random.default_rng(0).normal(size=(50, 3)))
     rng = np.random.default_rng(7)
@@ -204,7 +204,7 @@ def test_a_drawn_sample_is_not_drawn_again_while_there_are_enough() -> None:
         ([0.0, 0.0], [0.0], [0.0]),
     ],
 )
-def test_what_is_not_finite_or_of_another_size_is_refused_and_may_be_sent_again(
+def test_invalid_samples_are_refused_and_can_be_sent_again(
     x: list[float], u: list[float], h: list[float]
 ) -> None:
     buffer = ReplayBuffer(5, "fifo", 0, SCALE)
@@ -215,22 +215,22 @@ def test_what_is_not_finite_or_of_another_size_is_refused_and_may_be_sent_again(
     assert add(buffer, "run-1", 1, np.zeros(3), np.zeros(2))
 
 
-def test_a_sample_is_new_once_in_whatever_order_they_come() -> None:
+def test_a_sample_is_new_once_in_any_order() -> None:
     rng = np.random.default_rng(11)
     seen, met = Seen(), set[int]()
-    # Stretches, holes that are filled later, repetitions, all over the place.
+    # The sequence has intervals, gaps that are filled later, and repetitions.
     for seq in [*rng.permutation(300), *range(250, 400), *rng.integers(0, 600, 2000)]:
         assert seen.add("a", int(seq)) == (int(seq) not in met)
         met.add(int(seq))
         assert seen.last("a") == max(met)
 
 
-def test_what_is_remembered_of_sequence_numbers_is_bounded() -> None:
+def test_the_memory_of_sequence_numbers_is_bounded() -> None:
     seen = Seen(stretches=100, runs=2)
     order = [*range(0, 1000, 3), *range(999, 0, -1)]
     new = [seq for seq in order if seen.add("a", seq)]
     assert len(set(new)) == len(new)
-    # Recent gaps are still filled, ancient ones are not.
+    # Recent gaps can still be filled, old ones cannot.
     assert set(range(900, 1000)) <= set(new)
     assert 1 not in new
     assert seen.last("a") == 999
@@ -243,7 +243,7 @@ def test_a_long_run_takes_no_more_memory_than_a_short_one() -> None:
     def memory(samples: int) -> int:
         tracemalloc.start()
         seen = Seen()
-        # Every other one comes late: the holes close again.
+        # Every second sample is late, so that the gaps close later.
         for seq in [*range(0, samples, 2), *range(1, samples, 2)]:
             seen.add("a", seq)
         found = tracemalloc.get_traced_memory()[0]
@@ -254,11 +254,11 @@ def test_a_long_run_takes_no_more_memory_than_a_short_one() -> None:
 
 
 @pytest.mark.parametrize("strategy", ["fifo", "reservoir", "novelty"])
-def test_batches_leave_what_one_sample_after_the_other_leaves(strategy: Strategy) -> None:
+def test_batches_equal_single_samples(strategy: Strategy) -> None:
     rng = np.random.default_rng(8)
     one, many = (ReplayBuffer(20, strategy, 3, [1.0, 2.0, 0.5]) for _ in range(2))
     seq = 0
-    # Batches that fill it, that wrap, that are longer than it is, with some samples met before.
+    # The batches fill the buffer, wrap around, exceed it, and repeat some samples.
     for size in (1, 7, 11, 4, 30, 0, 45, 20, 3):
         seqs = [max(0, seq + k - 2) for k in range(size)]
         seq += size
@@ -270,7 +270,7 @@ def test_batches_leave_what_one_sample_after_the_other_leaves(strategy: Strategy
         assert (one.offered, one.last("a")) == (many.offered, many.last("a"))
 
 
-def test_first_in_first_out_by_the_batch_is_a_bounded_queue() -> None:
+def test_fifo_with_batches_is_a_bounded_queue() -> None:
     rng = np.random.default_rng(9)
     buffer, queue, seq = ReplayBuffer(20, "fifo", 3, [1.0, 2.0, 0.5]), deque[bytes](maxlen=20), 0
     for size in (1, 7, 11, 4, 30, 45, 20, 3, 20, 40):
@@ -282,7 +282,7 @@ def test_first_in_first_out_by_the_batch_is_a_bounded_queue() -> None:
         assert sorted(held) == sorted(queue)
 
 
-def test_a_bad_sample_keeps_its_whole_batch_out() -> None:
+def test_a_bad_sample_rejects_its_whole_batch() -> None:
     buffer = ReplayBuffer(20, "fifo", 3, [1.0, 2.0, 0.5])
     windows, h = np.zeros((3, 3)), np.zeros((3, 2))
     windows[1, 1] = np.nan

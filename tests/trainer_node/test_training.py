@@ -1,4 +1,4 @@
-"""The slow timescale: what a training does, what it never touches, when it keeps the old hidden layers."""
+"""The slow timescale: the effect of a training, its inputs, and reasons to keep the old hidden layers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def losses(weights: list[np.ndarray]) -> float:
-    """The loss over all 300 samples, written out in numpy."""
+    """Return the loss over all 300 samples, computed in numpy."""
     total = 0.0
     for sample in samples(0, 300):
         activation = np.concatenate([sample.x, sample.u]) / DESCRIPTION.input_scale
@@ -37,7 +37,7 @@ def losses(weights: list[np.ndarray]) -> float:
     return total / 300
 
 
-def test_a_training_lowers_the_loss_of_the_paper_with_K_as_it_was() -> None:
+def test_a_training_lowers_the_paper_s_loss_for_fixed_K() -> None:
     trainer = make(batch=300)
     asked = output(trainer)
     before = asked.K.data
@@ -50,7 +50,7 @@ def test_a_training_lowers_the_loss_of_the_paper_with_K_as_it_was() -> None:
     assert weights.samples == 300
 
 
-def test_what_is_published_names_what_it_was_trained_on() -> None:
+def test_the_message_identifies_its_training_data() -> None:
     trainer = make()
     first = trained(trainer, 40)
     second = trained(trainer, 60)
@@ -95,7 +95,7 @@ def test_another_process_trains_the_same_bits() -> None:
     assert found.stdout == trained(make()).sha256
 
 
-def test_it_is_due_after_enough_new_samples_and_not_before() -> None:
+def test_a_training_is_due_after_enough_new_samples() -> None:
     trainer = make(number=0, train_every=20, min_samples=50)
     for first in range(0, 40, 20):
         trainer.add("controller-1", samples(first, 20))
@@ -105,14 +105,14 @@ def test_it_is_due_after_enough_new_samples_and_not_before() -> None:
     trained(trainer)
     assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(30, 20))
-    assert trainer.counters["samples met before"] == 20
+    assert trainer.counters["samples_met_before"] == 20
     trainer.add("controller-1", samples(50, 19))
     assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(69, 1))
     assert trainer.due(output(trainer))
 
 
-def test_samples_that_cannot_be_right_never_reach_the_buffer() -> None:
+def test_invalid_samples_do_not_reach_the_buffer() -> None:
     trainer = make(number=30)
     good = samples(30, 1)[0]
     bad = [
@@ -122,7 +122,7 @@ def test_samples_that_cannot_be_right_never_reach_the_buffer() -> None:
         msgspec.structs.replace(good, h=[0.0]),
     ]
     assert trainer.add("controller-1", [*bad, good]) == 1
-    assert trainer.counters["bad samples"] == 4
+    assert trainer.counters["bad_samples"] == 4
     assert len(trainer.buffer) == 31
     assert np.isfinite(trained(trainer).loss_after)
 
@@ -141,12 +141,12 @@ def flipped(self: DenseLoss, right: Callable[[DenseLoss], torch.Tensor] = DenseL
 @pytest.mark.parametrize(
     ("gradient", "reason"),
     [
-        (broken_loss(float("nan")), "kept: not finite"),
-        (flipped, "kept: loss not lower"),
-        (broken_loss(0.0), "kept: loss not lower"),
+        (broken_loss(float("nan")), "kept_not_finite"),
+        (flipped, "kept_loss_not_lower"),
+        (broken_loss(0.0), "kept_loss_not_lower"),
     ],
 )
-def test_a_training_that_goes_wrong_leaves_the_old_layers(
+def test_a_failed_training_keeps_the_old_layers(
     monkeypatch: pytest.MonkeyPatch, gradient: Any, reason: str
 ) -> None:
     trainer = make()
@@ -162,13 +162,13 @@ def test_a_training_that_goes_wrong_leaves_the_old_layers(
 @pytest.mark.parametrize(
     ("weights", "reason"),
     [
-        (np.full_like(K, np.nan), "kept: K is not finite"),
-        (np.full_like(K, 1e300), "kept: K is too large"),
-        (K[:, :3], "kept: K has the wrong shape"),
-        (K[:-1], "kept: K has the wrong shape"),
+        (np.full_like(K, np.nan), "kept_k_is_not_finite"),
+        (np.full_like(K, 1e300), "kept_k_is_too_large"),
+        (K[:, :3], "kept_k_has_the_wrong_shape"),
+        (K[:-1], "kept_k_has_the_wrong_shape"),
     ],
 )
-def test_output_weights_that_cannot_be_used_are_named(weights: np.ndarray, reason: str) -> None:
+def test_unusable_output_weights_are_reported(weights: np.ndarray, reason: str) -> None:
     trainer = make()
     assert trainer.train(output(trainer, weights=weights), "controller-1") is None
     assert trainer.counters[reason] == 1
@@ -180,11 +180,11 @@ def test_layers_that_the_controller_would_refuse_are_not_published() -> None:
     trainer = Trainer(tight, CONFIG, 5, "trainer-1", HIDDEN)
     trainer.add("controller-1", samples(0, 300))
     assert trainer.train(output(trainer), "controller-1") is None
-    assert trainer.counters["kept: norm bound"] == 1
+    assert trainer.counters["kept_norm_bound"] == 1
 
 
-def test_it_goes_on_from_the_layers_that_K_belongs_to() -> None:
-    """The controller did not adopt the last weights: K was adapted to the ones before."""
+def test_a_training_continues_from_the_layers_of_K() -> None:
+    """The controller did not adopt the last weights, so K was adapted to the ones before."""
     trainer = make()
     first = trained(trainer)
     second = trained(trainer)
@@ -192,13 +192,13 @@ def test_it_goes_on_from_the_layers_that_K_belongs_to() -> None:
     assert again is not None
     assert again.base_sha256 == first.sha256
     assert again.seq == second.seq + 1
-    # Other samples were drawn, so the layers differ; but both began at the same loss, nearly.
+    # The drawn samples differ, and so do the layers, but both trainings began at nearly the same loss.
     assert again.loss_before == pytest.approx(second.loss_before, rel=0.3)
     assert trainer.train(output(trainer, sha256="0" * 64), "controller-1") is None
-    assert trainer.counters["kept: K belongs to unknown hidden weights"] == 1
+    assert trainer.counters["kept_k_belongs_to_unknown_hidden_weights"] == 1
 
 
-def test_it_goes_on_from_a_snapshot_with_its_samples() -> None:
+def test_a_training_continues_from_a_snapshot_with_its_samples() -> None:
     trainer = make()
     trained(trainer)
     other = initial_hidden(DESCRIPTION, np.random.default_rng(9))
@@ -211,7 +211,7 @@ def test_it_goes_on_from_a_snapshot_with_its_samples() -> None:
         trainer.resume(other[:1])
 
 
-def test_a_device_that_is_not_there_is_named() -> None:
+def test_a_missing_device_is_reported() -> None:
     if torch.cuda.is_available():
         assert pick_device("cuda").type == "cuda"
     else:
@@ -222,7 +222,7 @@ def test_a_device_that_is_not_there_is_named() -> None:
 
 
 @pytest.mark.parametrize("activations", [["tanh", "sigmoid"], ["relu", "softsign"], ["softplus", "tanh"]])
-def test_the_gradient_written_out_is_that_of_autograd(activations: Any) -> None:
+def test_the_handwritten_gradient_equals_autograd(activations: Any) -> None:
     description = msgspec.structs.replace(DESCRIPTION, hidden=[7, 5], activations=activations)
     rng = np.random.default_rng(3)
     network = Network(description, torch.float64)
@@ -239,7 +239,7 @@ def test_the_gradient_written_out_is_that_of_autograd(activations: Any) -> None:
 
 
 def test_a_training_is_quick() -> None:
-    """200 steps on 512 samples: about 40 ms of one core; the limit leaves room for slow machines."""
+    """200 steps on 512 samples take about 40 ms of one core; the limit leaves room for slow machines."""
     trainer = make(batch=512, capacity=2000, number=600)
     taken = []
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""A recurrent network of a file in the real processes: its samples reach the trainer, and weights come back."""
+"""A recurrent network from a file in the real processes: its samples reach the trainer, and weights are adopted."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def test_a_recurrent_network_learns_live_and_its_log_replays(tmp_path: Path) -> 
     assert result["weights_adopted"] >= 1
     log = read_run(tmp_path / "run.mcap")
     assert {len(sample.past) for sample in log.samples} == {4}
-    # Slots are counted by the clock, the ones that a busy machine made the controller miss included.
+    # Slots are counted by the clock, including those that a busy machine made the controller miss.
     assert 90 <= log.ticks[-1].slot <= 200
     assert replay(log, architecture=load_architecture(GRU)).equal

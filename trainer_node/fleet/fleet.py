@@ -34,11 +34,11 @@ ASKERS = 16
 """Number of plants that can be queried at once. A plant without an answer occupies its place for two seconds."""
 FLEET_SHARE = 0.9
 """Largest share of the time spent on training several plants, because a fleet's trainer has a machine of its own."""
-TAKEN_IN_AT_ONCE = 16
+ADDED_AT_ONCE = 16
 """Number of plants added between two checks for messages."""
-SAY_EVERY_S = 30.0
+LOG_EVERY_S = 30.0
 """Seconds between two log lines while there is no plant."""
-LEFT_ALONE_S = 10.0
+PAUSE_S = 10.0
 """Seconds for which a plant is not added again after an unexpected error."""
 
 
@@ -62,12 +62,12 @@ class Fleet:
     def __init__(self, finder: PlantFinder):
         self._finder = finder
         self._nodes: dict[str, _Followed] = {}
-        self._left_alone: dict[str, float] = {}
+        self._paused: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(ASKERS, "ask")
         self._health_thread = HealthThread()
         self._share = FLEET_SHARE if finder.many else SHARE
         self._train_at = 0.0
-        self._say_at = 0.0
+        self._log_at = 0.0
 
     @property
     def plants(self) -> list[str]:
@@ -100,13 +100,13 @@ class Fleet:
             try:
                 do(self._nodes[name].node)
             except Exception:
-                log.exception("%s: dropped for %g s after an unexpected error", name, LEFT_ALONE_S)
-                self._left_alone[name] = now + LEFT_ALONE_S
+                log.exception("%s: dropped for %g s after an unexpected error", name, PAUSE_S)
+                self._paused[name] = now + PAUSE_S
                 self._drop(name)
 
     def _update_plants(self, now: float) -> None:
-        self._left_alone = {name: until for name, until in self._left_alone.items() if now < until}
-        present = [name for name in self._finder.present(now) if name not in self._left_alone]
+        self._paused = {name: until for name, until in self._paused.items() if now < until}
+        present = [name for name in self._finder.present(now) if name not in self._paused]
         for name in set(self._nodes) - set(present):
             log.info("%s: no link, or no message for %.0f s; dropped until it returns", name, SILENT_S)
             self._drop(name)
@@ -115,16 +115,16 @@ class Fleet:
             if self._finder.lanes(name) is not self._nodes[name].lanes:
                 self._drop(name)
         # Add a few at a time, so that the present plants do not wait for all new ones.
-        for name in [name for name in present if name not in self._nodes][:TAKEN_IN_AT_ONCE]:
+        for name in [name for name in present if name not in self._nodes][:ADDED_AT_ONCE]:
             try:
-                self._take_in(name)
+                self._add_plant(name)
             except zenoh.ZError as error:
                 log.warning("%s could not be added: %s", name, error)
-        if not present and now >= self._say_at:
-            self._say_at = now + SAY_EVERY_S
+        if not present and now >= self._log_at:
+            self._log_at = now + LOG_EVERY_S
             log.info("waiting for %s", self._finder.looks_for)
 
-    def _take_in(self, name: str) -> None:
+    def _add_plant(self, name: str) -> None:
         said = self._finder.config(name)
         config = msgspec.structs.replace(said, seed=seed_of(said.seed, name))
         run_id, counts = new_run_id("trainer"), dict.fromkeys(COUNTERS, 0)

@@ -87,7 +87,7 @@ def _replays(replays: list[Replayed]) -> str:
 
 
 def reasons(pairs: dict[str, list[Pair]]) -> Iterator[str]:
-    """Table rows of the failed checks, by fault."""
+    """Return the table rows of the failed checks, by fault."""
     for name, found in pairs.items():
         for pair in found:
             for why in pair.outcome.not_held:

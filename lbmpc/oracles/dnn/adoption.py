@@ -48,7 +48,7 @@ class Adoption:
         Returns:
             The state and "adopted", or the previous state with an updated memory of trials and the reason.
         """
-        reason = self._why_not_of_this_network(state, offered)
+        reason = self._reason_to_refuse(state, offered)
         if reason is not None:
             return state, Verdict("refused", reason)
         # The hash covers float32 values.
@@ -106,7 +106,7 @@ class Adoption:
         later = newest(self.trial, state, int(state["seen"][0]) - offered.later)
         return later if len(later) >= self.trial.least else later[:0]
 
-    def _why_not_of_this_network(self, state: OracleState, offered: HiddenSet) -> str | None:
+    def _reason_to_refuse(self, state: OracleState, offered: HiddenSet) -> str | None:
         """Return the reason why a set does not belong to this network, or None."""
         known, version = int(state["version"][NEWEST]), offered.version
         if version <= known:
@@ -122,7 +122,7 @@ class Adoption:
 
     def _compare(self, samples: np.ndarray, new: Network, old: Network) -> Finding:
         """Compare two networks (hidden layers and K) on the same samples, (n, row)."""
-        windows, h = self._taken_apart(samples)
+        windows, h = self._windows_and_labels(samples)
 
         def error(hidden: list[np.ndarray], K: np.ndarray) -> float:
             missed = self.net.features_of(hidden, windows) @ K - h
@@ -137,10 +137,10 @@ class Adoption:
         known = state["samples"][: int(state["sampled"][0])]
         if not len(known):
             return state["K"]
-        windows, h = self._taken_apart(known)
+        windows, h = self._windows_and_labels(known)
         return refit(state["K"], self.net.features_of(hidden, windows), h, self.refit.ridge, self.bounds)
 
-    def _taken_apart(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _windows_and_labels(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the windows of pairs, (n, k, d + m), and the labels, (n, d), of stored samples, (n, row)."""
         d, m = self.net.d, self.net.m
         return samples[:, :-d].reshape(len(samples), self.net.pairs, d + m), samples[:, -d:]

@@ -103,7 +103,7 @@ class SetsCompute(Configured):
             Work,
             default_cache,
             read_sets,
-            why_not_believed,
+            why_not_trusted,
         )
         from lbmpc.sets.certificate import CertificateError
         from lbmpc.sets.check import check
@@ -112,7 +112,7 @@ class SetsCompute(Configured):
         from lbmpc.sets.guard import Guard
 
         work = Work.of(model, kind, start, W, self.slack, default_cache())
-        doubt = why_not_believed(work)
+        doubt = why_not_trusted(work)
         saved: Saved = SavedArrays(work.folder) if doubt is None else {}
         if doubt is not None:
             self.say(f"{doubt}; computed without it", style="yellow")

@@ -1,4 +1,4 @@
-"""The policy that a plant follows when its controller falls silent, on the true plant and against the judge."""
+"""The backup policy on the true plant, and compared with IPOPT."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ def problem(oracle: Oracle, model: Model = MODEL) -> Problem:
 
 
 def theta_of(oracle: Oracle, seed: int = 1) -> np.ndarray:
-    """What the oracle begins with; of the perfect one, the plant's parameters."""
+    """Return the oracle's initial parameters; for the perfect oracle, the plant's parameters."""
     return oracle.theta(oracle.initial_state(np.random.default_rng(seed)))
 
 
 def outside(x: np.ndarray) -> float:
-    """How far x, a deviation, lies outside X, as a share of the half-widths; negative inside."""
+    """Return how far x, a deviation, lies outside X, as a share of the half-widths; negative inside."""
     return float(np.max(np.abs(x + PLANT.x_e - 0.5 * (PLANT.x_min + PLANT.x_max)) / HALF)) - 1.0
 
 
 def distance(x: np.ndarray) -> float:
-    """In the norm of the terminal cost."""
+    """Return the norm of x in the terminal cost."""
     return float(np.sqrt(x @ MODEL.P @ x))
 
 
 def followed(x: np.ndarray, policy: Policy, truth: Truth) -> list[np.ndarray]:
-    """The true plant's deviations under the policy."""
+    """Return the true plant's deviations under the policy."""
     states = []
     for inputs in policy.inputs:
         u = np.clip(inputs + policy.gain @ x + PLANT.u_e, PLANT.u_min, PLANT.u_max)
@@ -63,8 +63,8 @@ def followed(x: np.ndarray, policy: Policy, truth: Truth) -> list[np.ndarray]:
     return states
 
 
-def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
-    """With h known the backup problem's constraints are the true plant's; the nominal plan's are not."""
+def test_the_policy_keeps_the_true_plant_in_x_while_the_nominal_plan_leaves() -> None:
+    """With a known h the constraints of the backup problem are the true plant's; those of the nominal plan are not."""
     oracle, truth = PerfectOracle(MODEL), Truth(PLANT)
     theta = theta_of(oracle)
     nominal = Solver(problem(oracle)).solve(X0, theta, np.zeros((N, 1)))
@@ -74,11 +74,11 @@ def test_the_true_plant_stays_inside_where_the_nominal_plan_leaves() -> None:
     assert policy is not None
     states = followed(X0, policy, truth)
     assert max(map(outside, states)) < 1e-4
-    # What it expects is what happens, so that the feedback has nothing to do.
+    # The true states equal the expected ones, so the feedback adds nothing.
     assert np.array(states[:-1]) == pytest.approx(policy.states[1:], abs=2e-4)
 
 
-def test_the_margin_is_kept_once_it_has_grown() -> None:
+def test_the_full_margin_is_kept_after_the_ramp() -> None:
     oracle = PerfectOracle(MODEL)
     x = np.array([-0.1, -0.4, 0.0, 0.0])
     policy = BackupPlanner(problem(oracle), 0.05).policy(x, theta_of(oracle), np.zeros((N, 1)))
@@ -89,17 +89,17 @@ def test_the_margin_is_kept_once_it_has_grown() -> None:
 @pytest.mark.parametrize(
     ("flow", "margin", "least", "most"),
     [
-        (0.15, 0.02, 0.02, 0.02),  # leads back with all of it
-        (0.15, 0.06, 0.01, 0.02),  # with all of it the flow falls to a third
+        (0.15, 0.02, 0.02, 0.02),  # leads back with the full margin
+        (0.15, 0.06, 0.01, 0.02),  # with the full margin the flow falls to a third
         (0.145, 0.02, 0.001, 0.003),
-        (0.135, 0.06, 0.0, 0.0),  # too late, but cheaper
-        (0.13, 0.06, 0.0, 0.0),  # ends no nearer without one, but stays at the edge of X until then
+        (0.135, 0.06, 0.0, 0.0),  # does not lead back, but is cheaper without margin
+        (0.13, 0.06, 0.0, 0.0),  # ends no nearer without margin, but stays at the edge of X
     ],
 )
-def test_as_much_of_the_margin_is_kept_as_leads_back(
+def test_the_largest_margin_that_leads_back_is_kept(
     flow: float, margin: float, least: float, most: float
 ) -> None:
-    """From the paper's x0 and below the flow recovers only while the pressure is near its bound."""
+    """From the paper's x0 and below, the flow recovers only while the pressure is near its bound."""
     oracle = PerfectOracle(MODEL)
     x = np.array([flow - PLANT.x_e[0], *X0[1:]])
     policy = BackupPlanner(problem(oracle), margin).policy(x, theta_of(oracle), np.zeros((N, 1)))
@@ -110,16 +110,16 @@ def test_as_much_of_the_margin_is_kept_as_leads_back(
         assert max(map(outside, states)) < 1e-3 - policy.margin
         assert distance(states[-1]) < 0.95 * distance(x)
     else:
-        # With all of it, by a tenth of the half-width and more.
+        # With the full margin the plant leaves X by a tenth of the half-width or more.
         assert max(map(outside, states)) < 0.01
 
 
 @pytest.mark.parametrize("x", [np.zeros(4), np.full(4, 1e-4), np.array([-0.1, -0.4, 0.0, 0.0])])
 @pytest.mark.parametrize("oracle", [PerfectOracle(MODEL), oracle_named("dnn", MODEL)])
-def test_a_margin_that_costs_nothing_is_kept(
+def test_a_margin_without_cost_is_kept(
     x: np.ndarray, oracle: Oracle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And nothing is solved a second time, at rest neither, where what was learned says that it will move away."""
+    """No second problem is solved then, and none at rest, even if the learned model predicts a motion away from it."""
     solved = []
 
     def counted(*arguments: Any) -> Nearest | None:
@@ -133,8 +133,8 @@ def test_a_margin_that_costs_nothing_is_kept(
     assert len(solved) == STEPS
 
 
-def test_a_margin_is_not_given_up_for_nothing() -> None:
-    """A valve that hardly moves: no plan leads back, and none without a margin costs less."""
+def test_a_margin_is_kept_if_dropping_it_gains_nothing() -> None:
+    """With an almost immovable valve no plan leads back, and no plan without margin costs less."""
     stuck = replace(PLANT, u_min=PLANT.u_e - 1e-6, u_max=PLANT.u_e + 1e-6)
     model = build_model(stuck, MODEL.period)
     oracle = PerfectOracle(model)
@@ -144,8 +144,8 @@ def test_a_margin_is_not_given_up_for_nothing() -> None:
     assert policy.margin == 0.05
 
 
-def test_without_learning_it_is_the_solution_of_the_judge() -> None:
-    """For h_hat = 0 the learned states are the nominal ones, and the judge solves the same problem."""
+def test_without_learning_the_policy_matches_ipopt() -> None:
+    """For h_hat = 0 the learned states are the nominal ones, and IPOPT solves the same problem."""
     oracle = LinearOracle(MODEL.d, MODEL.m)
     plain = state_set(MODEL)
     inside = 0.02 * HALF
@@ -163,8 +163,8 @@ def test_without_learning_it_is_the_solution_of_the_judge() -> None:
 
 
 @pytest.mark.parametrize("architecture", ["mlp", "rnn"])
-def test_the_learned_states_are_what_the_rows_hold(architecture: str) -> None:
-    """Also where the oracle looks back, and the state of the recursion is longer than x."""
+def test_the_rows_constrain_the_learned_states(architecture: str) -> None:
+    """This includes an oracle with a window, for which the recursion's state is longer than x."""
     oracle = DnnOracle(
         describe(MODEL, [8], architecture=architecture, window=1 if architecture == "mlp" else 3)
     )
@@ -182,14 +182,14 @@ def test_the_learned_states_are_what_the_rows_hold(architecture: str) -> None:
     assert max(map(outside, policy.states[RAMP + 4 :])) < -0.01 + 1e-3
 
 
-def test_numbers_that_are_none_give_no_policy() -> None:
+def test_nonfinite_numbers_give_no_policy() -> None:
     oracle = oracle_named("dnn", MODEL)
     planner = BackupPlanner(problem(oracle), 0.01)
     theta = theta_of(oracle)
     assert planner.policy(X0, theta, np.zeros((N, 1))) is not None
     assert planner.policy(X0 * np.nan, theta, np.zeros((N, 1))) is None
     assert planner.policy(X0, np.full_like(theta, np.inf), np.zeros((N, 1))) is None
-    # And the next one is as if nothing had been.
+    # The next call is not affected.
     first = planner.policy(X0, theta, np.zeros((N, 1)))
     again = BackupPlanner(problem(oracle), 0.01).policy(X0, theta, np.zeros((N, 1)))
     assert first is not None
@@ -208,7 +208,7 @@ CONFIG = override(
 )
 
 
-def test_a_backup_takes_part_in_the_replay_and_changes_nothing_else() -> None:
+def test_backups_are_replayed_and_do_not_change_commands() -> None:
     run = simulate(CONFIG, 12)
     core = ControllerCore(CONFIG, run.controllers[0])
     backups = []
@@ -233,7 +233,7 @@ def test_a_backup_takes_part_in_the_replay_and_changes_nothing_else() -> None:
     assert (found.tick, found.field) == (7, "backup.inputs[0][0]")
 
 
-def test_in_plant_units_it_is_the_same_policy() -> None:
+def test_the_policy_in_plant_units_is_equivalent() -> None:
     run = simulate(CONFIG, 3)
     core = ControllerCore(CONFIG, run.controllers[0])
     for tick in run.ticks:

@@ -1,4 +1,4 @@
-"""What was written acts a dead time later: in labels, in the estimator and in the prediction."""
+"""The dead time in labels, in the estimator and in the prediction."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def linear_plant(rng: np.random.Generator, dead_time: float, m: int = 2) -> Know
 
 
 class Delayed:
-    """dx/dt = A x + B u(t - dead_time) + w, under random inputs that switch up to three times a period."""
+    """dx/dt = A x + B u(t - dead_time) + w, under random inputs with up to three switches per period."""
 
     def __init__(self, plant: Known, rng: np.random.Generator, w: np.ndarray, periods: int):
         self.plant, self.w = plant, w
@@ -50,7 +50,7 @@ class Delayed:
             self.written.append(tuple((b - a, rng.uniform(-1.0, 1.0, plant.m)) for a, b in pairwise(ends)))
 
     def move(self, x: np.ndarray, begin: float, end: float) -> np.ndarray:
-        """From x(begin) to x(end)."""
+        """Return x(end) from x(begin)."""
         b = np.hstack([self.plant.B, np.eye(3)])
         t = 0.0
         for seconds, u in (piece for period in self.written for piece in period):
@@ -62,7 +62,7 @@ class Delayed:
         return x
 
     def seen(self, k: int, x: np.ndarray) -> Observation:
-        """The sample that ends period k - 1."""
+        """Return the sample at the end of period k - 1."""
         pieces = self.written[k - 1]
         applied = sum(seconds / T * u for seconds, u in pieces)
         return Observation(x, np.asarray(applied), 1, k, None, pieces if len(pieces) > 1 else ())
@@ -74,7 +74,7 @@ def dead_times() -> list[float]:
 
 
 @pytest.mark.parametrize("dead_time", dead_times())
-def test_labels_are_the_true_h_and_predictions_the_true_motion(dead_time: float) -> None:
+def test_labels_equal_the_true_h_and_predictions_the_true_motion(dead_time: float) -> None:
     rng = np.random.default_rng(int(1e6 * dead_time))
     plant = linear_plant(rng, dead_time)
     model, line, w = build_model(plant, T), InputLine(plant, T), rng.normal(0.0, 0.3, 3)
@@ -82,7 +82,7 @@ def test_labels_are_the_true_h_and_predictions_the_true_motion(dead_time: float)
     windy, calm = Delayed(plant, rng, w, 24), Delayed(plant, rng, np.zeros(3), 24)
     calm.written = windy.written
     memory, before, first_label = line.initial_state(), None, 0
-    # From here on all that acts was written by somebody.
+    # From here on every acting input was written during the test.
     first = math.ceil(dead_time / T - 1e-9) + 1
     x = rng.normal(0.0, 0.2, 3)
     for k in range(first, 17):
@@ -92,18 +92,18 @@ def test_labels_are_the_true_h_and_predictions_the_true_motion(dead_time: float)
             assert acted.seen.applied is not None
             label = model.label(before, acted.seen.applied, x, acted.seen.pieces)
             np.testing.assert_allclose(label, h, atol=1e-12 * max(1.0, np.abs(x).max()))
-            # From x to where a command acts that comes in the middle of this period's first input.
+            # Predict from x to the time of a command in the middle of this period's first input.
             delay = 0.5 * windy.written[k][0][0]
             inputs = (*acted.ahead, (delay, windy.written[k][0][1]))
             found, _ = predicted(model, LinearOracle(3, 2), {}, x, inputs)
             there = calm.move(x, k * T, k * T + dead_time + delay)
             np.testing.assert_allclose(found, there, atol=1e-9 * max(1.0, np.abs(there).max()))
         before, x = x, windy.move(x, k * T, (k + 1) * T)
-    # Of the first sample's period all is known, and of nothing before it.
+    # The period of the first sample is fully known, and the time before it is unknown.
     assert first_label == first + math.ceil(dead_time / T - 1e-9)
 
 
-def test_without_a_dead_time_nothing_is_remembered_and_nothing_changes() -> None:
+def test_without_a_dead_time_the_line_is_empty_and_has_no_effect() -> None:
     line = InputLine(linear_plant(np.random.default_rng(0), 0.0), T)
     seen = Observation(np.zeros(3), np.zeros(2), 1, 3, None)
     memory, acted = line.advance(line.initial_state(), seen, 0.01)
@@ -112,7 +112,7 @@ def test_without_a_dead_time_nothing_is_remembered_and_nothing_changes() -> None
     assert (acted.known, acted.ahead) == (True, ())
 
 
-# -- samples that are missing ----------------------------------------------------------------------------------
+# -- missing samples -------------------------------------------------------------------------------------------
 
 
 PLANT = linear_plant(np.random.default_rng(1), 1.5 * T, m=1)
@@ -120,7 +120,7 @@ LINE = InputLine(PLANT, T)
 
 
 def sample(k: int, *pieces: float, source: int = 1, applied: float | None = None) -> Observation:
-    """Of equal pieces, each with this input."""
+    """Return a sample of equally long pieces with these inputs."""
     parts = tuple((T / len(pieces), np.array([u])) for u in pieces)
     mean = np.array([sum(pieces) / len(pieces) if applied is None else applied])
     return Observation(np.zeros(3), mean, source, k, None, parts if len(pieces) > 1 else ())
@@ -130,7 +130,7 @@ MISSING = Observation(None, None, 0, -1, None)
 
 
 def after(*ticks: tuple[Observation, float], delay: float = 0.0) -> Acted:
-    """Of the last of these ticks, (what was seen, what was commanded then)."""
+    """Return the result of the last of these ticks; each is an observation and the command after it."""
     memory: LineState = LINE.initial_state()
     acted = Acted(MISSING, False, ())
     for seen, u in ticks:
@@ -144,32 +144,32 @@ def told(pieces: Pieces) -> list[tuple[float, float]]:
     return [(round(seconds / T, 9), round(float(u[0]), 9)) for seconds, u in pieces]
 
 
-def test_a_lost_sample_counts_as_commanded_and_gives_no_label() -> None:
+def test_a_lost_sample_is_assumed_as_commanded_and_gives_no_label() -> None:
     ticks = [(sample(k, 0.1 * k), 0.1 * (k + 1)) for k in range(4)]
     whole = after(*ticks, (sample(4, 0.4), 0.5), (sample(5, 0.5), 0.6))
     assert whole.known
     assert told(whole.seen.pieces) == [(0.5, 0.3), (0.5, 0.4)]
     lost = after(*ticks, (MISSING, 0.5), (sample(5, 0.5), 0.6))
-    # What was commanded at tick 3 acted from then on, as the sample would have said.
+    # The command of tick 3 acted from then on, as the sample would have reported.
     assert told(lost.seen.pieces) == told(whole.seen.pieces)
     assert told(lost.ahead) == told(whole.ahead) == [(0.5, 0.4), (1.0, 0.5)]
-    # Half of the period that is a guess acts in this one, and half in the next.
+    # Half of the assumed period acts in this period, and half in the next one.
     assert not lost.known
     more = [(sample(k, 0.1 * k), 0.1 * (k + 1)) for k in range(6, 9)]
     assert not after(*ticks, (MISSING, 0.5), (sample(5, 0.5), 0.6), *more[:1]).known
     assert after(*ticks, (MISSING, 0.5), (sample(5, 0.5), 0.6), *more[:2]).known
 
 
-def test_a_missing_sample_says_what_acted_in_its_period_for_the_estimator() -> None:
+def test_the_estimator_gets_the_assumed_inputs_of_a_missing_sample() -> None:
     ticks = [(sample(k, 0.1 * k), 0.1 * (k + 1)) for k in range(5)]
     acted = after(*ticks, (MISSING, 0.6))
-    # Behind one and a half periods.
+    # The dead time is one and a half periods.
     assert told(acted.seen.pieces) == [(0.5, 0.3), (0.5, 0.4)]
     with_delay = after(*ticks, (MISSING, 0.6), delay=0.2 * T)
     assert told(with_delay.ahead) == [(0.7, 0.4), (0.8, 0.5)]
 
 
-def test_ticks_that_were_left_out_and_samples_that_come_late_keep_their_place() -> None:
+def test_skipped_ticks_and_late_samples_keep_the_timing() -> None:
     ticks = [(sample(k, 0.1 * k), 0.1 * (k + 1)) for k in range(6)]
     skipped = after(*ticks, (sample(7, 0.7), 0.8))
     assert told(skipped.ahead) == [(0.5, 0.6), (1.0, 0.7)]
@@ -179,20 +179,20 @@ def test_ticks_that_were_left_out_and_samples_that_come_late_keep_their_place() 
     assert late.known
 
 
-def test_another_start_of_the_plant_and_a_long_gap_begin_afresh() -> None:
+def test_a_plant_restart_and_a_long_gap_reset_the_line() -> None:
     ticks = [(sample(k, 0.1 * k), 0.1 * (k + 1)) for k in range(6)]
     for other in (sample(0, 0.9, source=2), sample(20, 0.9), sample(1, 0.9)):
         acted = after(*ticks, (other, 0.0))
         assert not acted.known
         assert told(acted.ahead) == [(1.5, 0.9)]
-    # Nothing acts that is known: a plant that was held has its safe input in the line.
+    # No known input acts: a plant that was held has its safe input in the line.
     held = Observation(np.zeros(3), None, 3, 0, None)
     assert told(after((held, 0.0)).ahead) == [(1.5, 0.0)]
 
 
 @pytest.mark.parametrize("periods", [1, 2, 11])
-def test_a_sample_that_is_as_late_as_the_memory_is_long_begins_afresh(periods: int) -> None:
-    # Of 2 and 11 periods of 0.1 s rounding puts the end of the memory behind the sample.
+def test_a_sample_as_late_as_the_memory_resets_the_line(periods: int) -> None:
+    # For 2 and 11 periods of 0.1 s rounding puts the end of the memory behind the sample.
     line = InputLine(replace(PLANT, dead_time=periods * T), T)
     memory, _ = line.advance(line.initial_state(), sample(100, 0.4), 0.0)
     memory, acted = line.advance(memory, sample(100 - periods, 0.7), 0.0)
@@ -200,7 +200,7 @@ def test_a_sample_that_is_as_late_as_the_memory_is_long_begins_afresh(periods: i
     assert not acted.known
 
 
-def test_more_inputs_than_are_remembered_become_a_mean() -> None:
+def test_surplus_inputs_are_replaced_by_their_mean() -> None:
     many = sample(1, *[0.1 * i for i in range(20)])
     memory, _ = LINE.advance(LINE.initial_state(), sample(0, 0.0), 0.0)
     for k in range(1, 60):
@@ -211,7 +211,7 @@ def test_more_inputs_than_are_remembered_become_a_mean() -> None:
     assert memory["written"].shape == LINE.initial_state()["written"].shape
 
 
-def test_nothing_that_a_sample_may_hold_breaks_the_line() -> None:
+def test_any_valid_sample_is_handled() -> None:
     rng, memory, known = np.random.default_rng(3), LINE.initial_state(), 0
     for _ in range(400):
         number = int(rng.choice([0, 1, 2**63 - 1, int(memory["sample"][1]) + int(rng.integers(-4, 5))]))
@@ -236,13 +236,13 @@ def model(dead_time: float = 0.0) -> Model:
     return build_model(replace(get_plant("moore_greitzer"), dead_time=dead_time), 0.05)
 
 
-def test_the_past_pairs_of_the_network_go_along_with_the_prediction() -> None:
+def test_prediction_advances_the_window_of_the_network() -> None:
     delayed = model(0.1)
     oracle = DnnOracle(describe(delayed, [6], architecture="rnn", window=3))
     state = oracle.begin(oracle.initial_state(np.random.default_rng(0)), np.full(4, 0.1), np.array([0.2]))
     x, inputs = np.array([0.05, 0.02, 0.01, 0.0]), ((0.01, np.array([0.3])), (0.1, np.array([0.4])))
     found, there = predicted(delayed, oracle, state, x, inputs)
-    # By hand: a broken period, and two whole ones under 0.4.
+    # Computed by hand: a partial period, and two whole ones under 0.4.
     first = delayed.ahead(x, np.array([0.3]), 0.01) + 0.2 * oracle.estimate(state, x, np.array([0.3]))
     pairs, at = state, first
     for _ in range(2):
@@ -255,7 +255,7 @@ def test_the_past_pairs_of_the_network_go_along_with_the_prediction() -> None:
     assert (oracle.past(there)[-2] == np.concatenate([first, [0.4]])).all()
 
 
-def test_a_state_with_a_line_comes_back_from_its_arrays() -> None:
+def test_a_state_with_a_line_is_restored_from_its_arrays() -> None:
     delayed = model(0.12)
     problem = build_problem(delayed, LinearOracle(4, 1), 10, "none")
     controller = Controller(problem, Solver(problem))
@@ -269,11 +269,11 @@ def test_a_state_with_a_line_comes_back_from_its_arrays() -> None:
             np.testing.assert_array_equal(thawed.to_arrays()[name], array)
         state = thawed
     assert result.label is not None
-    # Two periods and 0.4 of one before.
+    # The dead time covers two periods and 0.4 of one.
     np.testing.assert_allclose(result.label.u, [0.4 * 0.01 + 0.6 * 0.02])
 
 
-def test_what_cannot_be_with_a_dead_time_is_refused_by_name() -> None:
+def test_options_that_exclude_a_dead_time_are_refused_by_name() -> None:
     delayed = model(0.1)
     with pytest.raises(CertificateError, match=r"dead time of 0\.1 s"):
         build_problem(delayed, LinearOracle(4, 1), 10, "invariant")
@@ -289,7 +289,7 @@ def test_what_cannot_be_with_a_dead_time_is_refused_by_name() -> None:
     assert controller.backup(BackupPlanner(problem, 0.01), state) is None
 
 
-def test_it_is_in_what_a_log_carries_of_a_plant_and_only_where_there_is_one() -> None:
+def test_a_log_contains_the_dead_time_only_if_there_is_one() -> None:
     plant = linear_plant(np.random.default_rng(0), 0.25)
     assert Known.from_builtins(plant.to_builtins()).dead_time == 0.25
     assert "dead_time" not in replace(plant, dead_time=0.0).to_builtins()

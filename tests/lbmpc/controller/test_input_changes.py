@@ -1,4 +1,4 @@
-"""A step whose plan depends on what acts now: rate limits, a weight on changes, and what stands in for a solution."""
+"""A step with rate limits and a weight on input changes, also without a solution."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def within(plan: np.ndarray, acts: float) -> bool:
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-def test_a_plan_begins_where_the_input_is(real_time: bool) -> None:
+def test_a_plan_starts_from_the_present_input(real_time: bool) -> None:
     one, two = controller(real_time), controller(real_time)
     state = also = one.initial_state(0)
     active = 0
@@ -52,20 +52,20 @@ def test_a_plan_begins_where_the_input_is(real_time: bool) -> None:
         assert result.mode == "solver"
         assert within(result.plan, acts)
         active += abs(abs(result.plan[0, 0] - acts) - STEP) < 1e-9
-        # A step that finds nothing prepared does the same, from a state that was frozen.
+        # An unprepared step from a restored state gives the same result.
         also, again = two.step(ControllerState.from_arrays(also.to_arrays()), seen(x, k, acts))
         np.testing.assert_array_equal(result.plan, again.plan)
         assert same_memory(state, also) is None
     assert active >= 2
 
 
-def test_what_stands_in_for_a_solution_keeps_the_rate_too() -> None:
+def test_fallback_inputs_keep_the_rate_limits() -> None:
     state, result = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
-    # No sample: the plan goes on from what was commanded.
+    # Without a sample the plan continues from the commanded input.
     lost, without = LIMITED.step(state, seen(None, 1, None))
     assert without.mode == "shifted_plan"
     assert within(without.plan, result.plan[0, 0])
-    # Something else acts than was planned, and there are no numbers to solve with.
+    # An unplanned input acts, and the numbers do not allow a solution.
     broken = dataclasses.replace(state, oracle={**state.oracle, "h_hat": np.full(4, np.nan)})
     _, other = LIMITED.step(broken, seen(np.full(4, 1e5), 1, -0.5))
     assert within(other.plan, -0.5)
@@ -73,12 +73,12 @@ def test_what_stands_in_for_a_solution_keeps_the_rate_too() -> None:
     _, idle = LIMITED.step(nothing, seen(None, 2, None))
     assert idle.mode == "feedback"
     assert within(idle.plan, lost.commanded[0])
-    # Before anything acts, the actuator is where the safe input has it.
+    # Before the first command the actuator has the safe input.
     _, begun = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, None))
     assert within(begun.plan, float(MODEL.plant.safe_input[0] - MODEL.plant.u_e[0]))
 
 
-def test_an_input_that_is_said_to_act_outside_u_leads_no_plan_out_of_it() -> None:
+def test_a_reported_input_outside_u_keeps_the_plan_in_u() -> None:
     state, _ = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
     _, other = LIMITED.step(state, seen(None, 1, 1e3))
     assert other.mode == "shifted_plan"
@@ -86,7 +86,7 @@ def test_an_input_that_is_said_to_act_outside_u_leads_no_plan_out_of_it() -> Non
     assert ((other.plan >= low) & (other.plan <= high)).all()
 
 
-def test_an_oracle_without_numbers_leads_to_no_command_that_is_none() -> None:
+def test_an_oracle_with_nan_gives_finite_commands() -> None:
     state, _ = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
     broken = {**state.oracle, "h_hat": np.full(4, np.nan)}
     for plan in (state.plan, empty_plan(15, 1)):
@@ -96,7 +96,7 @@ def test_an_oracle_without_numbers_leads_to_no_command_that_is_none() -> None:
         assert np.isfinite(after.predicted).all()
 
 
-def test_a_backup_plan_goes_on_from_the_command() -> None:
+def test_a_backup_plan_continues_from_the_command() -> None:
     state, result = LIMITED.step(LIMITED.initial_state(0), seen(FAR, 0, 0.1))
     policy = LIMITED.backup(BackupPlanner(PROBLEM, 0.0075), state)
     assert policy is not None
@@ -104,7 +104,7 @@ def test_a_backup_plan_goes_on_from_the_command() -> None:
     assert within(planned, result.plan[0, 0])
 
 
-def test_nothing_is_remembered_where_inputs_may_step() -> None:
+def test_without_rate_limits_no_input_is_stored() -> None:
     state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
     assert "commanded" not in state.to_arrays()
     assert "commanded" in LIMITED.initial_state(0).to_arrays()

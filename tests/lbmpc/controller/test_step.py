@@ -1,4 +1,4 @@
-"""One control step: learn, adopt, solve, plan; and what happens when a part of it is missing."""
+"""One control step: learn, adopt, solve, plan; and steps with missing parts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def offered(shift: float, version: int = 1) -> HiddenSet:
 
 
 def same_memory(a: ControllerState, b: ControllerState) -> str | None:
-    """Name of the first array that differs between two states, bit for bit, or None."""
+    """Return the name of the first array that differs between two states, bit for bit, or None."""
     left, right = a.to_arrays(), b.to_arrays()
     for name in sorted(left.keys() | right.keys()):
         if name not in left or name not in right or left[name].tobytes() != right[name].tobytes():
@@ -51,7 +51,7 @@ def same_memory(a: ControllerState, b: ControllerState) -> str | None:
     return None
 
 
-def test_the_label_uses_the_input_that_was_applied_and_not_the_commanded_one() -> None:
+def test_the_label_uses_the_applied_input() -> None:
     state, first = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
     assert first.label is None
     _, second = CONTROLLER.step(state, seen(X_NEXT, 1, applied=0.3))
@@ -62,14 +62,14 @@ def test_the_label_uses_the_input_that_was_applied_and_not_the_commanded_one() -
 
 
 def test_a_swap_learns_the_old_label_with_the_old_features() -> None:
-    """The set arrives together with x_{t+1}: the label of u_t belongs to phi_j, not to phi_{j+1}."""
+    """The set arrives together with x_{t+1}, but the label of u_t belongs to phi_j, not to phi_{j+1}."""
     state, _ = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
     plain, _ = CONTROLLER.step(state, seen(X_NEXT, 1))
     swapped, result = CONTROLLER.step(state, seen(X_NEXT, 1, hidden=offered(0.5)))
     assert result.verdict == Verdict("adopted")
     np.testing.assert_array_equal(swapped.oracle["K"], plain.oracle["K"])
     assert not np.array_equal(swapped.oracle["W1"], plain.oracle["W1"])
-    # And from then on the new features count.
+    # From then on the new features are used.
     after = CONTROLLER.step(swapped, seen(X, 2))[0].oracle["K"]
     assert not np.array_equal(after, CONTROLLER.step(plain, seen(X, 2))[0].oracle["K"])
     phi = features(ORACLE, swapped.oracle, X_NEXT, np.array([0.1]))
@@ -92,12 +92,12 @@ def test_a_label_needs_two_consecutive_samples_of_one_plant_and_a_known_input() 
         after, result = CONTROLLER.step(state, observation)
         assert result.label is None
         np.testing.assert_array_equal(after.oracle["K"], state.oracle["K"])
-    # A missing state breaks the chain: the sample after it has no label either.
+    # A missing state interrupts the sequence, so the sample after it has no label either.
     gone, _ = CONTROLLER.step(state, seen(None, 5))
     assert CONTROLLER.step(gone, seen(X_NEXT, 5))[1].label is None
 
 
-def test_a_refused_set_is_named_and_the_loop_goes_on_with_the_old_one() -> None:
+def test_a_refused_set_is_reported_and_the_old_one_stays() -> None:
     state = CONTROLLER.initial_state(0)
     broken = offered(0.1)
     broken.layers[0][0, 0] = np.nan
@@ -109,7 +109,7 @@ def test_a_refused_set_is_named_and_the_loop_goes_on_with_the_old_one() -> None:
 
 
 class Failing:
-    """A solver that finds nothing from some call on; the real one before that."""
+    """The real solver for some calls, and a solver without solutions after that."""
 
     def __init__(self, good: int):
         self.good, self.real = good, Solver(PROBLEM)
@@ -126,7 +126,7 @@ class Failing:
         )
 
 
-def test_without_a_solution_the_shifted_plan_and_then_K() -> None:
+def test_without_a_solution_the_shifted_plan_and_then_K_act() -> None:
     controller = Controller(PROBLEM, Failing(1))
     state, first = controller.step(controller.initial_state(0), seen(X, 0, None))
     assert first.mode == "solver"
@@ -142,7 +142,7 @@ def test_without_a_solution_the_shifted_plan_and_then_K() -> None:
     assert result.plan.shape == (15, 1)
 
 
-def test_without_a_state_the_plan_goes_on_and_without_both_the_equilibrium() -> None:
+def test_without_a_state_the_plan_continues_and_without_both_the_equilibrium_input_acts() -> None:
     state, first = CONTROLLER.step(CONTROLLER.initial_state(0), seen(X, 0, None))
     _, result = CONTROLLER.step(state, seen(None, -1))
     assert result.mode == "shifted_plan"
@@ -153,8 +153,8 @@ def test_without_a_state_the_plan_goes_on_and_without_both_the_equilibrium() -> 
 
 
 @pytest.mark.parametrize("absurd", [1.7e308, 1e307, -1e160, 3e6])
-def test_a_number_that_is_no_measurement_is_no_state(absurd: float) -> None:
-    """Finite, but what would be learned from it is not, and what is not finite stays in the memory for good."""
+def test_an_absurd_measurement_counts_as_missing(absurd: float) -> None:
+    """The number is finite, but the learned weights would not be, and nonfinite weights would stay in the memory."""
     state = CONTROLLER.initial_state(0)
     for i in range(3):
         state, _ = CONTROLLER.step(state, late(X, i, 0.1, 0.004, 0.1))
@@ -170,8 +170,8 @@ def test_a_number_that_is_no_measurement_is_no_state(absurd: float) -> None:
 
 @pytest.mark.parametrize("absurd", [1.7e308, -1e160, 3e6])
 @pytest.mark.parametrize("which", [0, 1])
-def test_a_number_that_is_no_input_is_none_that_acts(absurd: float, which: int) -> None:
-    """Finite, but where it would lead within the delay is not, and no command answers a state that is not finite."""
+def test_an_absurd_input_counts_as_unknown(absurd: float, which: int) -> None:
+    """The number is finite, but the prediction over the delay would not be."""
     state = CONTROLLER.initial_state(0)
     for i in range(3):
         state, _ = CONTROLLER.step(state, late(X, i, 0.1, 0.004, 0.1))
@@ -187,7 +187,7 @@ def test_a_number_that_is_no_input_is_none_that_acts(absurd: float, which: int) 
     assert result.mode == "solver"
 
 
-def test_what_is_learned_from_a_wild_measurement_is_finite() -> None:
+def test_learning_from_a_wild_measurement_stays_finite() -> None:
     state = CONTROLLER.initial_state(0)
     half = 0.5 * (MODEL.plant.x_max - MODEL.plant.x_min)
     for i in range(4):
@@ -208,7 +208,7 @@ def test_the_feedback_is_clipped_to_U() -> None:
 
 
 def test_the_feedback_holds_the_target() -> None:
-    """K pulls the nominal model towards it: at the target the input is its own, and beside it K's on top."""
+    """K pulls the nominal model towards the target: there the input is the target's, and elsewhere K adds to it."""
     controller = Controller(PROBLEM, Failing(0), targets=TargetSelector(PROBLEM), reference=TO_Y)
     state = controller.initial_state(0)
     _, probe = controller.step(state, seen(X, 0, None))
@@ -221,7 +221,7 @@ def test_the_feedback_holds_the_target() -> None:
         np.testing.assert_allclose(result.plan[0], us + MODEL.K @ off, atol=1e-12)
 
 
-def test_the_memory_survives_freezing_and_thawing_bit_for_bit() -> None:
+def test_the_memory_is_saved_and_restored_bit_for_bit() -> None:
     state = CONTROLLER.initial_state(0)
     for i in range(5):
         state, _ = CONTROLLER.step(state, seen(X + 0.001 * i, i))
@@ -233,20 +233,20 @@ def test_the_memory_survives_freezing_and_thawing_bit_for_bit() -> None:
     assert same_memory(a, state) is not None
 
 
-def test_the_seed_decides_the_start_and_nothing_else_does() -> None:
+def test_only_the_seed_determines_the_initial_state() -> None:
     assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(3)) is None
     assert same_memory(CONTROLLER.initial_state(3), CONTROLLER.initial_state(4)) == "oracle.K"
 
 
 def late(x: np.ndarray, sequence: int, first: float, delay: float, then: float) -> Observation:
-    """A sample whose period began with the input `first` and went on with `then` after `delay` seconds."""
+    """Return a sample whose period began with the input `first` and continued with `then` after `delay` seconds."""
     pieces = ((delay, np.array([first])), (0.05 - delay, np.array([then])))
     mean = (delay * first + (0.05 - delay) * then) / 0.05
     return Observation(x, np.array([mean]), 1, sequence, None, pieces)
 
 
-def test_the_problem_is_solved_from_where_the_command_will_act() -> None:
-    """With the true linear plant and a constant delay, the prediction meets what then happens."""
+def test_the_problem_starts_at_the_state_where_the_command_acts() -> None:
+    """For a linear true plant and a constant delay the prediction equals the true motion."""
     delay, x, acting = 0.004, np.array([0.1, 0.05, 0.0, 0.0]), 0.0
     state = CONTROLLER.initial_state(0)
     state = ControllerState.from_arrays(state.to_arrays() | {"oracle.K": np.zeros_like(state.oracle["K"])})
@@ -259,7 +259,7 @@ def test_the_problem_is_solved_from_where_the_command_will_act() -> None:
         x = MODEL.A @ x + (
             MODEL.within.answer(((delay, np.array([acting])), (0.05 - delay, np.array([commanded]))))
         )
-        # Where the next command will act, under this one until then.
+        # The state at which the next command acts, with this one until then.
         phi, gamma = discretise(MODEL.plant.A, MODEL.plant.B, delay)
         errors.append(np.abs(phi @ x + gamma @ [commanded] - before).max())
     assert abs(state.delay - delay) < 1e-6
@@ -275,8 +275,8 @@ def test_in_lock_step_there_is_no_delay() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.002, 0.01, 0.025])
-def test_a_delay_that_is_configured_is_predicted_over_from_the_first_tick_on(delay: float) -> None:
-    """The first period is not a whole one: the plant was held until the first command, and says what acts since."""
+def test_a_configured_delay_is_predicted_from_the_first_tick_on(delay: float) -> None:
+    """The first period is not whole: the plant was held until the first command and reports the input since then."""
     controller = Controller(PROBLEM, Solver(PROBLEM), input_delay=delay)
     state = controller.initial_state(0)
     state = ControllerState.from_arrays(state.to_arrays() | {"oracle.K": np.zeros_like(state.oracle["K"])})
@@ -292,6 +292,6 @@ def test_a_delay_that_is_configured_is_predicted_over_from_the_first_tick_on(del
     assert state.predicted[:4] == pytest.approx(after, abs=1e-9)
 
 
-def test_the_delay_begins_at_no_more_than_half_a_period() -> None:
+def test_the_initial_delay_is_at_most_half_a_period() -> None:
     assert Controller(PROBLEM, Solver(PROBLEM), input_delay=0.2).initial_state(0).delay == 0.025
     assert CONTROLLER.initial_state(0).delay == 0.0

@@ -1,4 +1,4 @@
-"""The Kalman estimator: what it makes of noise, of states that nobody measures, and of samples that do not come."""
+"""The Kalman estimator: noise, unmeasured states and missing samples."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Motion:
 def followed(
     kalman: KalmanEstimator, motion: Motion, steps: int
 ) -> tuple[EstimatorState, list[Estimate], np.ndarray, np.ndarray]:
-    """The memory at the end, estimates, errors of x (steps, d) and of labels (steps, d)."""
+    """Return the final memory, the estimates, and the errors of x (steps, d) and of labels (steps, d)."""
     memory, estimate = kalman.update(kalman.initial_state(), motion.sample(first=True))
     estimates, errors, wrong = [], [], []
     for _ in range(steps):
@@ -62,7 +62,7 @@ def followed(
 H = 0.5 * PROCESS
 
 
-def test_estimates_are_better_than_samples_and_not_off_by_a_disturbance() -> None:
+def test_estimates_beat_samples_and_have_no_bias_under_a_disturbance() -> None:
     memory, _, errors, _ = followed(estimator(), Motion(0, 0.1 * SCALE, H), 800)
     late = errors[200:]
     assert (late.std(axis=0) < 0.75 * NOISE).all()
@@ -71,24 +71,24 @@ def test_estimates_are_better_than_samples_and_not_off_by_a_disturbance() -> Non
     np.testing.assert_array_equal(memory["covariance"], memory["covariance"].T)
 
 
-def test_a_label_is_not_pulled_anywhere_and_its_variance_is_what_its_errors_have() -> None:
+def test_labels_are_unbiased_with_the_stated_variance() -> None:
     _, estimates, _, wrong = followed(estimator(), Motion(1, 0.1 * SCALE, H), 3000)
     late = wrong[200:]
     variance = estimates[-1].variance
     np.testing.assert_allclose(late.var(axis=0), variance, rtol=0.15)
     assert (np.abs(late.mean(axis=0)) < 0.1 * np.sqrt(variance)).all()
     neighbours = (late[1:] * late[:-1]).mean(axis=0) / late.var(axis=0)
-    # Not positive: what one label errs by, the next does not repeat.
+    # The correlation is not positive: the error of one label is not repeated by the next.
     assert ((neighbours > -0.25) & (neighbours < 0.1)).all()
 
 
-def test_states_that_nobody_measures_are_found_from_a_wrong_start() -> None:
+def test_unmeasured_states_converge_from_a_wrong_start() -> None:
     kalman = estimator(np.array([0, 1]))
     x = np.array([0.1, -0.1, 0.3, 5.0])
     _, estimates, errors, _ = followed(kalman, Motion(2, x, np.zeros(4)), 100)
     assert abs(errors[0, 3]) > 0.5
     assert (np.abs(errors[-20:]) < 0.1 * SCALE).all()
-    # What was never measured says little of h: its label has a variance, and no step is taken on it.
+    # An unmeasured state has a label with a finite, large variance.
     assert all(np.isfinite(estimate.variance).all() for estimate in estimates)
 
 
@@ -104,7 +104,7 @@ def test_without_noise_the_estimate_is_the_sample() -> None:
         np.testing.assert_allclose(MODEL.label(before, motion.u, estimate.reached), H, atol=1e-6)
 
 
-def test_a_missing_sample_is_a_prediction_under_the_command() -> None:
+def test_a_missing_sample_is_predicted_under_the_command() -> None:
     kalman, motion = estimator(), Motion(4, 0.1 * SCALE, H)
     memory, _, _, _ = followed(kalman, motion, 300)
     spread = np.diag(memory["covariance"]).copy()
@@ -114,20 +114,20 @@ def test_a_missing_sample_is_a_prediction_under_the_command() -> None:
         memory = kalman.missed(memory, 0.0)
     assert (np.abs(memory["x"] - motion.x) < 6 * NOISE).all()
     assert (np.diag(memory["covariance"])[:2] > spread[:2]).all()
-    # The next one follows: nothing begins afresh.
+    # The next sample follows on, without a reset.
     motion.go()
     memory, estimate = kalman.update(memory, motion.sample())
     assert memory["sample"].tolist() == [7, motion.number]
     assert (np.abs(estimate.x - motion.x) < 6 * NOISE).all()
 
 
-def test_before_the_first_sample_nothing_is_predicted() -> None:
+def test_no_prediction_before_the_first_sample() -> None:
     kalman = estimator()
     begin = kalman.initial_state()
     assert kalman.missed(begin, 0.01) is begin
 
 
-def test_the_largest_number_of_a_sample_can_be_followed_by_a_missing_one() -> None:
+def test_a_missing_sample_after_the_largest_number_is_handled() -> None:
     kalman = estimator()
     memory, _ = kalman.update(kalman.initial_state(), Measured(np.zeros(4), 7, 2**63 - 1, None, ()))
     assert kalman.missed(memory, 0.0)["sample"].tolist() == [7, 2**63 - 1]
@@ -143,7 +143,7 @@ def test_the_period_of_a_missing_sample_is_split_where_the_command_took_over() -
 
 
 @pytest.mark.parametrize("gap", [2, 5])
-def test_after_a_gap_what_was_not_measured_is_known_less(gap: int) -> None:
+def test_the_variance_grows_over_a_gap(gap: int) -> None:
     kalman, motion = estimator(np.array([0, 1])), Motion(6, 0.1 * SCALE, np.zeros(4))
     memory, _, _, _ = followed(kalman, motion, 100)
     before = np.diag(memory["covariance"]).copy()
@@ -153,7 +153,7 @@ def test_after_a_gap_what_was_not_measured_is_known_less(gap: int) -> None:
     assert np.diag(memory["covariance"])[3] > 2 * before[3]
 
 
-def test_another_source_or_a_jump_begins_afresh() -> None:
+def test_another_source_or_a_jump_resets_the_filter() -> None:
     kalman, motion = estimator(), Motion(7, 0.1 * SCALE, H)
     memory, _, _, _ = followed(kalman, motion, 100)
     elsewhere = np.full(4, 0.3)
@@ -166,7 +166,7 @@ def test_another_source_or_a_jump_begins_afresh() -> None:
         assert not after["disturbance"].any()
 
 
-def test_the_late_sample_of_a_period_that_was_counted_as_missed_still_counts() -> None:
+def test_a_late_sample_of_a_period_counted_as_missed_is_used() -> None:
     kalman, motion = estimator(), Motion(8, 0.1 * SCALE, H)
     memory, _, _, _ = followed(kalman, motion, 100)
     memory = kalman.commanded(memory, MODEL.K @ motion.x)
@@ -179,8 +179,8 @@ def test_the_late_sample_of_a_period_that_was_counted_as_missed_still_counts() -
 
 @pytest.mark.parametrize("gap", [60, 3000])
 @pytest.mark.parametrize("counted", [True, False])
-def test_of_a_plant_that_runs_away_nothing_is_known_after_a_while(gap: int, counted: bool) -> None:
-    """Somebody else holds it meanwhile, and the prediction would have no end."""
+def test_an_unstable_plant_is_lost_after_a_long_gap(gap: int, counted: bool) -> None:
+    """Another controller holds the plant meanwhile, and the prediction would grow without limit."""
     model = build_model(unstable(20.0), 0.05)
     kalman = KalmanEstimator(model, np.arange(1), np.array([0.01]), np.array([0.01]), 1.0)
     u = np.array([-0.3])
@@ -191,13 +191,13 @@ def test_of_a_plant_that_runs_away_nothing_is_known_after_a_while(gap: int, coun
     memory, estimate = kalman.update(memory, Measured(np.array([0.3]), 7, gap + 1, u, ()))
     np.testing.assert_allclose(estimate.x, 0.3)
     assert memory["sample"].tolist() == [7, gap + 1]
-    # And from there on all is as ever.
+    # After that the filter works as usual.
     _, estimate = kalman.update(memory, Measured(np.array([0.3]), 7, gap + 2, u, ()))
     np.testing.assert_allclose(estimate.x, 0.3)
     assert np.isfinite(estimate.variance).all()
 
 
-def test_a_measurement_that_is_not_trusted_counts_nothing_but_has_an_innovation() -> None:
+def test_a_distrusted_measurement_is_ignored_but_has_an_innovation() -> None:
     kalman, motion = estimator(), Motion(9, 0.1 * SCALE, H)
     memory, _, _, _ = followed(kalman, motion, 100)
     trusted = np.array([True, False, True, True])
@@ -210,14 +210,14 @@ def test_a_measurement_that_is_not_trusted_counts_nothing_but_has_an_innovation(
         np.testing.assert_array_equal(after[name], without[name])
     assert estimate.innovation[1] > 8 * np.sqrt(estimate.innovation_variance[1])
     assert np.abs(estimate.innovation[0]) < 5 * np.sqrt(estimate.innovation_variance[0])
-    # And where none is trusted, the sample is as good as missing.
+    # If no measurement is trusted, the sample counts as missing.
     nothing, _ = kalman.update(memory, lies, np.zeros(4, dtype=bool))
     missed = kalman.missed(kalman.commanded(kalman.commanded(memory, motion.u), motion.u), 0.0)
     np.testing.assert_allclose(nothing["x"], missed["x"], rtol=1e-12)
 
 
 def chain() -> Model:
-    """Position and speed of a mass, and a heater that has nothing to do with it."""
+    """A mass with position and velocity, and an independent heater."""
     a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     b = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     known = Known.from_matrices(
@@ -234,7 +234,7 @@ def chain() -> Model:
     return build_model(known, 0.01)
 
 
-def test_what_no_sample_tells_of_is_named_unless_it_fades() -> None:
+def test_unobservable_states_are_named_unless_they_decay() -> None:
     model = chain()
     assert unobservable(model, np.array([0])) == []
     assert unobservable(model, np.array([1])) == [0]
@@ -251,12 +251,12 @@ def test_what_no_sample_tells_of_is_named_unless_it_fades() -> None:
         ("plant.sensors.bias={zz=0.1}", "plant.sensors.bias: .* has no state 'zz'"),
     ],
 )
-def test_a_name_that_is_no_state_is_refused(text: str, error: str) -> None:
+def test_an_unknown_state_name_is_refused(text: str, error: str) -> None:
     with pytest.raises(ConfigError, match=error):
         build_plant(load(None, [text]))
 
 
-def test_the_configuration_says_it_in_a_persons_words() -> None:
+def test_the_configuration_error_is_readable() -> None:
     config = load(None, ["rate=100", "estimator.kind=kalman", 'estimator.measured=["speed"]'])
     with pytest.raises(ConfigError, match=r"measured = speed: .* never tells of position"):
         build_estimator(config, chain())

@@ -1,4 +1,4 @@
-"""Noise that nobody told: found from innovations, whatever h does, and then used."""
+"""Unknown measurement noise: estimated from innovations under any h, and then used."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ COMPRESSOR, RUNAWAY = compressor(), build_model(unstable(3.0), 0.05)
 def follow(
     model: Model, kalman: KalmanEstimator, noise: np.ndarray, h: np.ndarray, seed: int, missing: int = 0
 ) -> tuple[EstimatorState, list[Estimate], np.ndarray]:
-    """The memory after the steps of h, (steps, d), the estimates, and errors of their labels, (steps, d).
+    """Return the memory after the steps of h, (steps, d), the estimates, and the errors of their labels, (steps, d).
 
-    missing: every so many samples one does not come.
+    missing: interval of the samples that are lost.
     """
     rng, d, scale = np.random.default_rng(seed), model.d, model.plant.x_scale
     memory, x, u = kalman.initial_state(), 0.2 * scale * rng.uniform(-1.0, 1.0, d), np.zeros(model.m)
@@ -45,7 +45,7 @@ def follow(
 
 
 def slow(model: Model, steps: int, times: float) -> np.ndarray:
-    """h that turns within a time scale, so many times as large as W, (steps, d)."""
+    """Return h of `times` times W that varies within a time scale, (steps, d)."""
     t = np.arange(steps)[:, None] * model.period / model.time_scale
     return times * model.plant.W * model.period * np.sin(2.0 * t + np.arange(model.d))
 
@@ -56,7 +56,7 @@ def finding(model: Model, measured: np.ndarray) -> KalmanEstimator:
 
 @pytest.mark.parametrize("level", [0.001, 0.003, 0.02])
 @pytest.mark.parametrize(("times", "measured"), [(0.0, [0, 1, 2, 3]), (20.0, [0, 1, 2, 3]), (20.0, [0, 1])])
-def test_what_is_found_is_the_noise_and_not_h(level: float, times: float, measured: list[int]) -> None:
+def test_the_estimate_is_the_noise_and_not_h(level: float, times: float, measured: list[int]) -> None:
     model = COMPRESSOR
     kalman, noise = finding(model, np.array(measured)), level * model.plant.x_scale
     for seed in range(3):
@@ -68,50 +68,50 @@ def test_what_is_found_is_the_noise_and_not_h(level: float, times: float, measur
         assert not np.delete(kalman.found_noise(memory), measured).any()
 
 
-def test_of_a_plant_that_runs_away_fast_as_well() -> None:
-    """Its filter must have a high gain, which mixes old noise into every innovation."""
+def test_the_noise_of_a_fast_unstable_plant_is_found() -> None:
+    """Its filter needs a high gain, which mixes earlier noise into every innovation."""
     kalman, noise = finding(RUNAWAY, np.arange(1)), 0.003 * RUNAWAY.plant.x_scale
     memory, _, _ = follow(RUNAWAY, kalman, noise, slow(RUNAWAY, SAMPLES + 10, 1.0), 0)
     np.testing.assert_allclose(kalman.found_noise(memory), noise, rtol=0.4)
 
 
-def test_one_loud_sensor_among_quiet_ones_is_told_apart() -> None:
+def test_one_noisy_sensor_among_quiet_ones_is_identified() -> None:
     noise = np.array([0.02, 0.001, 0.001, 0.005]) * COMPRESSOR.plant.x_scale
     memory, _, _ = follow(COMPRESSOR, finding(COMPRESSOR, np.arange(4)), noise, slow(COMPRESSOR, 110, 1.0), 1)
     share = memory["noise"] / noise
     assert ((share > 1 / 1.5) & (share < 1.5)).all()
 
 
-def test_labels_have_the_variance_of_the_noise_that_was_found() -> None:
+def test_labels_use_the_variance_of_the_estimated_noise() -> None:
     model, noise = COMPRESSOR, 0.003 * COMPRESSOR.plant.x_scale
     h = np.tile(0.5 * model.plant.W * model.period, (900, 1))
     memory, estimates, wrong = follow(model, finding(model, np.arange(4)), noise, h, 2)
     share = estimates[-1].variance / wrong[SAMPLES + 50 :].var(axis=0)
-    # As far off as what was found, squared.
+    # The ratio is that of the estimated and the true noise, squared.
     found = (memory["noise"] / noise) ** 2
     np.testing.assert_allclose(share, found, rtol=0.25)
-    # The guess would be ten times too much.
+    # The initial guess would be ten times too large.
     assert (share < 0.3 * (GUESS / 0.003) ** 2).all()
 
 
-def test_samples_that_are_missing_or_not_trusted_are_no_innovations_but_nothing_is_forgotten() -> None:
+def test_missing_and_distrusted_samples_add_no_innovations_and_keep_the_rest() -> None:
     kalman, noise = finding(COMPRESSOR, np.arange(4)), 0.003 * COMPRESSOR.plant.x_scale
     memory, _, _ = follow(COMPRESSOR, kalman, noise, slow(COMPRESSOR, 150, 1.0), 3, missing=10)
     gathered = memory["finder.counts"][1]
-    # Of nine in a row the first three have no difference, and the very first has no innovation.
+    # Among nine consecutive innovations the first three have no difference, and the very first sample has none.
     assert gathered == 15 * 6 - 1
     share = memory["noise"] / noise
     assert ((share > 1 / 1.6) & (share < 1.6)).all()
     lies = Measured(np.full(4, 0.4), 7, 150, np.zeros(1), ())
     after, _ = kalman.update(memory, lies, np.array([True, True, True, False]))
     assert after["finder.counts"].tolist() == [0, gathered]
-    # A plant that was started again has the sensors that it had.
+    # A restarted plant keeps its sensors.
     again, _ = kalman.update(after, Measured(np.zeros(4), 8, 0, None, ()))
     np.testing.assert_array_equal(again["noise"], memory["noise"])
     assert again["finder.counts"].tolist() == [0, gathered]
 
 
-def test_before_enough_is_known_the_guess_counts_and_what_is_told_is_never_touched() -> None:
+def test_the_guess_is_used_at_first_and_configured_noise_never_changes() -> None:
     kalman, scale = finding(COMPRESSOR, np.arange(4)), COMPRESSOR.plant.x_scale
     memory, _, _ = follow(COMPRESSOR, kalman, 0.1 * scale, slow(COMPRESSOR, 15, 1.0), 4)
     np.testing.assert_allclose(kalman.found_noise(memory), GUESS * scale)
@@ -122,7 +122,7 @@ def test_before_enough_is_known_the_guess_counts_and_what_is_told_is_never_touch
     assert sorted(memory) == ["covariance", "disturbance", "inputs", "sample", "x"]
 
 
-def test_h_changes_within_the_time_scale_of_the_plant_where_nobody_says_otherwise() -> None:
+def test_the_default_correlation_is_the_time_scale_of_the_plant() -> None:
     settings = ["rate=20", "estimator.kind=kalman"]
     seen = Measured(0.1 * RUNAWAY.plant.x_scale, 7, 1, np.zeros(1), ())
 

@@ -1,4 +1,4 @@
-"""Sensors that are not believed: which are named, how soon, what becomes of the estimate, and what is no fault."""
+"""Distrusted sensors: which ones are reported, how soon, the effect on the estimate, and false alarms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Z, Y = 0, 1
 SECOND = round(1.0 / PERIOD)
 
 Sense = Callable[[int, np.ndarray], np.ndarray]
-"""From a sample's number and what a good sensor shows, (d,), to what is shown."""
+"""Maps a sample's number and the true measurement, (d,), to the displayed one."""
 
 
 def supervised(noise: np.ndarray = NOISE, measured: tuple[int, ...] = (0, 1, 2, 3)) -> SupervisedEstimator:
@@ -29,7 +29,7 @@ def supervised(noise: np.ndarray = NOISE, measured: tuple[int, ...] = (0, 1, 2, 
 
 
 class Ran:
-    """The linear model, steered by what is estimated, with a disturbance h(k), and what was said of its sensors."""
+    """The linear model, controlled by its estimate, with a disturbance h(k), and the reported faults."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ def good(_k: int, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("i", [Z, Y])
-def test_a_stuck_sensor_is_named_and_not_followed(i: int) -> None:
+def test_a_stuck_sensor_is_reported_and_ignored(i: int) -> None:
     ran, name = Ran(stuck(i, 20), 100), MODEL.plant.states[i]
     moved = np.abs(np.array(ran.x)[20:, i] - ran.x[20][i]) > 3.0 * NOISE[i]
     assert ran.first(name) <= 20 + int(np.argmax(moved)) + SECOND
@@ -102,20 +102,20 @@ def test_a_stuck_sensor_is_named_and_not_followed(i: int) -> None:
     assert np.abs(np.array(ran.errors)[:, i]).max() < 0.1
 
 
-def test_the_only_sensor_that_is_stuck_is_named_too() -> None:
+def test_a_stuck_only_sensor_is_reported() -> None:
     ran = Ran(stuck(Z, 40), 100, one=supervised(measured=(Z,)))
     assert 40 < ran.first("z") <= 40 + SECOND
     assert np.abs(np.array(ran.errors)[:, Z]).max() < 0.1
 
 
-def test_a_constant_of_zero_is_named_and_never_believed() -> None:
+def test_a_constant_reading_of_zero_is_reported_and_never_trusted() -> None:
     ran = Ran(replaced(Y, 30, 1000, -MODEL.plant.x_e[Y]), 70)
     assert ran.named == {"y"}
     assert ran.first("y") <= 30 + SECOND
     assert np.abs(np.array(ran.errors)[5:]).max() < 0.08
 
 
-def test_a_sensor_without_numbers_is_named_and_believed_again_a_second_after_it_lives() -> None:
+def test_a_dead_sensor_is_reported_and_trusted_a_second_after_it_recovers() -> None:
     ran = Ran(replaced(Y, 20, 50, np.nan), 90)
     assert ran.named == {"y"}
     assert ran.first("y") == 22
@@ -126,18 +126,18 @@ def test_a_sensor_without_numbers_is_named_and_believed_again_a_second_after_it_
     assert np.isfinite(ran.errors).all()
 
 
-def test_a_short_gap_is_no_fault() -> None:
+def test_a_short_gap_is_not_a_fault() -> None:
     assert not Ran(replaced(Y, 20, 22, np.nan), 40).named
 
 
-def test_a_bias_that_comes_at_once_is_named_and_not_followed() -> None:
+def test_a_sudden_bias_is_reported_and_ignored() -> None:
     ran = Ran(biased(Y, 40, 0.3), 120)
     assert ran.named == {"y"}
     assert ran.first("y") <= 40 + SECOND
     assert np.abs(np.array(ran.errors)[5:]).max() < 0.1
 
 
-def test_a_disturbance_as_sudden_is_not_a_fault() -> None:
+def test_a_sudden_disturbance_is_not_a_fault() -> None:
     push = 0.1 * SCALE * np.array([0.0, 1.0, 0.0, 0.0])
 
     def h(k: int) -> np.ndarray:
@@ -145,12 +145,12 @@ def test_a_disturbance_as_sudden_is_not_a_fault() -> None:
 
     ran = Ran(good, 120, h=h)
     assert not ran.named
-    # And it is followed as by the filter alone.
+    # The estimate equals that of the filter without supervision.
     alone = Ran(good, 120, h=h, one=KalmanEstimator(MODEL, np.arange(4), NOISE, PROCESS, 1.0))
     np.testing.assert_allclose(np.array(ran.errors)[60:], np.array(alone.errors)[60:], atol=0.02)
 
 
-def test_a_plant_that_was_pushed_shows_in_several_sensors_and_is_believed() -> None:
+def test_a_push_that_shows_in_several_sensors_is_trusted() -> None:
     push = 0.3 * SCALE * np.array([1.0, 1.0, 0.0, 0.0])
     assert not Ran(good, 80, h=lambda k: push if k == 40 else np.zeros(4)).named
 
@@ -163,13 +163,13 @@ def test_a_few_samples_tell_whether_a_sensor_is_quantised() -> None:
 
 
 @pytest.mark.parametrize("told", [0.1, 1.0])
-def test_noise_alone_is_no_fault_also_where_it_is_larger_than_told(told: float) -> None:
+def test_noise_is_not_a_fault_even_if_larger_than_configured(told: float) -> None:
     for seed in range(3):
         assert not Ran(good, 200, seed, one=supervised(told * NOISE)).named
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
-def test_a_quantised_sensor_that_repeats_at_rest_is_no_fault(noise: float) -> None:
+def test_a_quantised_sensor_that_repeats_at_rest_is_not_a_fault(noise: float) -> None:
     step = 0.01 * SCALE
     h = 3.0 * PROCESS
 
@@ -181,30 +181,30 @@ def test_a_quantised_sensor_that_repeats_at_rest_is_no_fault(noise: float) -> No
     assert np.abs(np.array(ran.errors)[40:]).max() < 0.08
 
 
-def test_a_quantised_sensor_that_is_stuck_is_named() -> None:
+def test_a_stuck_quantised_sensor_is_reported() -> None:
     step, hold = 0.01 * SCALE, stuck(Y, 20)
     ran = Ran(lambda k, y: hold(k, np.rint(y / step) * step), 100, noise=0.0 * NOISE)
     assert ran.named == {"y"}
 
 
-def test_sensors_at_exact_rest_are_no_fault() -> None:
+def test_sensors_at_exact_rest_are_not_faulty() -> None:
     one, memory = supervised(), supervised().initial_state()
     for k in range(100):
         memory, _estimate = one.update(memory, Measured(np.zeros(4), 7, k, np.zeros(1) if k else None, ()))
         assert not one.faults(memory)
 
 
-def test_a_plant_that_is_held_repeats_and_is_seen() -> None:
+def test_repeated_readings_of_a_held_plant_are_used() -> None:
     one, memory = supervised(), Ran(good, 40).memory
     for k in range(20):
-        # Only z has noise meanwhile.
+        # Only z has noise here.
         y = START + np.where(np.arange(4) == Z, 0.001 * k * SCALE, 0.0)
         memory, estimate = one.update(memory, Measured(y, 7, 40 + k, None, ()))
         np.testing.assert_allclose(estimate.x, y)
     assert not one.faults(memory)
 
 
-def test_what_nothing_tells_of_any_more_is_named() -> None:
+def test_states_that_become_unobservable_are_reported() -> None:
     one = supervised(measured=(Z, Y, 2, 3))
     assert one._unseen((Z, Y)) == "what it measures is estimated from the others"
     assert one._unseen(()) == "nothing is measured any more"
@@ -212,7 +212,7 @@ def test_what_nothing_tells_of_any_more_is_named() -> None:
     assert rising.named == set() or "nothing is measured any more" in rising.faults[-1]["r"]
 
 
-def test_a_sample_with_some_numbers_tells_something() -> None:
+def test_a_sample_with_some_numbers_is_used() -> None:
     one = supervised(measured=(Z, Y))
     nan = np.nan
     assert one.tells(np.array([0.0, nan, nan, nan]))

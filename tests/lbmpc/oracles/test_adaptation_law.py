@@ -1,4 +1,4 @@
-"""Lemma 1 of the paper, held on synthetic plants whose ideal weights W* are known."""
+"""Lemma 1 of the paper, checked on synthetic plants with known ideal weights W*."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Case:
         return np.concatenate([[1.0], np.tanh(self.rng.normal(size=len(self.K) - 1) * 2)])
 
     def step(self) -> tuple[float, float, float, float]:
-        """(V_t, V_{t+1}, |xtilde|^2, |epsilon|^2) of one step of the law."""
+        """Return (V_t, V_{t+1}, |xtilde|^2, |epsilon|^2) of one step of the law."""
         phi = self.phi()
         epsilon = self.rng.normal(size=self.K.shape[1])
         epsilon *= self.noise * self.rng.uniform() / np.linalg.norm(epsilon)
@@ -70,7 +70,7 @@ def test_lemma_1_i_ii_iii(case: Case) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(CASES)
-def test_the_columns_never_leave_their_bounds(case: Case) -> None:
+def test_columns_stay_within_their_bounds(case: Case) -> None:
     for _ in range(20):
         case.step()
         assert (np.linalg.norm(case.K, axis=0) <= case.bounds * (1 + 1e-12)).all()
@@ -90,9 +90,7 @@ def test_projection_scales_a_long_column_and_leaves_a_short_one() -> None:
     np.testing.assert_allclose(K, [[0.6, 0.1], [0.8, 0.0]])
 
 
-def test_a_label_without_a_variance_takes_the_papers_step_to_the_bit_and_one_within_its_noise_takes_none() -> (
-    None
-):
+def test_exact_labels_take_exactly_the_papers_step_and_labels_within_noise_none() -> None:
     oracle, rng = DnnOracle(describe(compressor(), [8]), gamma=0.6), np.random.default_rng(3)
     state, x, u = oracle.initial_state(rng), np.full(4, 0.1), np.array([0.2])
     for _ in range(5):
@@ -114,10 +112,8 @@ def test_a_label_without_a_variance_takes_the_papers_step_to_the_bit_and_one_wit
     deviation=st.sampled_from([1e-4, 1e-3, 1e-2, 0.1]),
     within=st.booleans(),
 )
-def test_lemma_1_where_labels_have_a_variance(
-    seed: int, gamma: float, deviation: float, within: bool
-) -> None:
-    """On the oracle itself; `within`: no error of a label is larger than three of its deviations."""
+def test_lemma_1_with_noisy_labels(seed: int, gamma: float, deviation: float, within: bool) -> None:
+    """The oracle itself is tested; `within`: no error of a label exceeds three standard deviations."""
     oracle = DnnOracle(describe(compressor(), [6], scale=0.02), gamma=gamma, column_bound=0.03)
     rng = np.random.default_rng(seed)
     state = oracle.initial_state(rng)
@@ -151,7 +147,7 @@ def test_lemma_1_where_labels_have_a_variance(
 FILTER = Kalman(prior_variance=0.02, label_variance=1e-3, kept=0.975)
 
 
-def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
+def test_the_weight_follows_the_evidence_of_noisy_labels() -> None:
     rng = np.random.default_rng(0)
     evidence = Evidence(FILTER, np.full(4, 0.05), np.full(4, 0.1))
     state = evidence.nothing()
@@ -160,8 +156,8 @@ def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
     found, constants = [], []
     for _ in range(400):
         h_hat = 0.02 * rng.normal(size=4)
-        # A true prediction, one that has nothing to do with h, a true one of exact labels, and one that misses a
-        # constant.
+        # A correct prediction, one that is independent of h, a correct one of exact labels, and one with a constant
+        # error.
         h = np.array([h_hat[0], 0.0, h_hat[2], 0.005]) + np.sqrt(variance) * rng.normal(size=4)
         state |= evidence.with_label(state, h, h_hat, variance)
         found.append(weights(state))
@@ -178,7 +174,7 @@ def test_what_is_learned_counts_as_far_as_noisy_labels_bear_it_out() -> None:
     np.testing.assert_allclose(state["constant"][0], 0.1)
 
 
-def test_of_noise_free_labels_the_constant_is_the_rest_at_once() -> None:
+def test_with_exact_labels_the_constant_is_the_remainder_at_once() -> None:
     evidence = Evidence(FILTER, np.full(2, 0.05), np.full(2, 0.1))
     state = evidence.nothing()
     for _ in range(3):
@@ -187,7 +183,7 @@ def test_of_noise_free_labels_the_constant_is_the_rest_at_once() -> None:
     np.testing.assert_allclose(state["constant"][0], [0.03, -0.02], rtol=0.01)
 
 
-def test_what_the_network_predicts_is_not_the_constants_too() -> None:
+def test_the_constant_excludes_the_networks_prediction() -> None:
     evidence = Evidence(FILTER, np.full(2, 0.05), np.full(2, 0.1))
     state, h = evidence.nothing(), np.array([0.03, -0.02])
     for _ in range(100):
@@ -196,7 +192,7 @@ def test_what_the_network_predicts_is_not_the_constants_too() -> None:
     np.testing.assert_allclose(network * h + constant * state["constant"][0], h, rtol=0.05)
 
 
-def test_the_prediction_and_its_parameters_have_that_weight_and_training_has_the_whole_K() -> None:
+def test_prediction_uses_the_weight_and_training_the_full_K() -> None:
     oracle = DnnOracle(describe(compressor(), [8]), evidence=FILTER)
     plain = DnnOracle(describe(compressor(), [8]))
     state = oracle.initial_state(np.random.default_rng(1))

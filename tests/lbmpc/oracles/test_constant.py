@@ -1,4 +1,4 @@
-"""The constant oracle: the filter's limits, what does not enter it, and where the loop comes to rest with it."""
+"""The constant oracle: limits of its filter, invalid labels, and the rest of the closed loop."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def filtered(gain: float, labels: list[list[float]]) -> np.ndarray:
 
 
 @given(LABELS)
-def test_with_a_gain_of_1_it_is_the_last_label(labels: list[list[float]]) -> None:
+def test_with_a_gain_of_1_h_hat_is_the_last_label(labels: list[list[float]]) -> None:
     np.testing.assert_array_equal(filtered(1.0, labels), labels[-1])
 
 
 @given(st.floats(1e-3, 1.0), LABELS)
-def test_it_stays_among_zero_and_the_labels(gain: float, labels: list[list[float]]) -> None:
+def test_h_hat_stays_in_the_hull_of_zero_and_the_labels(gain: float, labels: list[list[float]]) -> None:
     seen = np.array([[0.0, 0.0], *labels])
     h_hat, slack = filtered(gain, labels), 1e-12 * np.abs(seen).max(axis=0)
     assert (h_hat >= seen.min(axis=0) - slack).all()
@@ -44,14 +44,14 @@ def test_it_stays_among_zero_and_the_labels(gain: float, labels: list[list[float
 
 
 @given(st.floats(0.05, 1.0), st.lists(st.floats(-10, 10), min_size=2, max_size=2))
-def test_a_label_that_does_not_change_is_its_fixed_point(gain: float, h: list[float]) -> None:
+def test_a_constant_label_is_the_fixed_point(gain: float, h: list[float]) -> None:
     for n in (1, 5, 40):
         left = np.array(h) - filtered(gain, [h] * n)
         np.testing.assert_allclose(left, (1 - gain) ** n * np.array(h), atol=1e-12)
 
 
 @pytest.mark.parametrize("gain", [0.0, -0.1, 1.001])
-def test_a_gain_that_is_no_share_is_refused(gain: float) -> None:
+def test_a_gain_outside_its_range_is_refused(gain: float) -> None:
     with pytest.raises(ConfigError, match=r"constant\.gain"):
         load(None, [f"constant.gain={gain}"])
 
@@ -67,9 +67,9 @@ def test_a_lock_step_run_filters_with_the_configured_gain() -> None:
     assert np.abs(h_hat).max() > 1e-3
 
 
-# -- on a plant that the model describes but for a constant push -----------------------------------------------------
+# -- a plant that differs from its model by a constant push -----------------------------------------------------------
 
-# The input costs little, so that what is left of an offset is not what the input's price leaves.
+# The input has a low cost, so that an offset cannot come from the cost of the input.
 MODEL = build_model(INTEGRATOR, 0.1, None, np.array([0.01]))
 PUSH = MODEL.B @ [0.3]
 
@@ -80,7 +80,7 @@ def controller(oracle: Oracle) -> Controller:
 
 
 def rest(oracle: Oracle, steps: int = 250) -> tuple[np.ndarray, np.ndarray]:
-    """Where x comes to rest, and h_hat there."""
+    """Return the rest of x, and h_hat at it."""
     loop, x, applied = controller(oracle), np.array([-0.5, 0.0]), None
     state = loop.initial_state(0)
     for seq in range(steps):
@@ -92,21 +92,21 @@ def rest(oracle: Oracle, steps: int = 250) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Told(ConstantOracle):
-    """Knows the push from the beginning."""
+    """Knows the push from the start."""
 
     def initial_state(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         return {"h_hat": PUSH}
 
 
 @pytest.mark.parametrize("gain", [0.2, 0.5, 1.0])
-def test_the_loop_rests_at_the_target_as_if_the_push_were_known(gain: float) -> None:
+def test_the_loop_rests_at_the_target_as_with_a_known_push(gain: float) -> None:
     x, h_hat = rest(ConstantOracle(2, 1, gain))
     np.testing.assert_allclose(h_hat, PUSH, atol=1e-7)
     np.testing.assert_allclose(x, rest(Told(2, 1, gain))[0], atol=1e-7)
     assert np.linalg.norm(x) < 0.02 * np.linalg.norm(rest(LinearOracle(2, 1))[0])
 
 
-def test_what_is_no_number_does_not_enter() -> None:
+def test_nonfinite_labels_are_ignored() -> None:
     loop = controller(ConstantOracle(2, 1, 0.5))
     state, _ = loop.step(loop.initial_state(0), Observation(np.array([0.1, 0.0]), None, 1, 0, None))
     state, result = loop.step(state, Observation(np.array([0.1, 0.01]), np.zeros(1), 1, 1, None))

@@ -1,4 +1,4 @@
-"""The Kalman law: the counterpart of Lemma 1, its projection, its covariance, and both after a rollback."""
+"""The Kalman law: the counterpart of Lemma 1, projection and covariance, and both after a rollback."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Step = Callable[[OracleState, np.ndarray, np.ndarray, np.ndarray | float], Oracl
 
 
 def stepping(law: KalmanLaw, features: int, d: int) -> Step:
-    """(state, phi, error, the label's variance) -> state, as an oracle does it."""
+    """Return (state, phi, error, variance of the label) -> state, as in an oracle."""
     phi, K, error = ca.MX.sym("phi", features), ca.MX.sym("K", d, features), ca.MX.sym("error", d)
     Sigma, variance = ca.MX.sym("Sigma", features, features), ca.MX.sym("variance", d)
     numbers = {name: ca.DM(value) for name, value in law.settings().items()}
@@ -51,13 +51,13 @@ def stepping(law: KalmanLaw, features: int, d: int) -> Step:
 
 
 class Case:
-    """A plant h = W*' phi + epsilon, |W*^(i)| <= Wbar_i, whose features may change altogether."""
+    """A plant h = W*' phi + epsilon, |W*^(i)| <= Wbar_i, whose features may change completely."""
 
     def __init__(self, seed: int, features: int, d: int, filter: Kalman, noise: float):
         rng = self.rng = np.random.default_rng(seed)
         self.filter, self.noise, self.d = filter, noise, d
         self.bounds = rng.uniform(0.1, 2.0, d)
-        # Half of them at the bound, where the projection acts.
+        # Half of them are at the bound, where the projection acts.
         self.ideal = project_columns(
             rng.normal(size=(features, d)) * 10.0 ** rng.uniform(-2, 1, d), self.bounds
         )
@@ -69,15 +69,15 @@ class Case:
         self.projected = 0
 
     def step(self) -> tuple[float, float, float]:
-        """(|xtilde|^2 / s_t, |epsilon|^2 / r, s_t) of one step of the law."""
+        """Return (|xtilde|^2 / s_t, |epsilon|^2 / r, s_t) of one step of the law."""
         n = len(self.turned)
         if self.rng.uniform() < 0.1:
-            # Other hidden layers.
+            # Switch to other hidden layers.
             self.turned = self.rng.normal(size=(n, n))
         phi = np.concatenate([[1.0], np.tanh(self.turned @ self.rng.normal(size=n))])
         epsilon = self.noise * self.rng.uniform() * self.rng.normal(size=self.d)
         error = self.state["K"].T @ phi - (self.ideal.T @ phi + epsilon)
-        # Some labels come with a variance of their own.
+        # Some labels have a variance of their own.
         variance = self.rng.uniform(size=self.d) * self.rng.choice([0.0, 0.01, 1.0])
         r = self.filter.label_variance + variance.max()
         s = r + phi @ self.state["Sigma"] @ phi
@@ -122,7 +122,7 @@ def test_the_counterpart_of_lemma_1(case: Case) -> None:
     assert errors <= (start + noises) * (1 + 1e-6) + 1e-6  # (iii)
 
 
-def test_the_projection_is_at_work_in_that() -> None:
+def test_the_projection_is_active_in_these_cases() -> None:
     case = Case(3, 12, 3, FILTER, 1.0)
     for _ in range(40):
         case.step()
@@ -143,7 +143,7 @@ def test_the_projection_is_the_nearest_point(seed: int, f: int, spread: float, f
             np.testing.assert_array_equal(nearest[:, i], K[:, i])
             continue
         assert np.linalg.norm(nearest[:, i]) == pytest.approx(bounds[i], rel=1e-9)
-        # kbar - k = lambda Sigma k with lambda > 0: no point of the ball is nearer.
+        # kbar - k = lambda Sigma k with lambda > 0 proves that no point of the ball is nearer.
         pull, along = K[:, i] - nearest[:, i], Sigma @ nearest[:, i]
         multiplier = (pull @ along) / (along @ along)
         assert multiplier > 0
@@ -157,7 +157,7 @@ def test_a_million_updates_leave_the_covariance_symmetric_and_positive() -> None
     numbers = {name: ca.DM(value) for name, value in law.settings().items()}
     after = law.expression(phi, ca.MX(1, f), ca.MX(1, 1), ca.MX(1, 1), numbers, {"Sigma": Sigma})["Sigma"]
     folded = ca.Function("f", [Sigma, phi], [after]).expand().fold(many)
-    # Nearly always the same direction, as at rest.
+    # The direction is almost constant, as at rest.
     phis = np.vstack([np.ones(many), 1e-6 * rng.normal(size=(f - 1, many))])
     now = np.eye(f)
     for _ in range(1000):
@@ -168,7 +168,7 @@ def test_a_million_updates_leave_the_covariance_symmetric_and_positive() -> None
     assert variances[-1] <= 1 + 1e-9
 
 
-def test_what_fades_lets_a_change_be_followed() -> None:
+def test_forgetting_allows_a_change_to_be_followed() -> None:
     rng, f = np.random.default_rng(0), 6
     left = {}
     for kept in (0.98, 1 - 1e-9):
@@ -183,13 +183,13 @@ def test_what_fades_lets_a_change_be_followed() -> None:
     assert left[1 - 1e-9] > 0.2
 
 
-# -- in an oracle ----------------------------------------------------------------------------------------------------
+# -- the oracle ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "realise", [lambda function: function, Compiler()], ids=["virtual machine", "compiled"]
 )
-def test_what_every_tick_calls_is_the_law_as_written(realise: Realise) -> None:
+def test_the_functions_of_a_tick_equal_the_law(realise: Realise) -> None:
     rng = np.random.default_rng(5)
     oracle = DnnOracle(describe(MODEL, [6, 5]), column_bound=0.01, kalman=FILTER)
     oracle.compile(realise)
@@ -234,8 +234,8 @@ def oracle_of(settings: Config) -> DnnOracle:
     return build_network_oracle(settings, build_model(settings))
 
 
-def test_refusals_and_rollbacks_replay_and_bring_the_covariance_back() -> None:
-    # Anything goes before, nothing after: sets are adopted that are then rolled back.
+def test_refusals_and_rollbacks_are_replayed_and_restore_the_covariance() -> None:
+    # These settings accept every set before adoption and none after it, so adopted sets are rolled back.
     trial = [f"adaptation.trial.{key}" for key in ("floor=1.0", "floor_after=0.0", "margin=0.0")]
     run = follow_attacked(config(*trial), 100, noise(0.3), 9)
     back = [result.seq for result in run.results if result.weights_rolled_back]
@@ -268,7 +268,7 @@ def test_an_adoption_keeps_K_and_its_covariance() -> None:
         np.testing.assert_array_equal(one[name], other[name])
 
 
-def test_no_covariance_is_kept_where_there_is_no_filter() -> None:
+def test_no_covariance_without_a_filter() -> None:
     for more in (["adaptation.law=gradient"], ["adaptation.enabled=false"]):
         state = oracle_of(config(*more)).initial_state(np.random.default_rng(0))
         assert not [name for name in state if "Sigma" in name]
@@ -293,13 +293,13 @@ def test_the_memory_is_in_time_scales_of_the_plant_or_in_seconds(
     assert describe_filter(config(*settings), time_scale).kept ** samples == pytest.approx(np.exp(-1))
 
 
-def test_too_wide_a_last_layer_is_refused_by_name() -> None:
+def test_a_last_layer_that_is_too_wide_is_refused_by_name() -> None:
     assert oracle_of(config("network.hidden=[4, 511]")).law.remembers == ("Sigma",)
     with pytest.raises(ConfigError, match=r"the last of network\.hidden can have 511 neurons at most"):
         oracle_of(config("network.hidden=[4, 512]"))
 
 
-def test_a_checkpoint_of_the_other_law_is_named() -> None:
+def test_a_checkpoint_of_the_other_law_is_refused_by_name() -> None:
     with_filter, without = (
         ControllerCore(config(f"adaptation.law={law}"), law) for law in ("kalman", "gradient")
     )

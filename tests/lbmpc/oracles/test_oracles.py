@@ -1,4 +1,4 @@
-"""The oracles keep one contract: value, Jacobian, learning, parameters as data."""
+"""The common interface of the oracles: value, Jacobian, learning, parameters as data."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_every_activation_has_the_right_slope(activation: str) -> None:
     "realise", [lambda function: function, Compiler()], ids=["virtual machine", "compiled"]
 )
 @pytest.mark.parametrize("architecture", ["mlp", "rnn", "cnn"])
-def test_what_every_tick_calls_is_the_law_as_written(architecture: str, realise: Realise) -> None:
+def test_the_functions_of_a_tick_equal_the_law(architecture: str, realise: Realise) -> None:
     rng = np.random.default_rng(5)
     oracle = DnnOracle(describe(MODEL, [6, 5], architecture=architecture), gamma=0.7, column_bound=0.01)
     oracle.compile(realise)
@@ -68,7 +68,7 @@ def test_what_every_tick_calls_is_the_law_as_written(architecture: str, realise:
     bounded = 0
     for k in range(60):
         if k == 30:
-            # Other hidden layers, as after an adoption.
+            # Switch to other hidden layers, as an adoption does.
             state = {**state, **{f"W{i + 1}": 1.1 * layer for i, layer in enumerate(oracle.hidden(state))}}
         x, u, h = rng.normal(size=4), rng.normal(size=1), rng.normal(size=4) * 0.02
         phi, K = features(oracle, state, x, u), state["K"]
@@ -83,13 +83,13 @@ def test_what_every_tick_calls_is_the_law_as_written(architecture: str, realise:
     assert 0 < bounded < 240
 
 
-def test_unused_slots_of_the_window_do_not_count() -> None:
+def test_unused_slots_of_the_window_are_ignored() -> None:
     oracle = L2nwOracle(4, 1, (0, 1, 4), window=50, bandwidth=0.5, regularisation=1e-6)
     state = oracle.initial_state(np.random.default_rng(0))
     np.testing.assert_array_equal(oracle.estimate(state, np.zeros(4), np.zeros(1)), np.zeros(4))
     h = np.array([0.01, -0.02, 0.0, 0.0])
     state = oracle.learn(state, np.zeros(4), np.zeros(1), h)
-    # 49 slots of zeros beside one sample would pull this to h / 50.
+    # 49 slots of zeros beside one sample would reduce this to h / 50.
     np.testing.assert_allclose(oracle.estimate(state, np.zeros(4), np.zeros(1)), h, rtol=1e-5)
 
 
@@ -102,7 +102,7 @@ def test_the_window_forgets_its_oldest_sample() -> None:
     assert oracle.estimate(state, np.full(4, 3.0), np.zeros(1))[0] == pytest.approx(4.0, rel=1e-5)
 
 
-def test_learning_leaves_the_given_state_as_it_was() -> None:
+def test_learning_does_not_modify_the_given_state() -> None:
     for name in ("constant", "l2nw", "dnn"):
         oracle = oracle_named(name, MODEL)
         state = oracle.initial_state(np.random.default_rng(0))
@@ -112,7 +112,7 @@ def test_learning_leaves_the_given_state_as_it_was() -> None:
             np.testing.assert_array_equal(state[key], value)
 
 
-def test_the_estimate_is_bounded_whatever_the_point() -> None:
+def test_the_estimate_is_bounded_at_every_point() -> None:
     oracle = DnnOracle(describe(MODEL, [16, 16]))
     state = oracle.initial_state(np.random.default_rng(0))
     state = {**state, "K": state["K"] / np.linalg.norm(state["K"], axis=0) * oracle.bounds}

@@ -1,4 +1,4 @@
-"""Hidden weights on trial: what is refused, what is rolled back, and that ordinary training is not hampered."""
+"""The trial of hidden weights: refusals, rollbacks, and no effect on ordinary training."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ Layers = list[np.ndarray]
 # -- the rule ------------------------------------------------------------------------------------------------
 
 
-def test_worse_is_judged_with_a_margin_and_never_below_the_floor() -> None:
+def test_the_comparison_has_a_margin_and_a_floor() -> None:
     trial = Trial(40, 1, 20, margin=0.2, floor=0.01, floor_after=0.1)
     assert not trial.refuses(Finding(1.19, 1.0, 40))
     assert trial.refuses(Finding(1.21, 1.0, 40))
-    # Two nearly perfect networks do not refuse each other by rounding.
+    # Rounding must not make two almost perfect networks refuse each other.
     assert not trial.refuses(Finding(0.9e-4, 1e-12, 40))
     assert trial.refuses(Finding(1.1e-4, 1e-12, 40))
     assert not trial.regrets(Finding(0.9e-2, 1e-12, 40))
@@ -65,7 +65,7 @@ def test_the_ring_holds_the_newest_samples(stride: int) -> None:
         (["rate=1000"], 1.0, 50, 1000),
         (["rate=1000"], 0.25, 12, 250),
         (["rate=10"], 64.0, 32, 640),
-        # Where a time scale has few samples, so many.
+        # The minimum number of samples applies if a time scale has few.
         (["rate=2"], 1.0, 1, 20),
         (["rate=20", "adaptation.trial.seconds=20.0", "adaptation.trial.confirm=0.1"], 64.0, 5, 8),
     ],
@@ -77,7 +77,7 @@ def test_a_trial_is_in_time_scales_of_the_plant_or_in_seconds(
     assert trial == Trial(80, stride, window, margin=0.2, floor=0.003, floor_after=0.1)
 
 
-def test_a_trial_can_be_switched_off_and_needs_samples() -> None:
+def test_a_trial_can_be_disabled_and_needs_samples() -> None:
     assert describe_trial(override(Config(), ["adaptation.trial.enabled=false"]), 1.0) is None
     with pytest.raises(ConfigError, match="samples"):
         override(Config(), ["adaptation.trial.samples=3"])
@@ -87,7 +87,7 @@ def test_a_trial_can_be_switched_off_and_needs_samples() -> None:
 
 
 def learned(samples: int, oracle: DnnOracle = ORACLE, spread: float = 0.1) -> OracleState:
-    """After that many samples of a smooth h about the equilibrium."""
+    """Return the state after that many samples of a smooth h about the equilibrium."""
     rng = np.random.default_rng(0)
     state = oracle.initial_state(rng)
     for _ in range(samples):
@@ -108,18 +108,18 @@ def offer(
 
 
 def nudged(hidden: Layers) -> Layers:
-    """As good, and not the same."""
+    """Return layers that are as good but not the same."""
     return [layer * (1 + 1e-5) for layer in hidden]
 
 
 def assert_as_it_was(after: OracleState, state: OracleState) -> None:
-    """But for what it remembers of trials."""
+    """Assert equality except for the memory of trials."""
     assert after.keys() == state.keys()
     for name in state.keys() - {"tried"}:
         assert after[name] is state[name], name
 
 
-def test_nothing_can_be_tried_without_samples() -> None:
+def test_no_trial_without_samples() -> None:
     state = learned(9)
     after, verdict = offer(ORACLE, state, ORACLE.hidden(state), 1)
     assert verdict == Verdict("refused", "trial: 9 samples so far, 10 are needed")
@@ -127,7 +127,7 @@ def test_nothing_can_be_tried_without_samples() -> None:
 
 
 @pytest.mark.parametrize("architecture", ["mlp", "rnn", "cnn"])
-def test_a_set_that_predicts_worse_is_refused_with_both_figures(architecture: str) -> None:
+def test_a_worse_set_is_refused_with_both_errors(architecture: str) -> None:
     oracle = DnnOracle(describe(MODEL, [8, 8], architecture=architecture), trial=TRIAL)
     state = learned(60, oracle)
     hidden = oracle.hidden(state)
@@ -143,7 +143,7 @@ def test_a_set_that_predicts_worse_is_refused_with_both_figures(architecture: st
 
 
 def _worse_elsewhere(state: OracleState) -> Layers:
-    """Where the samples are, a unit at rest that gives what a constant would; above z = 0.2 it turns over."""
+    """Return layers with a unit that acts like a constant at the samples and changes sign above z = 0.2."""
     hidden = [layer.copy() for layer in ORACLE.hidden(state)]
     hidden[0][:, 0] = 0.0
     hidden[0][0, 0], hidden[0][1, 0] = -8.0, 40.0
@@ -152,11 +152,11 @@ def _worse_elsewhere(state: OracleState) -> Layers:
     return hidden
 
 
-def test_a_set_that_says_what_it_was_trained_on_must_be_as_good_on_what_came_after() -> None:
+def test_a_set_with_known_training_samples_must_pass_on_later_samples() -> None:
     state = learned(60, spread=0.01)
     rng = np.random.default_rng(1)
     for _ in range(28):
-        # Labels so noisy that nothing can be seen on them.
+        # The labels are so noisy that a comparison on them shows nothing.
         h = 10.0 * ORACLE.output_scale * rng.normal(size=4)
         state = {**ORACLE.learn(state, rng.normal(size=4) * 0.01, np.array([0.1]), h), "K": state["K"]}
     for _ in range(12):
@@ -166,14 +166,14 @@ def test_a_set_that_says_what_it_was_trained_on_must_be_as_good_on_what_came_aft
     assert verdict.outcome == "refused"
     assert "of 12 samples" in verdict.reason
     assert_as_it_was(after, state)
-    # Too few say nothing, and neither does a set without a word.
+    # Too few later samples decide nothing, and neither does a set without information.
     assert offer(ORACLE, state, worse, 1, later=9)[1].outcome == "adopted"
     assert offer(ORACLE, state, worse, 1)[1].outcome == "adopted"
-    # Later than all that is remembered is all of it.
+    # An age beyond the memory means all stored samples.
     assert offer(ORACLE, state, worse, 1, later=2**62)[1].outcome == "adopted"
 
 
-def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> None:
+def test_a_set_that_proves_worse_is_rolled_back_with_K() -> None:
     state = learned(60, spread=0.01)
     before = {name: state[name].copy() for name in ("W1", "W2", "K")}
     state, verdict = offer(ORACLE, state, _worse_elsewhere(state), 7)
@@ -188,7 +188,7 @@ def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> N
     for name, array in before.items():
         np.testing.assert_array_equal(state[name], array)
     assert int(state["version"][IN_USE]) == 0
-    # What comes next must be newer than what was rolled back.
+    # The next set must have a higher version than the one that was rolled back.
     assert int(state["version"][NEWEST]) == 7
     assert offer(ORACLE, state, ORACLE.hidden(state), 7)[1] == Verdict(
         "refused", "version 7 is not newer than 7"
@@ -196,7 +196,7 @@ def test_a_set_that_turns_out_worse_gives_way_to_the_one_before_and_its_K() -> N
     assert offer(ORACLE, state, nudged(ORACLE.hidden(state)), 8)[1].outcome == "adopted"
 
 
-def test_a_set_that_holds_is_confirmed_and_the_one_before_is_forgotten() -> None:
+def test_a_good_set_is_confirmed_and_its_predecessor_dropped() -> None:
     state = learned(60)
     state, verdict = offer(ORACLE, state, nudged(ORACLE.hidden(state)), 1)
     assert verdict.outcome == "adopted"
@@ -208,8 +208,8 @@ def test_a_set_that_holds_is_confirmed_and_the_one_before_is_forgotten() -> None
     assert not state["before.W1"].any()
 
 
-def test_a_set_that_was_there_before_is_refused_under_any_version() -> None:
-    """At first, adopted and replaced, refused, rolled back: whoever sends it again sends something stale."""
+def test_an_earlier_set_is_refused_under_any_version() -> None:
+    """This applies to sets that were initial, adopted and replaced, refused, or rolled back."""
     state = learned(60)
     first = ORACLE.hidden(state)
     second, third = nudged(first), nudged(nudged(first))
@@ -228,7 +228,7 @@ def test_a_set_that_was_there_before_is_refused_under_any_version() -> None:
     assert offer(ORACLE, state, nudged(third), 9)[1].outcome == "adopted"
 
 
-def test_the_memory_of_trials_has_an_end() -> None:
+def test_the_memory_of_trials_is_bounded() -> None:
     state = learned(60)
     old = ORACLE.hidden(state)
     for _ in range(TRIED):
@@ -238,12 +238,12 @@ def test_the_memory_of_trials_has_an_end() -> None:
     assert len(state["tried"]) == TRIED
 
 
-def test_a_version_near_the_end_of_all_numbers_does_not_shut_out_everybody_else() -> None:
+def test_a_huge_version_does_not_block_later_sets() -> None:
     state = learned(60)
     assert "leaps too far" in offer(ORACLE, state, ORACLE.hidden(state), 2**62)[1].reason
 
 
-# -- the closed loop under attack ----------------------------------------------------------------------------
+# -- the closed loop with a malicious trainer ----------------------------------------------------------------
 
 
 @cache
@@ -262,7 +262,7 @@ def calm() -> Summary:
     ],
     ids=["crude", "10 % noise", "10 % noise on every trained set", "drift", "right here and wrong elsewhere"],
 )
-def test_the_plant_does_not_notice_a_stolen_trainer(forge: Forge, every: int, instead: bool) -> None:
+def test_a_malicious_trainer_does_not_affect_the_plant(forge: Forge, every: int, instead: bool) -> None:
     summary = summarise(follow_attacked(load(None, ["seed=0"]), STEPS, forge, every, instead))
     assert summary.J < 1.05 * calm().J
     assert summary.constraint_violations == 0
@@ -278,7 +278,7 @@ def test_ordinary_training_is_neither_refused_nor_rolled_back() -> None:
     assert calm().weights_rolled_back == 0
 
 
-# Anything goes before, nothing after: sets are adopted that are then rolled back.
+# These settings accept every set before adoption and none after it, so adopted sets are rolled back.
 LOOSE = ["adaptation.trial.floor=1.0", "adaptation.trial.floor_after=0.0", "adaptation.trial.margin=0.0"]
 SMALL = ["controller.horizon=15", "controller.keyframe_every=10", "network.hidden=[8, 8]", "trainer.steps=20"]
 
@@ -292,11 +292,11 @@ def test_refusals_and_rollbacks_replay_from_the_start_and_from_a_keyframe() -> N
         result = replay(run, from_tick=tick)
         assert result.equal, result.first_difference
         assert result.first_tick <= tick
-    # Another rule is another run: the comparison sees it.
+    # A different rule gives a different run, and the comparison detects it.
     assert not replay(run, None, ["adaptation.trial.floor=0.0"]).equal
 
 
-def test_a_tick_says_how_many_samples_came_after_those_of_its_set_and_replays() -> None:
+def test_a_tick_contains_the_number_of_later_samples_and_replays() -> None:
     noisy = ["estimator.kind=kalman", "estimator.noise=0.001", "plant.sensors.noise=0.001"]
     config = override(Config(), [*SMALL, *noisy])
     run = follow(config, 60, Faults(training_seconds=0.3)).run
@@ -305,14 +305,14 @@ def test_a_tick_says_how_many_samples_came_after_those_of_its_set_and_replays() 
     assert offered
     for tick, hidden in offered:
         assert hidden is not None
-        # Trained in the tick that learned its last sample, six ticks before.
+        # The set was trained in the tick that learned its last sample, six ticks before.
         assert hidden.later == 6
         assert tick.weights.newest == tick.seq - 7
     assert replay(run).equal
     assert replay(run, from_tick=45).equal
 
 
-def test_stale_sets_under_new_versions_are_refused_in_a_replay_from_a_keyframe_too() -> None:
+def test_stale_sets_are_refused_in_a_replay_from_a_keyframe() -> None:
     heard: list[Layers] = []
 
     def stale(known: Known, _rng: np.random.Generator) -> Layers:
@@ -327,7 +327,7 @@ def test_stale_sets_under_new_versions_are_refused_in_a_replay_from_a_keyframe_t
     assert replay(run, from_tick=refused[-1]).equal
 
 
-def test_after_a_rollback_the_newest_version_and_the_hash_in_use_are_told() -> None:
+def test_after_a_rollback_newest_version_and_present_hash_are_published() -> None:
     run = follow_attacked(override(Config(), [*SMALL, *LOOSE]), 100, noise(0.3), 9)
     back = next(result for result in run.results if result.weights_rolled_back)
     told = next(weights for weights in run.output_weights if weights.seq == back.seq)
@@ -336,7 +336,7 @@ def test_after_a_rollback_the_newest_version_and_the_hash_in_use_are_told() -> N
     assert run.results[back.seq - 1].hidden_sha256 != back.hidden_sha256
 
 
-def test_a_keyframe_carries_the_trial() -> None:
+def test_a_keyframe_contains_the_trial() -> None:
     config = override(Config(), SMALL)
     core = ControllerCore(config, "controller-a")
     arrays = core.memory.keyframe(-1).arrays

@@ -1,4 +1,4 @@
-"""The window of past pairs: its beginning, its gaps, its way into keyframes and to the trainer."""
+"""The window of past pairs: its start, gaps, keyframes and the trainer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CONTROLLER = Controller(build_problem(MODEL, ORACLE, 8), Solver(build_problem(MO
 def run_controller(
     missing: tuple[int, ...] = (), ticks: int = 12
 ) -> list[tuple[ControllerState, StepResult]]:
-    """The states after each tick and its result; x of tick t is t / 100, u applied before it t / 10."""
+    """Return the states after each tick and its result; x of tick t is t / 100, the input before it t / 10."""
     state, found = CONTROLLER.initial_state(0), []
     for t in range(ticks):
         x = None if t in missing else np.full(D, t / 100)
@@ -47,11 +47,11 @@ def pair(t: int, u: float) -> np.ndarray:
     return np.append(np.full(D, t / 100), u)
 
 
-def test_a_window_begins_as_if_the_plant_had_stood_at_its_first_state() -> None:
+def test_a_window_starts_with_copies_of_the_first_state() -> None:
     found = run_controller()
     labels = [result.label for _state, result in found]
     assert labels[0] is None
-    stood = pair(0, 0.0)  # the input at the first sample is not known: the equilibrium's
+    stood = pair(0, 0.0)  # the input at the first sample is not known, so the equilibrium's is used
     for t, expected in [
         (1, [stood, stood, stood]),
         (2, [stood, stood, pair(0, 0.1)]),
@@ -63,7 +63,7 @@ def test_a_window_begins_as_if_the_plant_had_stood_at_its_first_state() -> None:
         np.testing.assert_array_equal(label.past, expected)
 
 
-def test_after_a_gap_the_window_begins_anew_and_holds_nothing_from_before_it() -> None:
+def test_a_gap_resets_the_window() -> None:
     found = run_controller(missing=(5,))
     assert [t for t, (_s, result) in enumerate(found) if result.label is None] == [0, 5, 6]
     label = found[7][1].label
@@ -74,14 +74,14 @@ def test_after_a_gap_the_window_begins_anew_and_holds_nothing_from_before_it() -
     np.testing.assert_array_equal(label.past, [pair(6, 0.6), pair(6, 0.6), pair(6, 0.7)])
 
 
-def test_the_predicted_state_of_the_next_tick_carries_the_window_as_it_will_be() -> None:
+def test_the_predicted_state_contains_the_next_window() -> None:
     found = run_controller()
     state, result = found[6]
     np.testing.assert_array_equal(state.predicted[D:-M], found[7][0].oracle["past"].ravel()[:-M])
     assert state.predicted[-M] == result.plan[0, 0]
 
 
-def test_the_window_is_part_of_the_memory_and_thaws() -> None:
+def test_the_window_is_saved_and_restored() -> None:
     state = run_controller()[-1][0]
     arrays = state.to_arrays()
     assert arrays["oracle.past"].shape == (3, D + M)
@@ -97,8 +97,8 @@ def test_the_window_is_part_of_the_memory_and_thaws() -> None:
     )
 
 
-def test_the_trainer_sees_the_window_that_the_controller_saw() -> None:
-    """Also at the beginning and behind a gap: phi there and here are the same."""
+def test_trainer_and_controller_use_the_same_window() -> None:
+    """This includes the start and the time after a gap: phi is the same on both sides."""
     trainer = Trainer(
         ORACLE.description,
         TrainerConfig(device="cpu"),
@@ -122,13 +122,13 @@ def test_the_trainer_sees_the_window_that_the_controller_saw() -> None:
     with torch.no_grad():
         theirs = phi_of(network, network.tensor(trainer.buffer.contents()[0])).numpy()
     np.testing.assert_allclose(theirs, phis, atol=1e-12)
-    assert trainer.counters["bad samples"] == 0
+    assert trainer.counters["bad_samples"] == 0
     short = m.Sample(99, [0.0] * D, [0.0] * M, [0.0] * D, [[0.0] * (D + M)] * 2)
     assert trainer.add("run", [short]) == 0
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
 
 
-def test_a_sample_without_a_past_is_written_as_it_always_was() -> None:
+def test_a_sample_without_a_past_keeps_its_format() -> None:
     sample = m.Sample(1, [0.5], [0.25], [0.125])
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(sample)) == {
         "seq": 1,
@@ -138,13 +138,13 @@ def test_a_sample_without_a_past_is_written_as_it_always_was() -> None:
     }
 
 
-def test_a_past_of_the_wrong_length_is_named() -> None:
+def test_a_past_of_the_wrong_length_is_reported() -> None:
     batch = m.Samples(run_id="r", seq=0, samples=[m.Sample(0, [0.0] * 4, [0.0], [0.0] * 4, [[0.0] * 4])])
     with pytest.raises(codec.BadMessage, match=r"past\[0\] has 4 entries, the plant has 5"):
         codec.check_dimensions(topics.SAMPLES, batch, 4, 1)
 
 
-def test_samples_with_a_long_past_still_fit_into_their_messages() -> None:
+def test_samples_with_a_long_past_fit_into_their_messages() -> None:
     sample = m.Sample(0, [0.1] * D, [0.1] * M, [0.1] * D, [[0.1] * (D + M)] * 63)
     samples = [msgspec.structs.replace(sample, seq=i) for i in range(BATCH)]
     batches = Outbox("run").batches(samples)

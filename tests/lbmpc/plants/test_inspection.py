@@ -1,4 +1,4 @@
-"""A plant that cannot be used is refused where it is looked up: what is wrong, where, and what to do."""
+"""A plant that cannot be used is refused at its look-up with the fault, its place and the remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def changed(**fields: object) -> Plant:
 
 
 def one_state() -> Plant:
-    """A level that follows a flow, in a unit far too large for it."""
+    """A level that follows a flow, in a unit that is much too large for it."""
     return Plant(
         name="slow",
         states=("level",),
@@ -55,12 +55,12 @@ FAULTY: dict[str, tuple[Plant, str]] = {
     "negative W": (changed(W=[0.01, -0.1]), "W of rate is -0.1: a half-width is at least 0"),
     "x0 too short": (changed(x0=[0.5]), r"x0 is \[0.5\]: it needs 2 entries, one for each of angle, rate"),
     "x_e as a column": (changed(x_e=[[0.0], [0.0]]), "x_e is .* needs 2 entries"),
-    "words for numbers": (changed(x0="here"), "x0 is 'here': give numbers"),
-    "a gain on its side": (changed(safe_gain=[[1.0], [2.0]]), "safe_gain is .* a row for each input"),
+    "text instead of numbers": (changed(x0="here"), "x0 is 'here': give numbers"),
+    "a transposed gain": (changed(safe_gain=[[1.0], [2.0]]), "safe_gain is .* a row for each input"),
     "rhs too short": (changed(rhs=lambda x, u: [x[1]]), "rhs returns 1 entries: it needs 2"),
-    "rhs of nothing": (changed(rhs=lambda x, u: None), "rhs returns None: it must return a list"),
-    "rhs of words": (changed(rhs=lambda x, u: ["a", 0]), "CasADi cannot use the result of rhs"),
-    "a symbol from elsewhere": (changed(rhs=lambda x, u: [ca.SX.sym("q"), 0]), r"variables \[q\] are free"),
+    "rhs returns None": (changed(rhs=lambda x, u: None), "rhs returns None: it must return a list"),
+    "rhs with text": (changed(rhs=lambda x, u: ["a", 0]), "CasADi cannot use the result of rhs"),
+    "a foreign symbol": (changed(rhs=lambda x, u: [ca.SX.sym("q"), 0]), r"variables \[q\] are free"),
     "rhs that fails": (changed(rhs=lambda x, u: [x[1], 1 / 0]), r"rhs fails in line \d+: ZeroDivisionError"),
     "a condition on a state": (
         changed(rhs=lambda x, u: [x[1] if x[0] > 0 else 0, u[0]]),
@@ -73,7 +73,7 @@ FAULTY: dict[str, tuple[Plant, str]] = {
         r"performance has 2: .* 0 \(angle\) to 1 \(rate\)",
     ),
     "performance counted backwards": (changed(performance=(-1,)), "performance has -1"),
-    "performance by name": (changed(performance=("angle",)), "performance has 'angle': a state's index"),
+    "performance with a name": (changed(performance=("angle",)), "performance has 'angle': a state's index"),
     "an unknown kernel variable": (
         changed(kernel=("angle", "rat")),
         "kernel has 'rat', .* choose from angle, rate",
@@ -87,7 +87,7 @@ FAULTY: dict[str, tuple[Plant, str]] = {
         "x_e of angle is 3.14159, but x_min of angle is -1 and x_max is 1: the equilibrium must lie",
     ),
     "an equilibrium outside U": (changed(u_e=[5.0]), "u_e of torque is 5, but u_min of torque is -3"),
-    "an equilibrium that is none": (changed(x_e=[0.5, 0.0]), "not an equilibrium: drate/dt is 1.92"),
+    "not an equilibrium": (changed(x_e=[0.5, 0.0]), "not an equilibrium: drate/dt is 1.92"),
     "no equilibrium in small units": (
         replace(one_state(), x_e=[5e-10]),
         "not an equilibrium: dlevel/dt is -5e-10",
@@ -96,7 +96,7 @@ FAULTY: dict[str, tuple[Plant, str]] = {
         changed(rhs=lambda x, u: [x[1], ca.sqrt(x[0]) + u[0]]),
         "slopes of dx/dt are not finite",
     ),
-    "a start where nothing holds": (
+    "a start outside the domain": (
         changed(rhs=lambda x, u: [x[1], ca.log(1 - 3 * x[0]) + u[0]]),
         "drate/dt is nan at x0",
     ),
@@ -121,16 +121,19 @@ FAULTY: dict[str, tuple[Plant, str]] = {
         changed(u_max=[INF]),
         r"u_min of torque is -3 and u_max is inf: .*scale=\{'torque'",
     ),
-    "a scale of nothing": (replace(INTEGRATOR, scale={"speed": 2.0, "spede": 2.0}), "scale has 'spede'"),
+    "a scale of an unknown name": (
+        replace(INTEGRATOR, scale={"speed": 2.0, "spede": 2.0}),
+        "scale has 'spede'",
+    ),
     "a scale of 0": (
         replace(INTEGRATOR, scale={"speed": 0.0}),
         "scale of speed is 0.0: .* a positive number",
     ),
-    "parameters that nothing takes": (
+    "parameters without equations": (
         changed(equations=None),
         "parameters has stiffness, gain and equations is None: give the function",
     ),
-    "a parameter in words": (changed(parameters={"gain": "high"}), "parameters is .*: give numbers by name"),
+    "a parameter as text": (changed(parameters={"gain": "high"}), "parameters is .*: give numbers by name"),
     "parameters that the equations do not have": (
         changed(parameters={"gain": 1.0}),
         "equations fails with symbols for gain: TypeError",
@@ -147,14 +150,14 @@ FAULTY: dict[str, tuple[Plant, str]] = {
 
 
 @pytest.mark.parametrize("case", FAULTY)
-def test_a_faulty_plant_is_refused_and_the_fault_named(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_faulty_plant_is_refused_with_its_fault(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plant, message = FAULTY[case]
     monkeypatch.setitem(PLANTS, "faulty", plant)
     with pytest.raises(PlantDefinitionError, match=message) as caught:
         get_plant("faulty")
     text = str(caught.value)
     assert text.startswith(f"the plant {plant.name!r} cannot be used")
-    # One fault is one sentence: nothing else is blamed for it.
+    # Each fault gives one sentence, and no other fault is reported.
     assert len(faults(plant)) == 1
     assert f"{plant.rhs.__code__.co_filename}, line" in text
 
@@ -184,7 +187,7 @@ def test_a_sound_plant_has_no_faults(plant: Plant) -> None:
     assert faults(plant) == ()
 
 
-def test_lists_are_as_good_as_arrays_and_tuples() -> None:
+def test_lists_are_accepted_for_arrays_and_tuples() -> None:
     fields = ("x_e", "u_e", "x_min", "x_max", "u_min", "u_max", "W", "x0", "safe_input", "safe_gain")
     names = ("states", "inputs", "performance", "kernel", "positive", "poles")
     lists = {name: getattr(MOORE_GREITZER, name).tolist() for name in fields}
@@ -195,7 +198,7 @@ def test_lists_are_as_good_as_arrays_and_tuples() -> None:
     assert all(getattr(plant, name) == getattr(MOORE_GREITZER, name) for name in names)
 
 
-def test_without_a_choice_all_states_are_reported_and_the_kernel_sees_all() -> None:
+def test_by_default_all_states_are_reported_and_in_the_kernel() -> None:
     chosen = ("performance", "kernel")
     given = {one.name: getattr(PENDULUM, one.name) for one in fields(Plant) if one.name not in chosen}
     plant = Plant(**given)
@@ -203,8 +206,8 @@ def test_without_a_choice_all_states_are_reported_and_the_kernel_sees_all() -> N
     assert faults(plant) == ()
 
 
-def test_rounding_of_an_equilibrium_is_judged_by_the_plants_own_units() -> None:
-    """A pressure in pascal: digits that are right to a millionth leave a residual of 0.1 Pa/s."""
+def test_rounding_of_an_equilibrium_is_relative_to_the_half_widths() -> None:
+    """A pressure in pascal: digits that are correct to a millionth leave a residual of 0.1 Pa/s."""
     in_pascal = replace(
         one_state(),
         rhs=lambda x, u: [2.0 * (u[0] - x[0])],
@@ -216,16 +219,16 @@ def test_rounding_of_an_equilibrium_is_judged_by_the_plants_own_units() -> None:
     assert faults(in_pascal) == ()
 
 
-def test_half_widths_are_the_bounds_where_there_are_two_and_else_the_scale() -> None:
+def test_half_widths_come_from_two_bounds_or_from_the_scale() -> None:
     np.testing.assert_array_equal(INTEGRATOR.x_scale, [1.0, 2.0])
     np.testing.assert_array_equal(INTEGRATOR.u_scale, [2.0])
-    # A scale for what is bounded changes nothing.
+    # A scale has no effect on a variable with bounds.
     np.testing.assert_array_equal(replace(INTEGRATOR, scale={"speed": 2.0, "push": 9.0}).u_scale, [2.0])
     half = replace(INTEGRATOR, x_min=[-1.0, -1.0])
     np.testing.assert_array_equal(half.x_scale, [1.0, 2.0])
 
 
-def test_half_widths_of_the_compressor_are_to_the_bit_what_they_were() -> None:
+def test_half_widths_of_the_compressor_are_unchanged() -> None:
     plant = MOORE_GREITZER
     np.testing.assert_array_equal(plant.x_scale, (plant.x_max - plant.x_min) / 2)
     np.testing.assert_array_equal(plant.u_scale, (plant.u_max - plant.u_min) / 2)

@@ -1,4 +1,4 @@
-"""A plant of numbers alone: defaults, faults, its motion within a period, its rest, and what is written of it."""
+"""A plant given by numbers: defaults, faults, motion within a period, rest, and its JSON form."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def numbers(a: Any = A, b: Any = B, **changes: Any) -> Known:
 
 
 def sampled(a: Any = A, b: Any = B, period: float = 0.1, **changes: Any) -> Known:
-    """In discrete time."""
+    """Return a discrete-time plant."""
     A_d, B_d = discretise(np.array(a), np.array(b), period)
     return numbers(A_d, B_d, period=period, **changes)
 
 
-def test_what_has_a_default_need_not_be_said() -> None:
+def test_defaults_are_applied() -> None:
     known = Known.from_matrices(A, B, W=[0.01, 0.1], scale={"x1": 1.0, "x2": 2.0, "u1": 3.0})
     assert (known.states, known.inputs, known.performance) == (("x1", "x2"), ("u1",), (0, 1))
     assert (known.x_e.tolist(), known.u_e.tolist(), known.x0.tolist()) == ([0.0, 0.0], [0.0], [0.0, 0.0])
@@ -63,7 +63,7 @@ def test_the_numbers_of_equations_make_the_same_model() -> None:
 # -- faults -----------------------------------------------------------------------------------
 
 FAULTY: dict[str, tuple[dict[str, Any], str]] = {
-    "A in words": ({"a": "fast"}, "A is 'fast': give a square matrix"),
+    "A as text": ({"a": "fast"}, "A is 'fast': give a square matrix"),
     "A of rows of different lengths": ({"a": [[0.0, 1.0], [2.0]]}, "A is .*: give a square matrix"),
     "A that is not square": ({"a": [[0.0, 1.0]]}, "A is .*: give a square matrix"),
     "B without columns": ({"b": [0.0, 1.0]}, r"B is \[0.0, 1.0\]: .* for one input, for example, \[\[0.0\]"),
@@ -75,14 +75,14 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
         {"states": ("a", "b", "c"), "x_min": None, "x_max": None, "W": [1, 1, 1]},
         r"3 states are named \(a, b, c\), and A and B have 2 rows",
     ),
-    "names in one word": ({"states": "ab"}, "states is the text 'ab'"),
+    "names as one text": ({"states": "ab"}, "states is the text 'ab'"),
     "NaN in A": ({"a": [[0.0, 1.0], [NAN, 0.0]]}, "A is nan from x1 to x2: give a finite number"),
     "infinity in B": ({"b": [[0.0], [INF]]}, "B is inf from u1 to x2"),
-    "a period of nothing": ({"period": 0.0}, "period is 0.0: give the seconds from x to"),
+    "a period of zero": ({"period": 0.0}, "period is 0.0: give the seconds from x to"),
     "a negative period": ({"period": -0.1}, "period is -0.1"),
-    "a period in words": ({"period": "fast"}, "period is 'fast'"),
-    "a name that is none": ({"names": {"x1": 3}}, "names is {'x1': 3}: give texts by name"),
-    "a unit that nobody asked for": ({"units": {"x9": 3}}, "units is .*'x9': 3}: give texts by name"),
+    "a period as text": ({"period": "fast"}, "period is 'fast'"),
+    "a name that is not text": ({"names": {"x1": 3}}, "names is {'x1': 3}: give texts by name"),
+    "a unit of an unknown name": ({"units": {"x9": 3}}, "units is .*'x9': 3}: give texts by name"),
     "no W": ({"W": None}, "W is missing: give the half-widths .* x1, x2"),
     "an infinite W": ({"W": [0.1, INF]}, "W of x2 is inf"),
     "no bounds and no scale": (
@@ -117,17 +117,17 @@ FAULTY: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", FAULTY)
-def test_a_fault_of_numbers_is_named(case: str) -> None:
+def test_a_fault_of_numbers_is_reported(case: str) -> None:
     given, message = FAULTY[case]
     with pytest.raises(PlantDefinitionError, match=message) as caught:
         numbers(**given)
     text = str(caught.value)
     assert text.startswith("the plant 'plant' cannot be used")
-    # One fault is one sentence.
+    # Each fault gives one sentence.
     assert "\n" not in text
 
 
-def test_faults_of_numbers_are_named_where_they_were_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faults_of_numbers_are_reported_for_unchecked_plants(monkeypatch: pytest.MonkeyPatch) -> None:
     bad = replace(numbers(), W=[-1.0, 0.1], A=np.eye(3))
     monkeypatch.setitem(PLANTS, "plant", bad)
     with pytest.raises(PlantDefinitionError, match=r"A has the shape \(3, 3\)"):
@@ -154,7 +154,7 @@ def test_a_model_in_discrete_time_is_used_at_its_own_rate_only() -> None:
 
 
 @pytest.mark.parametrize("shares", [(1.0,), (0.3,), (0.3, 0.7), (1.5,), (4.2,)])
-def test_a_sampled_model_moves_within_a_period_as_what_it_was_sampled_from(shares: tuple[float, ...]) -> None:
+def test_a_sampled_model_moves_within_a_period_like_its_source(shares: tuple[float, ...]) -> None:
     continuous, discrete = build_model(numbers(), 0.1), build_model(sampled(), 0.1)
     assert isinstance(discrete.within, Continuous)
     x, there = np.array([0.3, -0.5]), np.array([0.3, -0.5])
@@ -164,7 +164,7 @@ def test_a_sampled_model_moves_within_a_period_as_what_it_was_sampled_from(share
     np.testing.assert_allclose(there, x, atol=1e-12)
 
 
-def test_a_label_of_pieces_is_that_of_the_true_motion() -> None:
+def test_a_label_with_pieces_equals_that_of_the_true_motion() -> None:
     known = sampled()
     model, truth = build_model(known, 0.1), true_motion(numbers())
     x, pieces = np.array([0.3, -0.5]), ((0.03, np.array([1.0])), (0.07, np.array([-2.0])))
@@ -176,12 +176,12 @@ def test_a_label_of_pieces_is_that_of_the_true_motion() -> None:
 
 WITHOUT_MOTION = {
     "a dead time": ([[0.9, 0.5], [0.0, 0.0]], [[0.0], [1.0]]),
-    "two of it": ([[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], [[0.0], [0.0], [1.0]]),
+    "two dead times": ([[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], [[0.0], [0.0], [1.0]]),
     "a dead time that was identified": (
         [[0.9, 0.5, 0.0], [0.0, 1e-9, 1.0], [0.0, 1e-9, 1e-9]],
         [[0.0], [0.0], [1.0]],
     ),
-    "one with a motion of rounding": (
+    "a motion that consists of rounding": (
         [[0.9, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, -1e-6, 0.0]],
         [[0.0], [0.0], [1.0]],
     ),
@@ -190,7 +190,7 @@ WITHOUT_MOTION = {
 
 
 @pytest.mark.parametrize("case", WITHOUT_MOTION)
-def test_where_nothing_is_known_between_two_states_a_straight_line_stands_for_it(case: str) -> None:
+def test_an_unknown_motion_within_a_period_is_a_straight_line(case: str) -> None:
     a, b = WITHOUT_MOTION[case]
     d = len(a)
     known = Known.from_matrices(
@@ -206,7 +206,7 @@ def test_where_nothing_is_known_between_two_states_a_straight_line_stands_for_it
     np.testing.assert_allclose(
         model.ahead(x, u, 0.25), 0.5 * (model.step(after, u) + model.step(model.step(after, u), u))
     )
-    # The label of a constant input is the same, however it is cut into pieces.
+    # The label of a constant input does not depend on its pieces.
     for pieces in ((), ((0.1, u),), ((0.03, u), (0.07, u))):
         np.testing.assert_allclose(model.label(x, u, after, pieces), np.zeros(d), atol=1e-15)
 
@@ -215,7 +215,7 @@ def test_where_nothing_is_known_between_two_states_a_straight_line_stands_for_it
 
 
 @pytest.mark.parametrize("known", [numbers(), sampled()], ids=["continuous", "discrete"])
-def test_numbers_move_as_their_model_says(known: Known) -> None:
+def test_numbers_move_by_their_model(known: Known) -> None:
     x_e, u_e = np.array([0.1, 0.2]), np.array([0.5])
     model, truth = build_model(known, 0.1), true_motion(replace(known, x_e=x_e, u_e=u_e))
     x, u = np.array([0.3, -0.5]), np.array([-0.7])
@@ -225,7 +225,7 @@ def test_numbers_move_as_their_model_says(known: Known) -> None:
     np.testing.assert_allclose(halfway, after, atol=1e-12)
 
 
-def test_without_a_motion_within_a_period_numbers_are_a_truth_of_whole_periods() -> None:
+def test_without_a_motion_within_a_period_only_whole_periods_are_simulated() -> None:
     a, b = WITHOUT_MOTION["a dead time"]
     known = numbers(a, b, period=0.1)
     truth, x, u = true_motion(known), np.array([0.3, -0.5]), np.array([-0.7])
@@ -240,25 +240,25 @@ def test_without_a_motion_within_a_period_numbers_are_a_truth_of_whole_periods()
 # -- rest -------------------------------------------------------------------------------------
 
 
-def test_an_input_holds_an_offset_where_it_can() -> None:
+def test_an_input_balances_an_offset_if_possible() -> None:
     known = numbers(offset=[0.0, 0.4])
     assert (known.x_e.tolist(), known.u_e.tolist()) == ([0.0, 0.0], [-0.4])
-    # What follows from it by default, follows.
+    # Defaults that depend on the equilibrium follow it.
     assert (known.x0.tolist(), known.safe_input.tolist()) == ([0.0, 0.0], [-0.4])
     kept = numbers(offset=[0.0, 0.4], x0=[0.5, 0.0], safe_input=[0.0])
     assert (kept.x0.tolist(), kept.safe_input.tolist()) == ([0.5, 0.0], [0.0])
 
 
-def test_the_state_gives_way_where_no_input_holds_an_offset() -> None:
+def test_the_state_moves_if_no_input_balances_an_offset() -> None:
     known = numbers(offset=[0.3, 0.4], x_e=[0.1, 0.0], u_e=[1.0])
     drift = np.array(A) @ (known.x_e - [0.1, 0.0]) + np.array(B) @ (known.u_e - 1.0) + [0.3, 0.4]
     np.testing.assert_allclose(drift, np.zeros(2), atol=1e-14)
-    # A speed of -0.3 and no more.
+    # Only the velocity changes, to -0.3.
     np.testing.assert_allclose(known.x_e, [0.1, -0.3], atol=1e-14)
 
 
-def test_what_the_plant_is_for_moves_last() -> None:
-    """An actuator that is a period late: it holds the offset, where the first state could give way as well."""
+def test_performance_states_move_last() -> None:
+    """An actuator with a delay of one period balances the offset, although the first state could move as well."""
     a, b = [[1.05, 0.1], [0.0, 0.0]], [[0.0], [1.0]]
     held = numbers(a, b, period=0.1, offset=[0.01, 0.0], performance=(0,))
     np.testing.assert_allclose([*held.x_e, *held.u_e], [0.0, -0.1, -0.1], atol=1e-14)
@@ -270,7 +270,7 @@ def test_what_the_plant_is_for_moves_last() -> None:
 def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
     known = sampled(offset=[0.01, 0.02])
     there = known.A @ -known.x_e + known.B @ -known.u_e + known.x_e + [0.01, 0.02]
-    # From the old origin, one step: x+ - x is the offset.
+    # One step from the old origin: x+ - x is the offset.
     np.testing.assert_allclose(
         there + known.A @ known.x_e + known.B @ known.u_e - known.x_e, [0.01, 0.02], atol=1e-14
     )
@@ -279,21 +279,21 @@ def test_in_discrete_time_an_offset_is_that_of_the_next_state() -> None:
     )
 
 
-def test_numbers_rest_elsewhere_too() -> None:
+def test_numbers_can_rest_at_another_point() -> None:
     moved = numbers().resting_near(x_e=[0.5, 0.0])
     np.testing.assert_allclose(moved.x_e, [0.5, 0.0], atol=1e-14)
     np.testing.assert_allclose(moved.u_e, [1.0], atol=1e-14)
 
 
 @pytest.mark.parametrize("plant", [TANKS, TANKS.known()], ids=["equations", "numbers"])
-def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
+def test_a_configuration_can_set_the_rest(plant: Plant | Known) -> None:
     lower = 14.0
     upper = plant.resting_near(x_e=[9.0, lower]).x_e[0]
     there = plant.changed({"q": (0.0, 25.0)}, x_e=[upper, lower])
     assert there.u_max.tolist() == [25.0]
     np.testing.assert_allclose(there.x_e, [upper, lower], rtol=1e-9)
     assert faults(there) == ()
-    # What is shown of it can be given, and is the same to the bit.
+    # The displayed values can be configured, and give exactly the same plant.
     again = plant.changed({"q": (0.0, 25.0)}, there.x_e.tolist(), there.u_e.tolist())
     assert (again.x_e.tolist(), again.u_e.tolist()) == (there.x_e.tolist(), there.u_e.tolist())
     with pytest.raises(
@@ -302,14 +302,14 @@ def test_a_configuration_may_say_where_to_rest(plant: Plant | Known) -> None:
         plant.changed({}, x_e=[upper + 0.5, lower])
 
 
-def test_numbers_do_not_rest_where_their_matrices_do_not() -> None:
+def test_numbers_rest_only_where_their_matrices_do() -> None:
     with pytest.raises(
         PlantDefinitionError, match=r"not an equilibrium: x_e = \[0.5, 0.0\], u_e = \[0.9\]. The nearest"
     ):
         numbers().changed({}, [0.5, 0.0], [0.9])
 
 
-def test_what_cannot_be_changed_is_looked_at_first() -> None:
+def test_a_plant_is_checked_before_a_change() -> None:
     broken = replace(PENDULUM, rhs=lambda x, u: [x[1], 1 / 0], equations=None, parameters={})
     for bad in (broken, replace(PENDULUM.known(), A=np.eye(3)), replace(numbers(), W=[NAN, 1.0])):
         with pytest.raises(PlantDefinitionError, match=r"ZeroDivisionError|A has the shape|W of x1 is nan"):
@@ -322,20 +322,20 @@ def test_what_cannot_be_changed_is_looked_at_first() -> None:
         get_plant(numbers(), lambda plant: plant.changed({"x1": (2.0, 4.0)}, x_e=[3.0, 0.0]))
 
 
-def test_equations_rest_where_a_known_wind_lets_them() -> None:
+def test_equations_rest_under_a_known_wind() -> None:
     windy = QUADROTOR.varied(wind=2.0)
     with pytest.raises(ModelError, match=r"dvy/dt is 0.823 .* The nearest rest is x_e = \[.*resting_near"):
         build_model(windy, 0.02)
     rest = windy.resting_near()
     drift = np.array(rest.function()(rest.x_e, rest.u_e))
     np.testing.assert_allclose(drift, np.zeros((6, 1)), atol=1e-9)
-    # It leans into the wind, and stands still where it should be.
+    # It tilts into the wind and stays at the desired position.
     np.testing.assert_allclose(rest.x_e[[0, 1, 3, 4, 5]], np.zeros(5), atol=1e-12)
     assert rest.x_e[2] == pytest.approx(np.arctan(0.1 * 4 / (0.486 * 9.81)), abs=1e-9)
     assert rest.u_e[0] == pytest.approx(rest.u_e[1])
     assert rest.u_e[0] > QUADROTOR.u_e[0]
     assert faults(rest) == ()
-    # The numbers are those there.
+    # The linearisation is the one at this rest.
     model = build_model(rest, 0.02)
     np.testing.assert_array_equal(model.plant.A, rest.linearised()[1])
     truth = Truth(rest)
@@ -350,13 +350,13 @@ def test_another_level_is_held_by_another_inflow() -> None:
         replace(PENDULUM, u_max=np.array([0.5])).resting_near(x_e=[-0.3, 0.0])
 
 
-# -- written ----------------------------------------------------------------------------------
+# -- JSON -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "plant", [MOORE_GREITZER, INTEGRATOR, QUADROTOR, sampled(poles=(-1.0, -2.0))], ids=lambda p: p.name
 )
-def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
+def test_json_is_read_back_bit_for_bit(plant: Any) -> None:
     known = plant if isinstance(plant, Known) else plant.known()
     again = Known.from_builtins(json.loads(json.dumps(known.to_builtins(), allow_nan=False)))
     for one in fields(known):
@@ -366,7 +366,7 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         else:
             assert its == ours
             assert type(its) is type(ours)
-    # A real pole stays real: its exponential is another function.
+    # A real pole stays real, because its exponential is computed by another function.
     assert [type(pole) for pole in again.poles or ()] == [type(pole) for pole in known.poles or ()]
     for name in ("A", "B", "K", "P"):
         period = known.period or 0.05
@@ -375,7 +375,7 @@ def test_what_is_written_comes_back_bit_for_bit(plant: Any) -> None:
         )
 
 
-def test_a_number_is_written_the_same_with_and_without_a_point() -> None:
+def test_one_and_one_point_zero_are_written_equally() -> None:
     with_point = sampled(period=1.0, poles=(-1.0, -2.0), scale={"u1": 1.0}).to_builtins()
     without = sampled(period=1, poles=(-1, -2), scale={"u1": 1}).to_builtins()
     assert json.dumps(without) == json.dumps(with_point)
@@ -392,7 +392,7 @@ def test_a_number_is_written_the_same_with_and_without_a_point() -> None:
         ({"performance": [7]}, "performance has 7"),
     ],
 )
-def test_what_is_no_plant_is_not_read(change: dict[str, Any], message: str) -> None:
+def test_other_data_is_not_read_as_a_plant(change: dict[str, Any], message: str) -> None:
     with pytest.raises(PlantDefinitionError, match=message):
         Known.from_builtins(numbers().to_builtins() | change)
     with pytest.raises(PlantDefinitionError, match="missing required field"):

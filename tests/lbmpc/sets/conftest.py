@@ -1,4 +1,4 @@
-"""A family of sets that is constructed once."""
+"""A fixture with a family of sets that is constructed once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ START = np.array([0.62, 0.0])
 
 @pytest.fixture(scope="session")
 def family() -> Certificate:
-    """A base set and a chain of pieces from a state outside of it."""
+    """Return a base set and a chain of pieces from a state outside of it."""
     found = construct(MODEL, "regions", START)
     assert len(found.pieces) > 3
     return found

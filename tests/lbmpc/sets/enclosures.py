@@ -1,4 +1,4 @@
-"""What tests of rigorous bounds share: when a bound holds, and a plant with the equations of a test."""
+"""Helpers for tests of rigorous bounds: exact comparison, and a plant with given equations."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from lbmpc.plants.equations import Plant
 from lbmpc.sets.enclosures.interval import Interval
 
-# What the integrator of the truth may be off by, per unit of the state's size.
+# Error of the integrator of the truth, relative to the size of the state.
 TRUTH = 1e-11
 
 
 def holds(bound: Interval, i: int, exact: Fraction) -> bool:
-    """Infinity is a bound of everything on its side."""
+    """Return whether the bound contains the exact value; infinity bounds everything on its side."""
     low, high = float(bound.lower[i]), float(bound.upper[i])
     return (low == -np.inf or Fraction(low) <= exact) and (high == np.inf or exact <= Fraction(high))
 

@@ -1,4 +1,4 @@
-"""What is claimed of sets, and who checks it."""
+"""Certificates: the claim about sets and its check."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def moved_out(piece: Piece, row: int, by: float) -> list[float]:
     ]
 
 
-def test_the_claim_holds_and_more_is_known_with_more_knowledge_of_h(family: Certificate) -> None:
+def test_the_claim_holds_and_better_bounds_of_h_give_larger_sets(family: Certificate) -> None:
     box, hull = (construct(MODEL, kind, START) for kind in ("box", "hull"))
     verdicts = [check(c) for c in (box, hull, family)]
     assert all(v.ok and v.margin > 0 for v in verdicts)
     fractions = [volume_fraction(c) for c in (box, hull, family)]
-    # For this plant the hull of h is nearly its box.
+    # For this plant the hull of h almost equals its box.
     assert fractions[0] * (1 - 1e-5) <= fractions[1] < fractions[2]
     assert Guard(hull).first_inputs(START).piece == -1
     assert Guard(family).first_inputs(START).piece > 0
@@ -76,9 +76,7 @@ def test_a_false_claim_is_refused(family: Certificate, index: int, fields: dict,
     assert re.search(says, verdict.reason), verdict.reason
 
 
-def test_the_checker_knows_when_vertices_are_missing(
-    monkeypatch: pytest.MonkeyPatch, family: Certificate
-) -> None:
+def test_the_checker_detects_missing_vertices(monkeypatch: pytest.MonkeyPatch, family: Certificate) -> None:
     complete = checker._bases
     monkeypatch.setattr(checker, "_bases", lambda *a: complete(*a)[1:])
     verdict = check(family)
@@ -86,7 +84,7 @@ def test_the_checker_knows_when_vertices_are_missing(
     assert "edges do not end at a known vertex" in verdict.reason
 
 
-def test_a_certificate_comes_back_bit_for_bit_and_fits_one_model_only(family: Certificate) -> None:
+def test_a_certificate_is_read_back_bit_for_bit_and_fits_one_model(family: Certificate) -> None:
     again = decode(encode(family))
     assert again == family
     assert again.sha256 == family.sha256
@@ -109,7 +107,7 @@ def test_a_certificate_comes_back_bit_for_bit_and_fits_one_model_only(family: Ce
         (b"\xff\x00", "not a certificate"),
     ],
 )
-def test_garbage_is_no_certificate(data: bytes, says: str) -> None:
+def test_garbage_is_refused(data: bytes, says: str) -> None:
     with pytest.raises(CertificateError, match=says):
         decode(data)
 
@@ -123,14 +121,12 @@ def test_garbage_is_no_certificate(data: bytes, says: str) -> None:
         ({"W": [[0.0], [0.0, 1.0]]}, "different lengths"),
     ],
 )
-def test_a_certificate_of_the_wrong_shape_is_no_certificate(
-    family: Certificate, fields: dict, says: str
-) -> None:
+def test_a_certificate_of_the_wrong_shape_is_refused(family: Certificate, fields: dict, says: str) -> None:
     with pytest.raises(CertificateError, match=says):
         decode(encode(changed(family, 0, **fields)))
 
 
-def test_work_that_was_done_is_not_done_again(family: Certificate) -> None:
+def test_an_interrupted_construction_continues(family: Certificate) -> None:
     class Interrupted(Exception):
         pass
 
@@ -151,7 +147,7 @@ def test_work_that_was_done_is_not_done_again(family: Certificate) -> None:
     assert encode(again) == encode(family)
 
 
-def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family: Certificate) -> None:
+def test_the_approximation_of_the_paper_is_not_certified_and_fails_the_check(family: Certificate) -> None:
     approximation = construct(MODEL, "extension", START)
     assert volume_fraction(approximation) > volume_fraction(family)
     verdict = check(approximation)
@@ -162,7 +158,7 @@ def test_the_approximation_of_the_paper_claims_nothing_and_would_not_hold(family
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant", certificate=approximation)
 
 
-def test_a_last_digit_is_no_other_model(family: Certificate) -> None:
+def test_a_difference_in_the_last_digit_is_accepted(family: Certificate) -> None:
     again = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 3e-16)).tolist())
     require_match(msgspec.structs.replace(family, model=again), MODEL)
     other = msgspec.structs.replace(family.model, A=(np.array(family.model.A) * (1 + 1e-9)).tolist())
@@ -170,7 +166,7 @@ def test_a_last_digit_is_no_other_model(family: Certificate) -> None:
         require_match(msgspec.structs.replace(family, model=other), MODEL)
 
 
-def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:
+def test_a_row_without_effect_is_refused(family: Certificate) -> None:
     piece = family.pieces[0]
     loose = changed(family, 0, G=[*piece.G, [1.0, 1.0]], g=[*piece.g, 2.9])
     verdict = check(loose)
@@ -178,8 +174,8 @@ def test_a_row_that_bounds_nothing_is_refused(family: Certificate) -> None:
     assert "has no effect" in verdict.reason
 
 
-def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two opposite corners of a box, each of them twice: every edge is there twice, every row is touched.
+def test_a_repeated_vertex_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two opposite corners of a box, each listed twice: every edge occurs twice and every row is touched.
 
     The claim is false at the other two corners only.
     """
@@ -191,7 +187,7 @@ def test_a_vertex_listed_twice_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
     for forged in (np.vstack([corners, corners]), np.vstack([corners, corners[:, ::-1]])):
         monkeypatch.setattr(checker, "_bases", lambda *_a, forged=forged: forged)
         assert "listed twice" in check(false).reason
-    # The same rows under other names: counted from the end.
+    # The same rows by negative indices.
     monkeypatch.setattr(checker, "_bases", lambda *_a: np.vstack([corners, corners - 4]))
     assert "is not given by 2 of its 4 rows" in check(false).reason
     monkeypatch.setattr(checker, "_bases", lambda *_a: np.array([[0], [1], [2], [3]]))

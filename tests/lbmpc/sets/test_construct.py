@@ -1,4 +1,4 @@
-"""Where sets can be constructed, and what is said where they cannot."""
+"""Conditions for a construction of sets, and its error messages."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ MODEL = pendulum()
 START = np.array([0.62, 0.0])
 
 
-def test_there_is_no_set_where_there_is_none() -> None:
+def test_a_missing_trajectory_is_reported() -> None:
     with pytest.raises(EmptySetError, match=r"kept in X for \d+ steps"):
         construct(MODEL, "given", START, W=np.array([0.05, 1.0]))
     with pytest.raises(SetError, match="no trajectory of the true plant"):
         construct(MODEL, "regions", np.array([0.99, 1.9]))
 
 
-def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() -> None:
-    """With two inputs the rows between them did not bound it: "unbounded in variable 0: give it bounds"."""
+def test_a_state_that_decays_within_a_period_needs_no_bounds() -> None:
+    """With two inputs the elimination once failed with "unbounded in variable 0: give it bounds"."""
     fast = replace(
         two_inputs().equations,
         name="fast",
@@ -45,7 +45,7 @@ def test_a_state_that_is_forgotten_within_a_period_needs_no_bounds_of_its_own() 
     ],
 )
 @pytest.mark.parametrize("kind", ["box", "regions", "given"])
-def test_a_plant_without_bounds_is_told_which_it_needs(changes: dict, open_end: str, kind: Kind) -> None:
+def test_the_error_for_an_unbounded_plant_names_the_bounds(changes: dict, open_end: str, kind: Kind) -> None:
     plant = replace(PENDULUM, scale={"rate": 2.0, "torque": 3.0}, **changes)
     with pytest.raises(SetError, match=rf"not bounded: {open_end}\. .*Give the plant such bounds") as refused:
         construct(build_model(plant, 0.1), kind, np.zeros(2))

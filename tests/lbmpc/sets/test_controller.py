@@ -1,4 +1,4 @@
-"""What the controller does with certified sets: it stays inside, finds back, and needs no solution for that."""
+"""The controller with certified sets: it stays inside, returns from outside, and needs no solution for that."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ def test_from_every_state_of_the_sets_the_controller_keeps_the_plant_inside(
             assert guard.first_inputs(x).piece >= 0
 
 
-def test_outside_it_says_so_and_finds_back(family: Certificate) -> None:
+def test_outside_the_sets_it_reports_that_and_returns(family: Certificate) -> None:
     problem = build_problem(MODEL, oracle_named("linear", MODEL), 10, "invariant", certificate=family)
     controller = Controller(problem, Solver(problem))
     move = one_period(MODEL)
-    # Outside of every piece, and still to be saved.
+    # This state is outside every piece, but the plant can return from it.
     x = np.array([0.75, 0.0])
     state, pieces = controller.initial_state(0), []
     for number in range(40):
@@ -81,13 +81,13 @@ def test_outside_it_says_so_and_finds_back(family: Certificate) -> None:
     assert abs(x[0]) < 0.2
 
 
-def test_without_sets_there_is_no_invariant_tightening() -> None:
+def test_the_invariant_tightening_needs_sets() -> None:
     with pytest.raises(CertificateError, match="tandem sets compute"):
         build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant")
 
 
 @pytest.mark.parametrize("wish", [-50.0, 50.0])
-def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(wish: float) -> None:
+def test_the_first_input_stays_within_its_bounds_for_any_cost(wish: float) -> None:
     problem = build_problem(MODEL, oracle_named("linear", MODEL), 6)
     solver, first = Solver(problem), (np.array([-0.5]), np.array([0.2]))
     x, warm, nothing = np.array([0.01, 0.0]), np.zeros((6, 1)), np.zeros(0)
@@ -95,14 +95,14 @@ def test_whatever_the_cost_wants_the_first_input_stays_within_its_bounds(wish: f
     references = {"ur": np.full((6, 1), wish)}
     assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
     assert solver.solve(x, nothing, warm, **references, first=first).v[0, 0] == pytest.approx(bound, abs=1e-9)
-    # The bounds are for one solve only.
+    # The bounds apply to one solve only.
     assert abs(solver.solve(x, nothing, warm, **references).v[0, 0]) > 0.5
     solver.prepare(x, nothing, np.full((6, 1), 0.1))
     assert first[0][0] <= solver.feedback(np.array([-0.3 * np.sign(wish), 0.0]), first).v[0, 0] <= first[1][0]
 
 
 class Failing:
-    """A solver that finds its first solution and nothing after it."""
+    """A solver that finds its first solutions and none after them."""
 
     def __init__(self, real: Solver, good: int):
         self.real, self.good = real, good
@@ -114,8 +114,8 @@ class Failing:
 
 
 @pytest.mark.parametrize("good", [0, 1])
-def test_what_is_certified_holds_without_a_solution_too(family: Certificate, good: int) -> None:
-    # A feedback that drives the plant away.
+def test_the_certificate_holds_without_a_solution(family: Certificate, good: int) -> None:
+    # A feedback that destabilises the plant.
     model = replace(MODEL, K=-3.0 * MODEL.K)
     problem = build_problem(model, oracle_named("linear", model), 6, "invariant", certificate=family)
     rng, clipped = np.random.default_rng(8), 0
@@ -127,7 +127,7 @@ def test_what_is_certified_holds_without_a_solution_too(family: Certificate, goo
         if good:
             state, _ = controller.step(state, observation(start, 0))
         wanted = state.plan.u[0] if good else np.clip(model.K @ x, -3.0, 3.0)
-        # Far from where the plan was made for: it would lead anywhere.
+        # The plan was made for a distant state, so following it has no guarantee.
         _, result = controller.step(state, observation(x, 1))
         assert result.mode == ("shifted_plan" if good else "feedback")
         first = result.first

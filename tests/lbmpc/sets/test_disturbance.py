@@ -1,4 +1,4 @@
-"""Bounds of the disturbance are rigorous: nothing that h does is outside them, and they are not much too wide."""
+"""Bounds of the disturbance are rigorous and tight."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def whole(model: Model) -> Region:
 
 
 def draw(region: Region, n: int, seed: int) -> np.ndarray:
-    """Points of a region, (n, d + m): inside, on faces, in corners."""
+    """Return points of a region, (n, d + m): inside, on faces, in corners."""
     generator = np.random.default_rng(seed)
     edge = generator.random((n, region.lower.size))
     inside = generator.uniform(region.lower, region.upper, edge.shape)
@@ -42,7 +42,7 @@ def draw(region: Region, n: int, seed: int) -> np.ndarray:
 
 
 def disturbance(model: Model, p: np.ndarray) -> np.ndarray:
-    """h at points (n, d + m), (n, d), from the plant's own integrator."""
+    """Return h at points (n, d + m), (n, d), from the plant's own integrator."""
     truth, d = Truth(model.equations), model.d
     x, u = p[:, :d], p[:, d:]
     after = np.array(
@@ -55,9 +55,9 @@ def disturbance(model: Model, p: np.ndarray) -> np.ndarray:
 
 
 def excess(bound: DisturbanceBound, p: np.ndarray, h: np.ndarray) -> float:
-    """How far the samples stick out of the bound, in units of the samples' own range; not above zero when they are in.
+    """Return how far samples exceed the bound, in units of the samples' range; not above zero if they are inside.
 
-    Measured in random directions and along the axes; what the integrator may be off by is forgiven.
+    It is measured in random directions and along the axes, with an allowance for the error of the integrator.
     """
     d = h.shape[1]
     left = h - p[:, :d] @ bound.slope_x.T - p[:, d:] @ bound.slope_u.T
@@ -93,7 +93,7 @@ def test_box_holds_all_samples_and_is_tight(case):
     assert (np.maximum(np.abs(low), np.abs(high))[~live] < 1e-9).all()
     assert told == sorted(told)
     assert told[-1] == 1.0
-    # The same check refuses a bound that is too small by two parts in a hundred.
+    # The same check rejects a bound that is too small by two percent.
     small = DisturbanceBound(bound.region, bound.slope_x, bound.slope_u, 0.96 * bound.vertices)
     assert excess(small, p, h) > 0.0
 
@@ -160,7 +160,7 @@ def test_stopped_early_the_bound_is_wider_and_still_holds():
     assert (np.ptp(early.vertices, axis=0)[:2] > 1.05 * np.ptp(full.vertices, axis=0)[:2]).all()
 
 
-def test_given_box_is_what_was_given():
+def test_given_box_is_used_as_given():
     model = build_model(VAN_DER_POL, 0.1)
     bound = given_box(model, np.array([0.1, 0.2]), whole(model))
     np.testing.assert_allclose(bound.support(np.array([[1.0, 0.0], [1.0, -2.0]])), [0.1, 0.5], rtol=1e-15)
@@ -175,7 +175,7 @@ def test_given_box_refuses(half):
 
 
 @pytest.mark.long
-def test_a_region_where_the_equations_do_not_hold_is_named():
+def test_a_region_outside_the_domain_is_reported():
     model = build_model(MOORE_GREITZER, 0.05)
     region = whole(model)
     low = region.x_lower.copy()
@@ -184,14 +184,14 @@ def test_a_region_where_the_equations_do_not_hold_is_named():
         bound_box(model, Region(low, region.x_upper, region.u_lower, region.u_upper))
 
 
-def test_an_operation_without_series_is_named():
+def test_an_operation_without_series_is_reported():
     plant = a_plant(lambda x, u: [x[1], ca.fabs(x[0]) - x[0] - x[1] + u[0]], "kink", x_e=(0.5, 0.0))
     model = build_model(plant, 0.1)
     with pytest.raises(DisturbanceError, match=r"kink.*fabs"):
         bound_box(model, whole(model))
 
 
-def test_a_region_that_is_none_is_named():
+def test_an_invalid_region_is_reported():
     model = build_model(VAN_DER_POL, 0.1)
     r = whole(model)
     with pytest.raises(DisturbanceError, match=r"b in \[1, -1\]"):
@@ -218,7 +218,7 @@ def test_a_region_that_is_none_is_named():
         (lambda x, u: [x[1], u[0] - x[1] * ca.fabs(x[1])], r"`fabs`.*--kind given.*in rate"),
     ],
 )
-def test_what_has_no_bound_is_named_with_its_state_and_a_remedy(rhs: Rhs, says: str) -> None:
+def test_an_unbounded_operation_is_reported_with_state_and_remedy(rhs: Rhs, says: str) -> None:
     model = build_model(replace(PENDULUM, rhs=rhs, parameters={}, equations=None), 0.1)
     with pytest.raises(DisturbanceError, match=says):
         bound_box(model, Region(*(np.array(b) for b in ([-1.0, -2.0], [1.0, 2.0], [-3.0], [3.0]))))

@@ -21,7 +21,7 @@ def flow_of(rhs, d: int, m: int, period: float, steps: int = 1) -> Flow:
 
 
 def fly(flow: Flow, centre: np.ndarray, radii: np.ndarray) -> FlowEnclosure:
-    """The flow of the boxes centre +- radii, both (n, d + m)."""
+    """Return the flow of the boxes centre +- radii, both (n, d + m)."""
     low, high = centre - radii, centre + radii
     reach = up(np.maximum(high - centre, centre - low))
     box, c, d = Interval(low, high), Interval.of(centre), flow.d

@@ -1,4 +1,4 @@
-"""Sets of a given W, which need no equations: what they hold of, with a delay too, and where they are refused."""
+"""Sets of a given W, which need no equations: their claim, also with a delay, and refusals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.helpers.science import oracle_named
 PERIOD = 0.1
 MODEL = build_model(PENDULUM.known(), PERIOD)
 W = np.array([0.004, 0.05])
-"""h of one period at most."""
+"""Largest h of one period."""
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +35,14 @@ def sets() -> Certificate:
 def test_from_numbers_and_a_given_w_the_claim_holds(sets: Certificate) -> None:
     assert check(sets).ok
     assert sets.source_of_W == "given"
-    # Their W has room for the delay.
+    # Their W includes the effect of the delay.
     np.testing.assert_array_equal(np.max(sets.pieces[0].W, axis=0), over_any_delay(MODEL, W))
-    # What is not proved of the plant, it does not need.
+    # Equations do not change sets of a given W.
     equations = construct(build_model(PENDULUM, PERIOD), "given", np.zeros(2), W=W)
     assert equations == sets
 
 
-def test_w_has_room_for_what_every_delay_makes_of_h() -> None:
+def test_w_covers_the_effect_of_every_delay_on_h() -> None:
     wide = over_any_delay(MODEL, W)
     assert (wide >= W).all()
     corners = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * W
@@ -53,10 +53,8 @@ def test_w_has_room_for_what_every_delay_makes_of_h() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_with_a_delay_the_predicted_states_stay_inside_whatever_h_does(
-    sets: Certificate, share: float
-) -> None:
-    """h is at a corner of W in every period, and the oracle lies."""
+def test_with_a_delay_the_predicted_states_stay_inside_for_any_h(sets: Certificate, share: float) -> None:
+    """h is at a corner of W in every period, and the oracle is wrong."""
     oracle = oracle_named("dnn", MODEL)
     problem = build_problem(MODEL, oracle, 6, "invariant", certificate=sets)
     delay = share * PERIOD
@@ -78,7 +76,7 @@ def test_with_a_delay_the_predicted_states_stay_inside_whatever_h_does(
             before = u
 
 
-def test_what_numbers_cannot_do_is_refused() -> None:
+def test_kinds_that_need_equations_are_refused() -> None:
     for kind in ("box", "hull", "regions", "extension"):
         with pytest.raises(SetError, match=r"is given by numbers alone, .* use the kind `given`"):
             construct(MODEL, kind, np.zeros(2))
@@ -96,7 +94,7 @@ def test_sets_of_equations_need_them_in_the_controller() -> None:
 
 
 def without_motion() -> Model:
-    """A dead time of a period."""
+    """A model with a dead time of one period in its matrices."""
     box = {"x_min": [-1.0, -1.0], "x_max": [1.0, 1.0], "u_min": [-1.0], "u_max": [1.0]}
     known = Known.from_matrices(
         [[1.1, 0.2], [0.0, 0.0]], [[0.0], [1.0]], period=PERIOD, W=[0.01, 0.01], **box
@@ -104,7 +102,7 @@ def without_motion() -> Model:
     return build_model(known, PERIOD)
 
 
-def test_where_the_delay_cannot_be_predicted_over_there_are_no_sets(sets: Certificate) -> None:
+def test_without_a_prediction_over_the_delay_there_are_no_sets(sets: Certificate) -> None:
     model = without_motion()
     with pytest.raises(CertificateError, match="no motion between two samples"):
         construct(model, "given", np.zeros(2))

@@ -1,4 +1,4 @@
-"""Bounds on the first input: what they keep inside the sets, what they are outside, and what errors and delays do."""
+"""Bounds on the first input: inside and outside the sets, with errors and delays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def compressor() -> ClosedLoop:
 
 
 def room(certificate: Certificate, index: int, x: np.ndarray, u: np.ndarray) -> float:
-    """Distance of the next state to the nearest facet of the piece's target, for the worst w."""
+    """Return the distance of the next state to the nearest facet of the piece's target, for the worst w."""
     model, piece = certificate.model, certificate.pieces[index]
     target = certificate.pieces[piece.target]
     after = (np.array(model.A) + np.array(piece.slope_x)) @ x + (
@@ -42,13 +42,13 @@ def room(certificate: Certificate, index: int, x: np.ndarray, u: np.ndarray) -> 
 
 
 def states(certificate: Certificate, rng: np.random.Generator) -> np.ndarray:
-    """Some inside, and the vertices, where least can be kept."""
+    """Return some inner states and the vertices, which have the smallest distance."""
     bodies = [body(np.array(p.G), np.array(p.g), p.name, HALF) for p in certificate.pieces]
     inside = [np.vstack([points_in(b, 5, rng), b.vertices + 1e-9 * (b.centre - b.vertices)]) for b in bodies]
     return np.vstack(inside)
 
 
-def test_half_of_the_checkers_margin_is_kept_from_every_state(family: Certificate) -> None:
+def test_half_of_the_checked_margin_is_kept_from_every_state(family: Certificate) -> None:
     guard, margin = Guard(family), check(family).margin
     kept = []
     for x in states(family, np.random.default_rng(1)):
@@ -58,12 +58,12 @@ def test_half_of_the_checkers_margin_is_kept_from_every_state(family: Certificat
         assert first.upper is not None
         kept += [room(family, first.piece, x, u) for u in (first.lower, first.upper)]
     assert min(kept) >= 0.5 * margin - 1e-9
-    # Near the boundary there is no more than that to be had, so half of it is really what is kept there.
+    # Near the boundary the margin is the largest possible distance, so half of it is exactly kept there.
     assert min(kept) < 0.02
 
 
 @pytest.mark.parametrize("most", [0.0, 0.01, MOST])
-def test_the_distance_found_is_the_largest_that_some_input_keeps(family: Certificate, most: float) -> None:
+def test_the_largest_distance_is_found(family: Certificate, most: float) -> None:
     guard, rng = Guard(family), np.random.default_rng(2)
     for x in np.vstack([states(family, rng)[::7], rng.uniform(-HALF, HALF, (40, 2))]):
         index = int(np.argmax(guard.margins(x)))
@@ -76,7 +76,7 @@ def test_the_distance_found_is_the_largest_that_some_input_keeps(family: Certifi
         assert min(room(family, index, x, u), most) == pytest.approx(distance, abs=1e-8)
 
 
-def test_outside_the_input_of_least_violation_is_given_and_called_no_more(family: Certificate) -> None:
+def test_outside_the_result_is_the_input_of_least_violation(family: Certificate) -> None:
     guard, rng = Guard(family), np.random.default_rng(3)
     forced = 0
     for x in rng.uniform(-HALF, HALF, (200, 2)):
@@ -99,7 +99,7 @@ def test_outside_the_input_of_least_violation_is_given_and_called_no_more(family
     assert forced > 20
 
 
-def test_two_inputs_outside_lead_least_far_out() -> None:
+def test_two_inputs_outside_give_the_least_violation() -> None:
     certificate = construct(two_inputs(), "box", np.zeros(2))
     guard, rng = Guard(certificate), np.random.default_rng(4)
     piece = certificate.pieces[0]
@@ -118,7 +118,7 @@ def test_two_inputs_outside_lead_least_far_out() -> None:
 
 @pytest.mark.parametrize("inputs", ["random", "bang-bang"])
 @pytest.mark.parametrize("noise", [1e-7, 1e-6])
-def test_errors_of_measurement_lead_no_liar_out_of_the_sets(
+def test_a_wrong_oracle_stays_in_the_sets_with_measurement_errors(
     compressor: ClosedLoop, inputs: str, noise: float
 ) -> None:
     found = [compressor.run(Case(inputs, noise), seed, 40) for seed in range(4)]
@@ -127,7 +127,7 @@ def test_errors_of_measurement_lead_no_liar_out_of_the_sets(
 
 
 @pytest.mark.parametrize("delay", [0.002, 0.01, 0.025])
-def test_a_known_constant_delay_leads_no_liar_out_of_the_sets(compressor: ClosedLoop, delay: float) -> None:
+def test_a_wrong_oracle_stays_in_the_sets_with_a_constant_delay(compressor: ClosedLoop, delay: float) -> None:
     found = [compressor.run(Case("bang-bang", 1e-6, delay), seed, 40) for seed in range(3)]
     assert [one.outside for one in found] == [0] * 3
     assert min(one.margin for one in found) > 1e-5
@@ -137,15 +137,15 @@ def test_a_known_constant_delay_leads_no_liar_out_of_the_sets(compressor: Closed
         )
 
 
-def test_over_a_delay_an_oracle_that_lies_leads_nobody_out_of_the_sets(compressor: ClosedLoop) -> None:
-    liar = ClosedLoop(compressor.certificate, compressor.model, "lying")
+def test_the_prediction_over_the_delay_ignores_a_wrong_oracle(compressor: ClosedLoop) -> None:
+    wrong = ClosedLoop(compressor.certificate, compressor.model, "lying")
     case = Case("bang-bang", 0.0, 0.025)
-    # The very same run: what is certified does not depend on the oracle.
-    assert liar.run(case, 1, 40) == compressor.run(case, 1, 40)
+    # The runs are equal, because the certificate does not depend on the oracle.
+    assert wrong.run(case, 1, 40) == compressor.run(case, 1, 40)
 
 
-def test_the_bounds_do_not_leap_at_the_sets_boundary(family: Certificate) -> None:
-    """Just outside by rounding, and just inside: the bounds hardly differ."""
+def test_the_bounds_are_continuous_at_the_boundary(family: Certificate) -> None:
+    """The bounds hardly differ between states just inside and just outside."""
     guard = Guard(family)
     base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), "C", HALF)
     for vertex in base.vertices[::5]:
@@ -157,7 +157,7 @@ def test_the_bounds_do_not_leap_at_the_sets_boundary(family: Certificate) -> Non
         assert near.lower == pytest.approx(beyond.lower, abs=1e-3)
 
 
-def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
+def test_two_inputs_are_bounded_by_a_box_that_keeps_the_sets() -> None:
     model = two_inputs()
     certificate = construct(model, "box", np.zeros(2))
     assert check(certificate).ok
@@ -171,7 +171,7 @@ def test_two_inputs_are_kept_in_a_box_that_keeps_the_sets() -> None:
             assert base.contains(np.array(move(x, u)).ravel())
 
 
-def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(family: Certificate) -> None:
+def test_the_bounds_on_the_first_input_equal_those_of_the_claim(family: Certificate) -> None:
     guard, rng = Guard(family, share=0.0), np.random.default_rng(6)
     bodies = [body(np.array(p.G), np.array(p.g)) for p in family.pieces]
     tight = 0
@@ -181,7 +181,7 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
         for x in points_in(bodies[index], 20, rng):
             first = guard.first_inputs(x)
             if first.piece != index:
-                # The first piece that holds x decides.
+                # The first piece that contains x determines the bounds.
                 assert first.piece < index
                 assert bodies[first.piece].contains(x)
                 continue
@@ -195,7 +195,7 @@ def test_the_bounds_on_the_first_input_are_those_of_the_claim_and_no_tighter(fam
     assert tight > 10
 
 
-def test_a_distance_is_kept_where_it_can_be_had(family: Certificate) -> None:
+def test_a_distance_is_kept_if_possible(family: Certificate) -> None:
     plain, wary, rng = Guard(family, share=0.0), Guard(family), np.random.default_rng(9)
     base = body(np.array(family.pieces[0].G), np.array(family.pieces[0].g), scale=np.array([1.0, 2.0]))
     tighter = 0

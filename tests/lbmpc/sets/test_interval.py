@@ -1,4 +1,4 @@
-"""Intervals are rigorous: every value of an operation or a function lies in them."""
+"""Intervals are rigorous: they contain every value of an operation or a function."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.lbmpc.sets.enclosures import holds
 
 
 def numbers(generator: np.random.Generator, n: int) -> np.ndarray:
-    """Floats of every kind: both signs, zeros, ordinary, huge, tiny, subnormal, and neighbours of integers."""
+    """Return floats of every kind: both signs, zeros, ordinary, huge, tiny, subnormal, and neighbours of integers."""
     exponents = generator.choice([0, 1, 30, 300, -30, -300, -320], n)
     values = generator.standard_normal(n) * 10.0**exponents
     values[generator.random(n) < 0.1] = 0.0
@@ -65,7 +65,7 @@ def test_interval_operations_contain_the_exact_rationals(name):
             for y in (b.lower[i], b.upper[i]):
                 if np.isfinite([x, y]).all():
                     assert holds(result, i, exact[name](Fraction(float(x)), Fraction(float(y)))), (name, x, y)
-    # And they are tight: where no end overflows, a point is widened by a few units in the last place only.
+    # They are also tight: without overflow a point is widened by a few units in the last place only.
     if name in ("add", "mul", "div"):
         point = {
             "add": lambda: a.lower + b.lower,
@@ -96,7 +96,7 @@ def test_interval_functions_contain_values_to_forty_digits(name):
     assert (thin.upper - thin.lower <= 1e-14 * np.abs(thin.upper) + 1e-300).all()
 
 
-def test_interval_says_where_an_operation_is_not_defined():
+def test_interval_reports_where_an_operation_is_not_defined():
     with pytest.raises(DomainError, match="sqrt") as caught:
         Interval(np.array([1.0, -1.0]), np.array([2.0, 2.0])).sqrt()
     assert caught.value.where.tolist() == [False, True]

@@ -1,4 +1,4 @@
-"""The plant's own motion over a part of a period: right where the equations hold, None where they do not."""
+"""The plant's own motion over part of a period: accurate in the domain of the equations, None outside."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMPRESSOR = build_model(get_plant("moore_greitzer"), 0.05)
 
 
 @pytest.mark.parametrize("model", [COMPRESSOR, pendulum(), two_inputs()], ids=lambda one: one.plant.name)
-def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
+def test_the_prediction_equals_the_true_motion_over_half_a_period(model: Model) -> None:
     plant, rng = model.plant, np.random.default_rng(0)
     motion, truth = OfEquations(model, model.equations), Truth(model.equations)
     for _ in range(50):
@@ -27,10 +27,10 @@ def test_it_is_the_true_motion_over_half_a_period(model: Model) -> None:
         assert np.abs(error).max() < 1e-8
 
 
-def test_where_the_equations_do_not_hold_there_is_none() -> None:
+def test_outside_the_domain_there_is_no_prediction() -> None:
     plant, motion = COMPRESSOR.plant, OfEquations(COMPRESSOR, COMPRESSOR.equations)
     without_pressure = np.array([0.5, -0.1, 1.0, 0.0])
     assert motion.after(without_pressure - plant.x_e, np.zeros(1), 0.01) is None
     assert motion.after(np.array([1e6, 0.0, 0.0, 0.0]), np.zeros(1), 0.01) is None
-    # And it goes on as if nothing had been.
+    # The next call is not affected.
     assert motion.after(np.zeros(4), np.zeros(1), 0.01) == pytest.approx(np.zeros(4), abs=1e-6)

@@ -1,4 +1,4 @@
-"""One state: sets are intervals, which Qhull does not know."""
+"""Sets of one state are intervals, which Qhull does not support."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def one_state(rhs: Rhs) -> Model:
 
 
 @pytest.mark.parametrize("kind", ["box", "hull", "regions", "given"])
-def test_an_integrator_is_kept_in_all_of_its_interval(kind: str) -> None:
+def test_an_integrator_is_kept_in_its_whole_interval(kind: str) -> None:
     certificate = construct(one_state(lambda _x, u: [u[0]]), kind, np.array([0.5]))
     verdict = check(certificate)
     assert verdict.ok, verdict.reason
@@ -52,7 +52,7 @@ def test_an_integrator_is_kept_in_all_of_its_interval(kind: str) -> None:
     assert Guard(certificate).first_inputs(np.array([1.001])).upper == pytest.approx([-1.0], abs=1.0)
 
 
-def test_an_unstable_state_is_kept_in_a_smaller_interval_and_no_more_is_believed() -> None:
+def test_an_unstable_state_has_a_smaller_interval_and_a_larger_one_is_refused() -> None:
     certificate = construct(one_state(lambda x, u: [2.0 * ca.sin(x[0]) + u[0]]), "box", np.zeros(1))
     assert check(certificate).ok
     piece = certificate.pieces[0]

@@ -49,7 +49,7 @@ def test_the_tube_contains_every_disturbed_deviation_and_is_tight() -> None:
             assert (-F @ e <= low[i] + 1e-12).all()
             reached[i] = np.maximum(reached[i], F @ e)
             e = closed @ e + rng.choice([-1.0, 1.0], 4) * SMALL
-    # The worst disturbance for one row is known in closed form: it must be reached, not only bounded.
+    # The worst disturbance for one row is known in closed form, and the tube must attain it.
     for row in range(len(F)):
         worst = sum(np.abs(F[row] @ np.linalg.matrix_power(closed, k)) @ SMALL for k in range(30))
         assert high[30, row] == pytest.approx(worst)
@@ -61,7 +61,7 @@ def test_the_terminal_set_is_disturbance_invariant_and_inside() -> None:
     rows, bounds = omega.one_sided()
     found = 0
     for _ in range(300):
-        # Points of the boundary, along random directions from the origin.
+        # Boundary points along random directions from the origin.
         direction = rng.normal(size=4) * [0.3, 0.3, 0.5, 5.0]
         x = direction / (rows @ direction / bounds).max()
         assert omega.contains(x, 1e-9)
@@ -74,7 +74,7 @@ def test_the_terminal_set_is_disturbance_invariant_and_inside() -> None:
 
 
 def test_an_empty_tightening_names_step_constraint_and_margin() -> None:
-    # h over all of X x U: NOTES of the example say that no tube exists.
+    # h over all of X x U. The notes of the example say that no tube exists for it.
     full = np.array([0.0144, 0.0148, 1.1e-4, 1.1e-4])
     with pytest.raises(EmptySetError, match=r"step \d+: state [zy] .* crosses by 0\.\d+"):
         build_problem(MODEL, LinearOracle(4, 1), 60, "tube", full)
@@ -84,7 +84,7 @@ def test_an_empty_tightening_names_step_constraint_and_margin() -> None:
         build_problem(MODEL, LinearOracle(4, 1), 60, "first_step", np.array([0.0, 0.6, 0.0, 0.0]))
 
 
-def test_first_step_tightens_the_first_step_alone() -> None:
+def test_first_step_tightens_only_the_first_step() -> None:
     problem = build_problem(MODEL, LinearOracle(4, 1), 5, "first_step", SMALL)
     plain = state_set(MODEL)
     np.testing.assert_allclose(problem.states[0].lower, plain.lower + SMALL)
@@ -103,8 +103,8 @@ def test_the_tube_is_hard_and_shrinks() -> None:
     assert problem.inputs[-1].upper[0] < problem.inputs[0].upper[0] == input_set(MODEL).upper[0]
 
 
-def test_the_tube_keeps_its_promise_under_the_worst_disturbances() -> None:
-    """From a feasible state, for random corner disturbances: feasible for ever, hard constraints kept for ever."""
+def test_the_tube_is_recursively_feasible_under_the_worst_disturbances() -> None:
+    """From a feasible state, under random corner disturbances, the problem stays feasible and X is kept."""
     from lbmpc.solver.gauss_newton import Solver, Status
 
     rng = np.random.default_rng(5)

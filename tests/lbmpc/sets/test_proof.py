@@ -1,4 +1,4 @@
-"""The proof that h stays in W: what is proved is true, and a W that h leaves by little is refuted, with a place."""
+"""The proof that h stays in W: it is correct, and a W that h leaves slightly is refuted with the place."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def shrunk(piece: Piece, share: float) -> list[list[float]]:
     return (W.mean(axis=0) + share * (W - W.mean(axis=0))).tolist()
 
 
-def test_what_was_constructed_is_proved_hull_and_regions(family: Certificate) -> None:
+def test_constructed_hulls_and_regions_are_proved(family: Certificate) -> None:
     assert len(family.pieces) > 1
     shown: list[float] = []
     found = prove(MODEL, family, shown.append)
@@ -48,15 +48,15 @@ def test_what_was_constructed_is_proved_hull_and_regions(family: Certificate) ->
 
 
 @pytest.mark.parametrize("index", [0, -1])
-def test_a_w_that_h_leaves_by_a_few_percent_is_refuted_where_it_does(family: Certificate, index: int) -> None:
+def test_a_w_that_h_leaves_by_a_few_percent_is_refuted(family: Certificate, index: int) -> None:
     piece = family.pieces[index]
-    # What a piece by a slope says is 1 to 2 times as wide as it need be, and a hull within one hundredth.
+    # A piece with a slope has a W of 1 to 2 times the necessary size; a hull is accurate to one percent.
     found = prove(MODEL, changed(family, index, W=shrunk(piece, 0.97 if index == 0 else 0.4)))
     assert f"in piece {piece.name}, from x = " in found.reason
     assert "h is outside of W by" in found.reason
 
 
-def test_the_place_that_is_named_really_is_outside(family: Certificate) -> None:
+def test_the_reported_place_is_outside(family: Certificate) -> None:
     small = changed(family, 0, W=shrunk(family.pieces[0], 0.5))
     text = prove(MODEL, small).reason
     x, u = (
@@ -83,17 +83,17 @@ def test_a_larger_box_than_w_was_made_for_is_refuted(family: Certificate) -> Non
     assert "h is outside of W" in prove(MODEL, changed(family, last, **wide)).reason
 
 
-def test_a_budget_ends_what_cannot_be_decided(family: Certificate) -> None:
+def test_the_budget_limits_an_undecidable_proof(family: Certificate) -> None:
     assert "not decided after 3 boxes" in prove(MODEL, family, budget=3).reason
 
 
-def test_a_w_that_is_flat_askew_is_refused(family: Certificate) -> None:
+def test_a_w_that_is_flat_off_the_axes_is_refused(family: Certificate) -> None:
     flat = [[-0.1, -0.1], [0.1, 0.1], [0.0, 0.0]]
     assert "flat in a direction that is not a state's axis" in prove(MODEL, changed(family, 0, W=flat)).reason
 
 
-def test_a_w_of_no_width_in_a_state_is_proved_to_a_hair(family: Certificate) -> None:
-    """A point is as good as a segment of 2e-7: the proof says how far beyond W h may be."""
+def test_a_w_without_width_in_a_state_is_proved_to_a_tolerance(family: Certificate) -> None:
+    """A point counts as a segment of 2e-7, and the proof states how far h may be beyond W."""
     point = changed(family, 0, W=[[0.0, 0.0]])
     assert "h is outside of W" in prove(MODEL, point).reason
 
@@ -103,11 +103,11 @@ def test_two_inputs() -> None:
     assert prove(model, construct(model, "box", np.zeros(2))).reason == ""
 
 
-def test_where_the_plants_equations_do_not_hold_there_is_no_proof() -> None:
+def test_outside_the_domain_of_the_equations_there_is_no_proof() -> None:
     certificate = read_sets(SHIPPED / "moore_greitzer-20Hz-regions.json.gz").certificate
     model = build_model(get_plant("moore_greitzer"), 0.05)
     (low, high), last = certificate.model.X, certificate.pieces[-1]
-    # A claim about pressures below 0, where there is no flow to follow.
+    # The claim includes pressures below 0, at which the equations have no flow.
     wider = msgspec.structs.replace(certificate.model, X=([low[0], -3.0, *low[2:]], high))
     piece = msgspec.structs.replace(last, x_lower=[last.x_lower[0], -3.0, *last.x_lower[2:]], target=0)
     wrong = msgspec.structs.replace(certificate, model=wider, pieces=[piece])
@@ -119,8 +119,8 @@ def test_where_the_plants_equations_do_not_hold_there_is_no_proof() -> None:
     assert "h is outside of W" in reason or "leaves its domain of definition" in reason
 
 
-def test_what_is_said_of_a_box_holds_at_its_points(family: Certificate) -> None:
-    """Over h less a steep slope, so that every part of the bound counts."""
+def test_bounds_of_a_box_hold_at_its_points(family: Certificate) -> None:
+    """h minus a steep slope is used, so that every part of the bound matters."""
     rng, disturbance, move = np.random.default_rng(1), Disturbance(MODEL), one_period(MODEL)
     rows = _rows(np.array(family.pieces[0].W), HALF)
     assert rows is not None
@@ -136,15 +136,15 @@ def test_what_is_said_of_a_box_holds_at_its_points(family: Certificate) -> None:
         rest = after - p[:, :2] @ MODEL.A.T - p[:, 2:] @ MODEL.B.T - p @ slope.T
         left = rows.b - rest @ rows.F.T
         assert (left >= room[i] - 1e-9).all()
-        # By the mean-value theorem the steepest slope says how far two points can differ.
+        # By the mean-value theorem the steepest slope bounds the difference of two points.
         steepest = slopes[i].magnitude() @ r[i]
         assert (np.ptp(left, axis=0) <= 2 * steepest + 1e-9).all()
 
 
 @pytest.mark.parametrize("state", [0, 1])
 @pytest.mark.parametrize("end", [-1.0, 1.0])
-def test_each_end_of_w_counts(family: Certificate, state: int, end: float) -> None:
-    """h is largest at one end of X and least at the other; only one of them is cut off here."""
+def test_each_end_of_w_is_checked(family: Certificate, state: int, end: float) -> None:
+    """h is largest at one end of X and smallest at the other; one of them is cut off here."""
     W = np.array(family.pieces[0].W)
     W[:, state] = end * np.minimum(end * W[:, state], 0.97 * (end * W[:, state]).max())
     assert "h is outside of W" in prove(MODEL, changed(family, 0, W=W.tolist())).reason

@@ -1,4 +1,4 @@
-"""Invariant sets against closed forms and published answers; the operations that they are made of."""
+"""Invariant sets compared with closed forms and published results, and the operations behind them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_chebyshev_centre_of_a_triangle_is_its_incentre() -> None:
     assert triangle.radius == pytest.approx(1.0)
 
 
-def test_units_far_apart_do_no_harm() -> None:
+def test_very_different_units_are_handled() -> None:
     units = np.array([1e-5, 1.0, 1e4])
     rows = np.vstack([np.eye(3), -np.eye(3), np.ones((1, 3))]) / units
     one = body(rows * units, np.array([1, 1, 1, 1, 1, 1, 1.5]))
@@ -72,7 +72,7 @@ def test_units_far_apart_do_no_harm() -> None:
     assert len(other.reduced().g) == len(one.reduced().g) == 7
 
 
-def test_redundant_rows_go_and_the_set_stays() -> None:
+def test_redundant_rows_are_removed_without_changing_the_set() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     many = body(
@@ -81,7 +81,7 @@ def test_redundant_rows_go_and_the_set_stays() -> None:
     few = many.reduced()
     assert len(few.g) < 60
     for row, bound in zip(few.G, few.g, strict=True):
-        # Each row that is left cuts something off.
+        # Each remaining row cuts something off.
         others = ~(row == few.G).all(axis=1)
         reach = linprog(-row, few.G[others], few.g[others], bounds=(None, None), method="highs")
         assert reach.status == 3 or -reach.fun > bound
@@ -89,7 +89,7 @@ def test_redundant_rows_go_and_the_set_stays() -> None:
     assert (few.contains(points) == many.contains(points)).all()
 
 
-def test_eliminating_variables_is_projecting() -> None:
+def test_elimination_equals_projection() -> None:
     rng = np.random.default_rng(1)
     G, g = (
         np.vstack([rng.normal(size=(30, 4)), np.eye(4), -np.eye(4)]),
@@ -121,7 +121,7 @@ def test_eliminating_variables_is_projecting() -> None:
         ([[0.0], [1.0], [-1.0]], [-1.0, 1.0, 1.0], EmptySetError, "asks for 0 <= -1"),
     ],
 )
-def test_what_is_no_body_is_named(G: list, g: list, error: type[Exception], says: str) -> None:
+def test_sets_without_interior_are_reported(G: list, g: list, error: type[Exception], says: str) -> None:
     with pytest.raises(error, match=says):
         body(np.array(G), np.array(g))
 
@@ -163,7 +163,7 @@ def test_three_decoupled_states_and_inputs_are_a_product_of_intervals() -> None:
     assert found.volume == pytest.approx(8 * np.prod(expected), rel=5e-3)
 
 
-def test_a_slow_iteration_ends_all_the_same_with_a_smaller_certified_set() -> None:
+def test_a_slow_iteration_ends_with_a_smaller_certified_set() -> None:
     plant = UncertainSystem(np.array([[1.01]]), np.array([[1.0]]), Corners([0.001]), cube([0.005]))
     *_, last = predecessor_iteration(body_of(cube([1.0])), plant, 1e-6, patience=5)
     assert last.invariant
@@ -171,7 +171,7 @@ def test_a_slow_iteration_ends_all_the_same_with_a_smaller_certified_set() -> No
     assert 0.3 < last.set.vertices.max() <= 0.4
 
 
-def test_an_interrupted_iteration_goes_on_to_the_same_set() -> None:
+def test_an_interrupted_iteration_gives_the_same_set() -> None:
     plant = UncertainSystem(
         np.array([[1.0, 0.1], [0.0, 1.2]]), np.array([[0.0], [1.0]]), Corners([0.01, 0.01]), cube([0.2])
     )
@@ -183,7 +183,7 @@ def test_an_interrupted_iteration_goes_on_to_the_same_set() -> None:
     assert np.array_equal(again.set.g, stages[-1].set.g)
 
 
-def test_the_predecessor_is_what_it_says() -> None:
+def test_the_predecessor_matches_its_definition() -> None:
     rng = np.random.default_rng(3)
     A, B = rng.normal(size=(2, 2)), rng.normal(size=(2, 1))
     W, U, target = Corners([0.1, 0.2]), cube([0.7]), body_of(cube([1.0, 1.5]))

@@ -1,4 +1,4 @@
-"""The solver against IPOPT, against liars, and against itself."""
+"""The solver compared with IPOPT, with wrong oracles, and with itself."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMALL = np.array([0.003, 0.0005, 1e-5, 1.1e-4])
 
 @pytest.mark.parametrize("tightening", ["none", "first_step", "tube"])
 @pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
-def test_the_optimum_is_that_of_ipopt(name: str, tightening: str) -> None:
+def test_the_optimum_matches_ipopt(name: str, tightening: str) -> None:
     rng = np.random.default_rng(7)
     oracle = oracle_named(name, MODEL)
     problem = build_problem(MODEL, oracle, 20, tightening, SMALL)
@@ -62,7 +62,7 @@ def test_states_outside_every_hard_set_get_the_least_violation() -> None:
     assert solution.slack > 0.01
     assert "at step" in solution.slack_row
     assert input_set(MODEL).contains(solution.v[0])
-    # What IPOPT finds when it may pay for violations cannot be beaten by much.
+    # IPOPT's solution with soft constraints cannot be much better.
     soft = ReferenceSolver(dataclasses.replace(problem, soft=True)).solve(x, np.zeros(0), solution.c)
     np.testing.assert_allclose(solution.v[0], soft.v[0], atol=1e-5)
 
@@ -99,7 +99,7 @@ def _lying_theta(oracle: DnnOracle, lie: str, seed: int) -> np.ndarray:
         case "random":
             return rng.normal(size=theta.size) * 10.0 ** rng.integers(-2, 9)
         case "steep":
-            # Steep hidden layers under a large last layer: gradients of 1e6 that change sign within the horizon.
+            # Steep hidden layers with a large last layer: gradients of 1e6 that change sign within the horizon.
             return np.concatenate([rng.normal(size=theta.size - 36) * 300, rng.normal(size=36) * 1e3])
         case _:
             return theta * np.where(np.arange(theta.size) % 2, 1e6, -1e6)
@@ -107,7 +107,7 @@ def _lying_theta(oracle: DnnOracle, lie: str, seed: int) -> np.ndarray:
 
 @settings(max_examples=120, deadline=None)
 @given(lie=LIES, seed=st.integers(0, 10**6), start=st.integers(0, 3))
-def test_a_lying_oracle_never_breaks_a_hard_constraint(lie: str, seed: int, start: int) -> None:
+def test_a_wrong_oracle_never_violates_a_hard_constraint(lie: str, seed: int, start: int) -> None:
     solver, oracle = _HARD
     x = np.array([[0.1, 0.1, 0, 0], [-0.1, -0.12, 0, 0], [0.3, 0.2, 0.1, 0], [0, 0, 0, 0]], dtype=float)[
         start
@@ -133,13 +133,13 @@ _HARD = _hard_problem()
 
 
 @pytest.mark.parametrize("x", [np.full(4, np.nan), np.full(4, 1e200), np.array([np.inf, 0, 0, 0])])
-def test_an_unusable_state_is_a_status_and_never_an_exception(x: np.ndarray) -> None:
+def test_an_unusable_state_gives_a_status_and_no_exception(x: np.ndarray) -> None:
     solver, oracle = _HARD
     solution = solver.solve(x, _lying_theta(oracle, "random", 0), np.zeros((15, 1)))
     assert solution.status in (Status.NUMERICAL, Status.INFEASIBLE)
 
 
-def test_a_warm_start_of_garbage_changes_nothing() -> None:
+def test_a_garbage_warm_start_changes_nothing() -> None:
     oracle = oracle_named("dnn", MODEL)
     solver = Solver(build_problem(MODEL, oracle, 20, "first_step", SMALL), max_iterations=30, tolerance=1e-10)
     theta = trained_theta(oracle, np.random.default_rng(0), size=0.003)
@@ -148,7 +148,7 @@ def test_a_warm_start_of_garbage_changes_nothing() -> None:
         np.testing.assert_allclose(solver.solve(X0, theta, garbage).v, clean.v, atol=1e-8)
 
 
-def test_one_iteration_is_feasible_already() -> None:
+def test_one_iteration_is_feasible() -> None:
     oracle = DnnOracle(describe(MODEL, [8, 8]))
     solver = Solver(build_problem(MODEL, oracle, 15, "tube", SMALL), max_iterations=1)
     theta = trained_theta(oracle, np.random.default_rng(0))
@@ -187,7 +187,7 @@ print(hashlib.sha256(solution.v.tobytes() + solution.zbar.tobytes()).hexdigest()
 
 
 @pytest.mark.long
-def test_the_same_bytes_in_fresh_and_reused_processes() -> None:
+def test_fresh_and_reused_processes_give_the_same_bytes() -> None:
     answers = {
         subprocess.run(
             [sys.executable, "-c", SCRIPT.format(root=str(ROOT), solves=solves)],

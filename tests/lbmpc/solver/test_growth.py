@@ -1,4 +1,4 @@
-"""Plants that run away within the horizon, and models with a bias: what h_hat says must not tear the plan apart."""
+"""Unstable plants whose predictions grow much within the horizon, and models with a bias."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tests.helpers.science import compressor, describe
 PERIOD = 0.05
 FAST = build_model(unstable(6.0), PERIOD)
 N = 60
-"""A^N is 7e7."""
+"""The growth A^N is 7e7."""
 
 
 def network(rng: np.random.Generator, size: float) -> tuple[DnnOracle, np.ndarray]:
-    """An oracle on the fast plant with output weights of that size, and its parameters."""
+    """Return an oracle for the fast plant with output weights of this size, and its parameters."""
     oracle = DnnOracle(describe(FAST, [8]), initial_scale=size, column_bound=100.0)
     return oracle, oracle.theta(oracle.initial_state(rng))
 
@@ -46,10 +46,10 @@ def nominal() -> Solver:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6), x=st.floats(-0.8, 0.8))
-def test_what_h_hat_says_wrong_does_not_grow_over_the_horizon(
+def test_errors_of_h_hat_do_not_grow_over_the_horizon(
     solver: Solver, nominal: Solver, seed: int, x: float
 ) -> None:
-    """h_hat of a few thousandths of a half-width: the input moves by as little, though A^N is 7e7."""
+    """With h_hat of a few thousandths of a half-width, the input changes by as little, although A^N is 7e7."""
     _oracle, theta = network(np.random.default_rng(seed), 1e-3)
     ours = solver.solve(np.array([x]), theta, np.zeros((N, 1)))
     theirs = nominal.solve(np.array([x]), np.zeros(0), np.zeros((N, 1)))
@@ -62,13 +62,13 @@ def test_what_h_hat_says_wrong_does_not_grow_over_the_horizon(
 def test_a_plan_stays_near_its_trajectory_from_another_state(solver: Solver) -> None:
     _oracle, theta = network(np.random.default_rng(1), 1e-3)
     plan = solver.solve(np.array([0.3]), theta, np.zeros((N, 1)))
-    # One step is enough where the start is no further away than the state.
+    # One step is enough if the start is no farther away than the state.
     once = Solver(solver.problem, max_iterations=1).solve(np.array([0.31]), theta, plan.c)
     assert once.v == pytest.approx(solver.solve(np.array([0.31]), theta, plan.c).v, abs=1e-3)
 
 
 @pytest.mark.parametrize("plant", [unstable(6.0), inverted(0.3)], ids=lambda plant: plant.name)
-def test_no_oracle_is_worse_than_none(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_oracle_costs_more_than_no_oracle(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANTS, plant.name, plant)
 
     def cost(oracle: str) -> float:
@@ -84,7 +84,7 @@ def test_no_oracle_is_worse_than_none(plant: Plant, monkeypatch: pytest.MonkeyPa
         assert cost(oracle) < 1.02 * linear, oracle
 
 
-def test_a_horizon_without_digits_is_refused_with_the_largest_that_has_some(
+def test_a_horizon_without_accuracy_is_refused_with_the_largest_possible_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = build_model(unstable(10.0), PERIOD)
@@ -102,8 +102,8 @@ def test_a_horizon_without_digits_is_refused_with_the_largest_that_has_some(
 
 
 @pytest.mark.parametrize("oracle", [LinearOracle(1, 1), DnnOracle(describe(FAST, [8]))], ids=lambda o: o.name)
-def test_a_broken_row_is_not_called_converged(oracle: Oracle) -> None:
-    """From outside of X, where no input brings the next state inside."""
+def test_a_violated_row_is_not_reported_as_converged(oracle: Oracle) -> None:
+    """The start is outside X, where no input brings the next state inside."""
     solver = Solver(build_problem(FAST, oracle, 10))
     theta = oracle.theta(oracle.initial_state(np.random.default_rng(0)))
     x, c = np.array([1.5]), np.zeros((10, 1))

@@ -1,4 +1,4 @@
-"""Limits on how fast inputs change, and what a change costs: IPOPT is the judge."""
+"""Rate limits of inputs and the cost of changes, compared with IPOPT."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from tests.lbmpc.solver.test_other_plants import random_case
 
 COMPRESSOR = get_plant("moore_greitzer")
 EXACT = 1e-9
-"""Of the step that is allowed: what the sum of two numbers is rounded by."""
+"""Share of the allowed step by which the sum of two numbers is rounded."""
 
 
 def with_rates(model: Model, rates: np.ndarray, S: np.ndarray) -> Model:
-    """The same model with other rate limits, (m,), and weights of a stage's change, (m,)."""
+    """Return the same model with other rate limits, (m,), and weights of changes between stages, (m,)."""
     return dataclasses.replace(model, plant=dataclasses.replace(model.plant, u_rate_max=rates), S=np.diag(S))
 
 
@@ -33,7 +33,7 @@ def changes(v: np.ndarray, previous: np.ndarray) -> np.ndarray:
     return np.abs(np.diff(v, axis=0, prepend=previous[None]))
 
 
-def test_the_optimum_is_that_of_ipopt() -> None:
+def test_the_optimum_matches_ipopt() -> None:
     compared = active = 0
     for seed in range(40, 49):
         kind = ("limit", "weight", "both")[seed % 3]
@@ -42,7 +42,7 @@ def test_the_optimum_is_that_of_ipopt() -> None:
             continue
         model, oracle, theta, rng = case
         n, half = int(rng.integers(2, 5)), model.plant.u_scale
-        # Of several inputs one may step.
+        # One of several inputs has no rate limit.
         rates = np.where(np.arange(model.m) == 1, np.inf, rng.uniform(1.0, 5.0, model.m) * half)
         S = rng.uniform(0.0, 0.3, model.m) / half**2 if kind != "limit" else np.zeros(model.m)
         model = with_rates(model, rates if kind != "weight" else np.full(model.m, np.inf), S)
@@ -68,8 +68,8 @@ def test_the_optimum_is_that_of_ipopt() -> None:
     assert active >= 3
 
 
-def test_with_a_past_the_input_before_stands_behind_it() -> None:
-    """A network that looks back: what acts now is another thing than the mean input of its last pair."""
+def test_with_a_window_the_previous_input_follows_it_in_the_state() -> None:
+    """For a network with a window the present input differs from the mean input of its last pair."""
     model = with_rates(build_model(COMPRESSOR, 0.05), np.array([2.0]), np.array([0.5]))
     oracle = DnnOracle(describe(model, [6, 6], architecture="rnn", window=3))
     state = oracle.initial_state(np.random.default_rng(0))
@@ -84,8 +84,8 @@ def test_with_a_past_the_input_before_stands_behind_it() -> None:
 
 
 @pytest.mark.parametrize("S", [0.0, 0.3])
-def test_a_prepared_step_knows_what_acts_when_it_is_completed(S: float) -> None:
-    """The problem of the nominal model is quadratic: one step from anywhere is its solution."""
+def test_a_prepared_step_uses_the_input_at_its_completion(S: float) -> None:
+    """The problem of the nominal model is quadratic, so one step from any start gives its solution."""
     model = with_rates(build_model(COMPRESSOR, 0.05), np.array([3.0]), np.array([S]))
     problem = build_problem(model, LinearOracle(4, 1), 20, "first_step")
     solver = Solver(problem)
@@ -99,8 +99,8 @@ def test_a_prepared_step_knows_what_acts_when_it_is_completed(S: float) -> None:
         assert (changes(found.v, np.array(acts)) <= problem.input_steps * (1 + EXACT)).all()
 
 
-def test_a_weight_means_the_same_in_other_units_and_at_another_rate() -> None:
-    """In half-widths the plan is the same; and what a ramp costs does not depend on how often it is sampled."""
+def test_a_weight_is_independent_of_units_and_rate() -> None:
+    """The plan in half-widths is the same, and the cost of a ramp does not depend on the sampling rate."""
     factors = np.array([10.0, 0.1, 100.0, 7.0]), np.array([1000.0])
     other = rescaled(dataclasses.replace(COMPRESSOR, u_rate_max=[4.0]), *factors)
     other = dataclasses.replace(other, u_rate_max=4.0 * factors[1])
@@ -123,7 +123,7 @@ def test_a_weight_means_the_same_in_other_units_and_at_another_rate() -> None:
         assert stages * step * model.S[0, 0] * step == pytest.approx(0.5 * 3.0**2)
 
 
-def test_what_claims_x_for_ever_refuses_a_rate() -> None:
+def test_tightenings_with_a_guarantee_refuse_rate_limits() -> None:
     model = with_rates(build_model(COMPRESSOR, 0.05), np.array([3.0]), np.zeros(1))
     for tightening in ("tube", "invariant"):
         with pytest.raises(CertificateError, match="how fast u may change"):

@@ -1,4 +1,4 @@
-"""The QP of one Gauss-Newton step at the edges of its tolerances."""
+"""The QP of one Gauss-Newton step at the limits of its tolerances."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lbmpc.solver.least_distance import PRIMAL_TOLERANCE, Penalty, least_distanc
 
 @pytest.mark.parametrize("soft", [True, False])
 @pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
-def test_a_row_outside_by_less_than_the_tolerance_holds_nothing_back(soft: bool, scale: float) -> None:
+def test_a_violation_below_the_tolerance_has_no_effect(soft: bool, scale: float) -> None:
     penalty = Penalty(np.array([soft, soft]), np.array([scale, 1.0]), 1e4)
     bounds = penalty.scale
     values = np.array([scale * (1.0 + 0.5 * PRIMAL_TOLERANCE), 0.0])

@@ -1,4 +1,4 @@
-"""The solver beyond the compressor: any d, any m, any network, references, both modes; IPOPT is the judge."""
+"""The solver for other plants: any d, any m, any network, references, both modes; compared with IPOPT."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.helpers.science import compressor, oracle_named, trained_theta
 
 
 def random_plant(rng: np.random.Generator, d: int, m: int) -> Plant:
-    """A mildly nonlinear plant with equilibrium 0, boxes about it, and some unstable directions."""
+    """Return a slightly nonlinear plant with equilibrium 0, boxes about it, and some unstable directions."""
     a, b = rng.normal(size=(d, d)), rng.normal(size=(d, m))
     return Plant(
         name="random",
@@ -87,10 +87,10 @@ def test_dozens_of_random_problems_networks_and_warm_starts() -> None:
         if np.abs(ours.v[0] - theirs.v[0]).max() < 2e-6:
             same_minimum += 1
             continue
-        # Another minimum of a nonconvex problem? Then ours must be one too, as IPOPT finds when it stays near.
+        # If IPOPT found another local minimum, ours must be a minimum too, as a search near it shows.
         near = reference.solve(x, theta, ours.c, within=0.01)
         np.testing.assert_allclose(ours.v[0], near.v[0], atol=1e-5, err_msg=f"seed {seed}")
-    # What IPOPT cannot solve is passed over; that must be the exception.
+    # Problems that IPOPT cannot solve are skipped; they must be exceptions.
     assert total >= 40
     assert judged >= 0.9 * total
     assert constrained >= 15
@@ -99,7 +99,7 @@ def test_dozens_of_random_problems_networks_and_warm_starts() -> None:
 
 @pytest.mark.parametrize("seed", [1, 66])
 def test_gauss_newton_steps_that_overshoot_are_shortened(seed: int) -> None:
-    """Taken whole, and halved where the cost rises, they need 20 and 19 iterations."""
+    """Without shortening, with halving on an increase of the cost, they need 20 and 19 iterations."""
     case = random_case(seed)
     assert case is not None
     model, oracle, theta, rng = case
@@ -112,7 +112,7 @@ def test_gauss_newton_steps_that_overshoot_are_shortened(seed: int) -> None:
 
 
 def closed_loop(name: str, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(converged first input, real-time first input) along a closed loop that the converged one drives."""
+    """Return (converged first input, real-time first input) along a closed loop of the converged solver."""
     model = compressor()
     plant, truth = model.plant, Truth(model.equations)
     oracle = oracle_named(name, model)
@@ -138,7 +138,7 @@ def closed_loop(name: str, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
 @pytest.mark.parametrize("name", ["linear", "constant", "l2nw", "dnn"])
 def test_one_real_time_iteration_is_close_to_the_optimum(name: str) -> None:
     differences = [abs(float(a[0] - b[0])) for a, b in closed_loop(name, 40)]
-    # For a linear model one step is exact; else the error is of second order in what the sample had not predicted.
+    # One step is exact for a linear model; otherwise the error is of second order in the innovation of the sample.
     limit = 1e-9 if name == "linear" else 2e-3
     assert max(differences) < limit
     assert np.median(differences) < limit / 20
@@ -165,7 +165,7 @@ def test_the_feedback_keeps_the_constraints_of_the_measured_state() -> None:
         assert solver.problem.inputs[0].contains(solution.v[0])
 
 
-def test_a_liar_is_set_aside_in_preparation_too() -> None:
+def test_a_wrong_oracle_is_replaced_in_the_preparation() -> None:
     model = compressor()
     oracle = oracle_named("dnn", model)
     solver = Solver(build_problem(model, oracle, 15))
@@ -179,7 +179,7 @@ def test_a_liar_is_set_aside_in_preparation_too() -> None:
     np.testing.assert_allclose(solution.v, nominal.v, atol=1e-8)
 
 
-def test_feedback_without_preparation_is_an_error_that_says_so() -> None:
+def test_feedback_without_preparation_is_an_error() -> None:
     model = compressor()
     solver = Solver(build_problem(model, oracle_named("linear", model), 5))
     with pytest.raises(RuntimeError, match="call prepare first"):
@@ -187,7 +187,7 @@ def test_feedback_without_preparation_is_an_error_that_says_so() -> None:
 
 
 def test_a_moving_reference_over_the_horizon() -> None:
-    """Time-varying (x^r, u^r): a trajectory of the nominal model is followed without error."""
+    """A trajectory of the nominal model as time-varying (x^r, u^r) is followed without error."""
     model = compressor()
     solver = Solver(build_problem(model, oracle_named("linear", model), 20, "none"))
     ur = 0.05 * np.sin(np.arange(20) / 3)[:, None]

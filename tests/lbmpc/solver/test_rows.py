@@ -1,4 +1,4 @@
-"""Rows beside the boxes: inputs in all of U, states that give way in order; IPOPT is the judge."""
+"""Rows besides the boxes: inputs in U, and states that are relaxed in order; compared with IPOPT."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def with_rows(model: Model, rows: dict[str, Any], **others: Any) -> Model:
 
 
 def solved(model: Model, x: np.ndarray, n: int = 12) -> np.ndarray:
-    """The nominal states of the optimum, (n, d)."""
+    """Return the nominal states of the optimum, (n, d)."""
     problem = build_problem(model, LinearOracle(model.d, model.m), n, "none")
     return Solver(problem).solve(x, NOTHING, np.zeros((n, model.m))).zbar
 
 
-def test_the_optimum_is_that_of_ipopt() -> None:
+def test_the_optimum_matches_ipopt() -> None:
     compared = of_states = of_inputs = 0
     for seed in range(60, 68):
         case = random_case(seed)
@@ -91,14 +91,14 @@ def test_the_optimum_is_that_of_ipopt() -> None:
     assert of_inputs >= 2
 
 
-def test_a_less_important_row_costs_more_important_ones_nothing() -> None:
-    """Rows of three priorities at random: each is violated at most as if there were none of less importance."""
+def test_less_important_rows_do_not_affect_important_ones() -> None:
+    """With random rows of three priorities, the violation of each equals that without less important rows."""
     rng, contradicted, kept = np.random.default_rng(0), 0, 0
     for _ in range(60):
         y, M = rng.normal(size=9), rng.normal(size=(9, 3)) * 10.0 ** rng.uniform(-1.0, 1.0, (9, 1))
         levels, upper = np.repeat([-1, 0, 1, 2], [1, 2, 3, 3]), rng.uniform(-0.3, 0.3, 9)
         lower, upper = np.where(rng.random(9) < 0.3, upper - 0.5, -np.inf), upper
-        # What is hard can be kept.
+        # The hard rows are feasible.
         lower[0], upper[0] = y[0] - 0.1, y[0] + 0.2
         penalty = Penalty(levels >= 0, np.abs(M).sum(axis=1), 1e3)
 
@@ -128,10 +128,10 @@ def test_a_less_important_row_costs_more_important_ones_nothing() -> None:
 
 
 @pytest.mark.parametrize("important", ["near", "far"])
-def test_who_gives_way_is_a_matter_of_priority_alone(important: str) -> None:
-    """p at most 0 and p at least 0.5, for ever: each is kept to the tolerance where it comes first."""
+def test_only_the_priority_decides_which_row_is_violated(important: str) -> None:
+    """p at most 0 conflicts with p at least 0.5; the more important row is satisfied to the tolerance."""
     plain = {"near": {"p": 1.0, "max": 0.1}, "far": {"p": 1.0, "min": -0.05, "max": 0.9}}
-    # About another rest the two contradict each other.
+    # About another rest the two rows conflict.
     far = {"p": -1.0, "v": -0.2, "max": 0.05}
     rows = {"near": {**plain["near"], "v": 1.0}, "far": far}
     for name, row in rows.items():
@@ -149,14 +149,14 @@ def test_who_gives_way_is_a_matter_of_priority_alone(important: str) -> None:
     assert outside[:, 1 - first].sum() > 1e-2
     assert found.status is Status.INFEASIBLE
     assert found.slack_row.split()[0] in rows
-    # A step that was prepared does the same; the problem is quadratic.
+    # A prepared step gives the same result, because the problem is quadratic.
     solver.prepare(x + 0.01, NOTHING, found.c)
     again = solver.feedback(x)
     np.testing.assert_allclose(again.v, found.v, atol=1e-6)
 
 
 @pytest.mark.parametrize("rates", [None, [1.0, 4.0]])
-def test_inputs_stay_in_all_of_U(rates: list[float] | None) -> None:
+def test_inputs_stay_in_U(rates: list[float] | None) -> None:
     model = with_rows(build_model(CART, 0.2), SHARED, u_rate_max=None if rates is None else np.array(rates))
     plant = model.plant
     steps = plant.input_rates * model.period
@@ -178,8 +178,8 @@ def test_inputs_stay_in_all_of_U(rates: list[float] | None) -> None:
     assert touched >= 5
 
 
-def test_an_input_on_its_way_does_not_stop_at_a_row() -> None:
-    """From one end of a shared supply to the other: input by input the first step would leave U, and none be taken."""
+def test_an_input_does_not_get_stuck_at_a_row() -> None:
+    """The inputs move from one end of a shared supply to the other. Clipped one by one, they would not move at all."""
     model = with_rows(build_model(CART, 0.2), SHARED, u_rate_max=np.array([0.5, 5.0]))
     start, end = np.array([0.8, 0.0]), np.array([-0.2, 1.0])
     there = all_reachable(model, np.tile(end, (12, 1)), start)
@@ -188,8 +188,8 @@ def test_an_input_on_its_way_does_not_stop_at_a_row() -> None:
     assert not np.allclose(there[8], end, atol=1e-3)
 
 
-def test_a_violated_row_that_no_input_moves_is_in_the_slack_alone() -> None:
-    """In discrete time an input moves the speed first: where the place is one step later is settled."""
+def test_a_violated_row_without_inputs_only_adds_slack() -> None:
+    """In discrete time an input first changes the velocity, so the position of the next step is fixed."""
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     cart = Known.from_matrices([[1, 0.1], [0, 1]], [[0.0], [0.1]], period=0.1, W=[0, 0], **limits)
     for rows in ({}, {"left": {"x1": 1.0, "max": 0.5, "priority": 2}}):
@@ -208,13 +208,13 @@ def test_targets_are_inside_the_rows() -> None:
     assert found.xu[0] == pytest.approx(0.7, abs=1e-5)
 
 
-def test_what_knows_boxes_alone_refuses_rows_by_name() -> None:
+def test_options_that_need_boxes_refuse_rows_by_name() -> None:
     model = with_rows(build_model(CART, 0.2), SHARED)
     with pytest.raises(CertificateError, match="supply"):
         build_problem(model, LinearOracle(2, 2), 5, "tube")
     with pytest.raises(CertificateError, match="supply"):
         require_certifiable(model)
-    # Rows of states the tube takes.
+    # The tube supports rows of states.
     model = with_rows(build_model(CART, 0.2), {"left": {"p": 1.0, "v": 0.1, "max": 0.7}})
     assert "left" in build_problem(model, LinearOracle(2, 2), 5, "tube").states[0].names
 

@@ -1,4 +1,4 @@
-"""Messages of a fast loop travel together, and those who log and show them cannot tell."""
+"""Batches of a fast loop's messages, which log and views receive as single messages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def hear(heard: list[Delivery], new: list[Delivery]) -> list[Delivery]:
 
 
 class Sent:
-    """A queue whose messages are sent at once, to here."""
+    """A queue whose messages are sent to this object at once."""
 
     def __init__(self) -> None:
         self.batches: list[bytes] = []
@@ -65,7 +65,7 @@ def batched(count: int) -> tuple[bytes, list[bytes]]:
     return batch, payloads
 
 
-def test_a_batch_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
+def test_a_batch_is_unpacked_byte_for_byte_in_order_with_original_times() -> None:
     batch, payloads = batched(30)
     mailbox = UnbatchingMailbox("everything", 10, RejectedMessages())
     mailbox.put(Delivery("tandem/jet1/plant/state", b"alone", 5))
@@ -82,7 +82,7 @@ def test_a_batch_comes_out_byte_for_byte_in_order_with_its_own_times() -> None:
     assert rest[-1].received_ns <= 10**9
 
 
-def test_messages_wait_twenty_milliseconds_and_no_longer() -> None:
+def test_messages_wait_at_most_twenty_milliseconds() -> None:
     sent, due = Sent(), []
     for k in range(21):
         sent.queue.put_batched(topics.TIMING, b"x", 1_000_000 * k)
@@ -91,13 +91,13 @@ def test_messages_wait_twenty_milliseconds_and_no_longer() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", codec.encode(timing(0))])
-def test_a_batch_that_cannot_be_read_is_counted_and_handed_on(payload: bytes) -> None:
+def test_an_unreadable_batch_is_counted_and_delivered(payload: bytes) -> None:
     bad = RejectedMessages()
     mailbox = UnbatchingMailbox("everything", 10, bad)
     delivery = Delivery(KEY, payload, 1)
     mailbox.put(delivery)
     assert mailbox.drain() == [delivery]
-    assert bad.counters() == {"bad controller/batch: malformed": 1}
+    assert bad.counters() == {"bad_controller_batch_malformed": 1}
 
 
 @pytest.mark.parametrize(("rate", "together"), [(20.0, False), (100.0, False), (101.0, True), (1000.0, True)])
@@ -116,7 +116,7 @@ def config() -> Iterator[Config]:
 
 
 @pytest.mark.live
-def test_control_goes_straight_to_who_needs_it_and_once_to_who_logs_it(config: Config) -> None:
+def test_control_messages_are_delivered_directly_and_logged_once(config: Config) -> None:
     with (
         Bus(config, "plant", "plant-a") as plant,
         Bus(config, "controller", "controller-a") as controller,
@@ -125,11 +125,11 @@ def test_control_goes_straight_to_who_needs_it_and_once_to_who_logs_it(config: C
         states, everything = controller.queue(topics.PLANT_STATE), recorder.everything()
         wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(plant, topics.BATCH["plant"]))
         payloads = [codec.encode(state(seq)) for seq in range(50)]
-        # One by one, as a loop sends them: the control lane drops what a full link cannot take at once.
+        # Send one by one, as a loop does, because the control lane drops messages when the link is full.
         for seq in range(50):
             plant.publish(topics.PLANT_STATE, state(seq))
-            wait_for(lambda: len(states) == seq + 1)  # noqa: B023 - called before the loop goes on
-        # Long before the batch is due, and under the key that it has at any rate.
+            wait_for(lambda: len(states) == seq + 1)  # noqa: B023 - called within this iteration
+        # They arrive long before the batch is due, under the same key as at any rate.
         assert [one.payload for one in states.drain()] == payloads
         assert plant.flush(HANG_S)
         heard: list[Delivery] = []
@@ -139,17 +139,17 @@ def test_control_goes_straight_to_who_needs_it_and_once_to_who_logs_it(config: C
 
 
 @pytest.mark.live
-def test_a_plant_that_speaks_under_the_plain_key_is_heard_at_any_rate(config: Config) -> None:
+def test_a_plant_that_publishes_under_the_plain_key_is_received_at_any_rate(config: Config) -> None:
     slow = override(config, ["rate=20"])
-    with Bus(slow, "plant", "plant-a") as stranger, Bus(config, "controller", "controller-a") as controller:
+    with Bus(slow, "plant", "plant-a") as foreign, Bus(config, "controller", "controller-a") as controller:
         states = controller.queue(topics.PLANT_STATE)
-        wait_for(lambda: matched(stranger, topics.PLANT_STATE))
-        stranger.publish(topics.PLANT_STATE, state(7))
+        wait_for(lambda: matched(foreign, topics.PLANT_STATE))
+        foreign.publish(topics.PLANT_STATE, state(7))
         wait_for(lambda: len(states) == 1)
 
 
 @pytest.mark.live
-def test_what_was_published_before_goes_out_before(config: Config) -> None:
+def test_the_order_of_publication_is_kept(config: Config) -> None:
     with Bus(config, "controller", "controller-a") as bus, Bus(config, "recorder", "recorder-a") as recorder:
         everything = recorder.everything()
         wait_for(lambda: matched(bus, BATCH) and matched(bus, topics.KEYFRAME))

@@ -1,4 +1,4 @@
-"""The bus over a real router: newest values, bounded queues, nobody stalls anybody, a router may come and go."""
+"""The bus over a real router: newest values, bounded queues, no blocking, and restarts of the router."""
 
 from __future__ import annotations
 
@@ -67,20 +67,20 @@ def seq_of(delivery: Delivery | None) -> int:
 # -- receiving -------------------------------------------------------------------------------------------
 
 
-def test_of_a_queue_of_one_the_newest_is_read_and_only_once(plant: Bus, controller: Bus) -> None:
+def test_a_queue_of_one_gives_the_newest_message_once(plant: Bus, controller: Bus) -> None:
     latest = controller.queue(topics.PLANT_STATE, capacity=1)
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
     assert latest.get() is None
     for seq in range(10):
         plant.publish(topics.PLANT_STATE, state(seq))
-        # One by one: the control lane drops what a full link cannot take at once.
-        wait_for(lambda: len(latest) + latest.overflow == seq + 1)  # noqa: B023 - called before the loop goes on
+        # Send one by one, because the control lane drops messages when the link is full.
+        wait_for(lambda: len(latest) + latest.overflow == seq + 1)  # noqa: B023 - called within this iteration
     assert seq_of(latest.get()) == 9
     assert latest.get() is None
     assert latest.overflow == 9
 
 
-def test_waiting_ends_with_the_arrival_or_in_time(plant: Bus, controller: Bus) -> None:
+def test_waiting_ends_with_a_message_or_the_timeout(plant: Bus, controller: Bus) -> None:
     latest = controller.queue(topics.PLANT_STATE, capacity=1)
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
     assert latest.get(0.02) is None
@@ -95,14 +95,14 @@ def test_a_queue_keeps_order_and_its_bound(plant: Bus, controller: Bus) -> None:
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
     for seq in range(20):
         plant.publish(topics.PLANT_STATE, state(seq))
-        wait_for(lambda: len(mailbox) + mailbox.overflow == seq + 1)  # noqa: B023 - called before the loop goes on
+        wait_for(lambda: len(mailbox) + mailbox.overflow == seq + 1)  # noqa: B023 - called within this iteration
     deliveries = [mailbox.get(0.0) for _ in range(6)]
     assert [seq_of(d) for d in deliveries if d] == [15, 16, 17, 18, 19]
     assert deliveries[5] is None
-    assert controller.counters()["overflow plant/state"] == 15
+    assert controller.counters()["overflow_plant_state"] == 15
 
 
-def test_a_mailbox_is_bounded_in_bytes_too() -> None:
+def test_a_mailbox_is_bounded_in_bytes() -> None:
     mailbox = Mailbox("test", capacity=1000, max_bytes=1000)
     for k in range(50):
         mailbox.put(Delivery(str(k), bytes(100), 0))
@@ -110,7 +110,7 @@ def test_a_mailbox_is_bounded_in_bytes_too() -> None:
     assert mailbox.overflow == 40
 
 
-def test_everything_is_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus) -> None:
+def test_everything_delivers_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus) -> None:
     mailbox = controller.everything()
     health = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={"n": 1}, note="")
     wait_for(lambda: matched(plant, topics.PLANT_STATE) and matched(plant, topics.HEALTH["plant"]))
@@ -125,7 +125,7 @@ def test_everything_is_the_exact_bytes_of_both_lanes(plant: Bus, controller: Bus
     assert msgpack.unpackb(heard["plant/state"])["x"] == [1.0, 2.0]
 
 
-def test_a_slow_reader_stalls_nobody(plant: Bus, controller: Bus) -> None:
+def test_a_slow_reader_blocks_no_other(plant: Bus, controller: Bus) -> None:
     unread = controller.queue(topics.HEALTH["plant"], capacity=3)
     latest = controller.queue(topics.PLANT_STATE, capacity=1)
     health = m.Health(
@@ -141,20 +141,22 @@ def test_a_slow_reader_stalls_nobody(plant: Bus, controller: Bus) -> None:
     assert unread.overflow == 297
 
 
-def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, controller: Bus) -> None:
+def test_oversized_messages_are_neither_sent_nor_accepted(
+    config: Config, plant: Bus, controller: Bus
+) -> None:
     mailbox = controller.everything()
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
-    stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+    foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
     key = topics.PLANT_STATE.key(config.name)
-    publisher = stranger.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    publisher = foreign.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
     wait_for(lambda: publisher.matching_status.matching)
     publisher.put(bytes(topics.PLANT_STATE.max_bytes + 1))
-    wait_for(lambda: controller.counters().get("bad plant/state: oversized", 0) == 1)
-    stranger.close()
+    wait_for(lambda: controller.counters().get("bad_plant_state_oversized", 0) == 1)
+    foreign.close()
     note = "x" * topics.HEALTH["plant"].max_bytes
     large = m.Health(run_id="plant-a", seq=0, process="plant", status="ready", counters={}, note=note)
     plant.publish(topics.HEALTH["plant"], large)
-    assert plant.counters()["not sent, oversized plant/health"] == 1
+    assert plant.counters()["not_sent_oversized_plant_health"] == 1
     plant.publish(topics.PLANT_STATE, state(0))
     wait_for(lambda: len(mailbox) > 0)
     assert [delivery.key for delivery in mailbox.drain()] == [key]
@@ -163,7 +165,7 @@ def test_what_is_too_large_is_neither_sent_nor_kept(config: Config, plant: Bus, 
 # -- sending ---------------------------------------------------------------------------------------------
 
 
-def test_what_is_pending_is_sent_before_closing(config: Config, controller: Bus) -> None:
+def test_pending_messages_are_sent_before_closing(config: Config, controller: Bus) -> None:
     mailbox = controller.queue(topics.HEALTH["plant"])
     with Bus(config, "plant", "plant-b") as bus:
         wait_for(lambda: matched(bus, topics.HEALTH["plant"]))
@@ -176,7 +178,7 @@ def test_what_is_pending_is_sent_before_closing(config: Config, controller: Bus)
     wait_for(lambda: len(mailbox) == 200)
 
 
-def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
+def test_a_blocked_link_does_not_block_the_loop() -> None:
     config = live_config("bus.lease_ms=60000")
     with (
         Process("node_runtime.router", config) as frozen,
@@ -202,19 +204,19 @@ def test_a_bus_that_does_not_move_blocks_no_loop() -> None:
             bus.publish(topics.COMMAND, command)
             bus.publish(topics.KEYFRAME, keyframe(seq, 8_000_000))
             longest = max(longest, clock.now() - before)
-        # A link that is full lets a message wait for 5 s, and would let 60 do so.
+        # A full link delays a message by up to 5 s, and would delay 60 messages by that much each.
         assert longest < BLOCKED_S / 2
-        assert bus.counters()["bulk overflow"] > 20
+        assert bus.counters()["bulk_overflow"] > 20
         before = clock.now()
         reader.close(drain_s=0.2)
         bus.close(drain_s=0.2)
         assert clock.now() - before < HANG_S
 
 
-# -- questions and answers -------------------------------------------------------------------------------
+# -- queries ---------------------------------------------------------------------------------------------
 
 
-def test_questions_are_answered_in_several_parts(plant: Bus, controller: Bus) -> None:
+def test_a_query_is_answered_in_several_parts(plant: Bus, controller: Bus) -> None:
     asked: list[dict[str, str]] = []
 
     def handler(parameters: dict[str, str]) -> list[bytes]:
@@ -228,11 +230,11 @@ def test_questions_are_answered_in_several_parts(plant: Bus, controller: Bus) ->
     assert asked[-1] == {"since": "7", "run": "controller-a"}
 
 
-def test_nobody_answers_is_no_error(plant: Bus) -> None:
+def test_a_query_without_an_answer_is_not_an_error(plant: Bus) -> None:
     assert plant.ask(topics.OUTBOX_QUERY, {}, 0.2) == []
 
 
-def test_a_wrong_question_is_counted_on_both_sides(plant: Bus, controller: Bus) -> None:
+def test_a_wrong_query_is_counted_on_both_sides(plant: Bus, controller: Bus) -> None:
     def handler(parameters: dict[str, str]) -> list[bytes]:
         if parameters.get("since") == "seven":
             raise ValueError("since = 'seven' is not a whole number")
@@ -241,13 +243,13 @@ def test_a_wrong_question_is_counted_on_both_sides(plant: Bus, controller: Bus) 
     controller.serve(topics.OUTBOX_QUERY, handler)
     wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"])
     assert plant.ask(topics.OUTBOX_QUERY, {"since": "seven"}, HANG_S) == []
-    assert controller.counters()["bad controller/outbox: bad query"] == 1
-    assert plant.counters()["bad controller/outbox: answered with an error"] == 1
+    assert controller.counters()["bad_controller_outbox_bad_query"] == 1
+    assert plant.counters()["bad_controller_outbox_answered_with_an_error"] == 1
     assert plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"]
 
 
-def test_an_oversized_question_is_dropped_unread(plant: Bus, controller: Bus) -> None:
-    """A router's limits of size are for payloads; the parameters of a question may be of any size."""
+def test_an_oversized_query_is_dropped_unread(plant: Bus, controller: Bus) -> None:
+    """A router's size limits apply to payloads; the parameters of a query may have any size."""
     asked: list[dict[str, str]] = []
 
     def handler(parameters: dict[str, str]) -> list[bytes]:
@@ -258,12 +260,12 @@ def test_an_oversized_question_is_dropped_unread(plant: Bus, controller: Bus) ->
     wait_for(lambda: plant.ask(topics.OUTBOX_QUERY, {"since": "1"}, HANG_S) == [b"fine"])
     asked.clear()
     assert plant.ask(topics.OUTBOX_QUERY, {"since": "1" * 100_000}, HANG_S) == []
-    assert controller.counters()["bad controller/outbox: oversized question"] == 1
+    assert controller.counters()["bad_controller_outbox_oversized_question"] == 1
     assert plant.ask(topics.OUTBOX_QUERY, {"since": "2"}, HANG_S) == [b"fine"]
     assert asked == [{"since": "2"}]
 
 
-def test_a_slow_answer_is_not_waited_for_and_stalls_nobody(plant: Bus, controller: Bus) -> None:
+def test_a_slow_answer_is_not_waited_for_and_blocks_no_other(plant: Bus, controller: Bus) -> None:
     release = threading.Event()
     controller.serve("controller/slow", lambda _: [b"late"] if release.wait(HANG_S) else [])
     latest = controller.queue(topics.PLANT_STATE, capacity=1)
@@ -324,14 +326,14 @@ def test_opening_can_be_stopped() -> None:
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "tcp/127.0.0.1", "carrier/127.0.0.1:1", "tcp/::1:1"])
-def test_an_endpoint_that_is_none_is_an_error_for_a_person(endpoint: str) -> None:
+def test_an_invalid_endpoint_gives_a_readable_error(endpoint: str) -> None:
     config = override(Config(), [f'bus.endpoint="{endpoint}"'])
     with pytest.raises(ConfigError, match=r"bus\.endpoint"):
         Bus(config, "plant", "plant-a").open()
     assert router.main(config) == 2
 
 
-def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_port_in_use_gives_a_readable_error(config: Config, caplog: pytest.LogCaptureFixture) -> None:
     assert router.main(config) == 1
     assert "is in use: another router may be running" in caplog.text
     assert config.bus.endpoint in caplog.text
@@ -345,7 +347,7 @@ def test_a_taken_port_is_an_error_for_a_person(config: Config, caplog: pytest.Lo
         ("tcp/127.0.0.1:99999", "tcp/127.0.0.1:99999: a port is a number from 1 to 65535"),
     ],
 )
-def test_where_no_router_can_listen_the_plain_cause_is_said(
+def test_a_router_that_cannot_listen_reports_the_cause(
     endpoint: str, says: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert router.main(override(Config(), [f'bus.endpoint="{endpoint}"', "bus.insecure=true"])) == 1
@@ -353,7 +355,7 @@ def test_where_no_router_can_listen_the_plain_cause_is_said(
     assert ".rs:" not in caplog.text
 
 
-def test_of_two_endpoints_the_taken_one_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_endpoint_in_use_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     certificate_authority.create("jet1", [], tmp_path / "keys", 30)
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""Large messages in fragments: put together in any order, in bounded memory, and what does not fit is not used."""
+"""Large messages in fragments: joined in any order, in bounded memory, with invalid fragments rejected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LIMIT = 64 * FRAGMENT_BYTES
 
 
 def fragments(message: bytes = MESSAGE, writer: str = "trainer-a", number: int = 0) -> list[bytes]:
-    """Of the process's message with that number, which counts from 0."""
+    """Return the fragments of the process's message with that number, counted from 0."""
     sending = Fragmenter(writer)
     return [list(sending.split(message)) for _ in range(number + 1)][-1]
 
@@ -52,17 +52,17 @@ class Receiver:
         return [whole for whole in found if whole is not None]
 
 
-def test_what_is_small_travels_as_it_is() -> None:
+def test_small_messages_are_sent_whole() -> None:
     assert fragments(MESSAGE[:FRAGMENT_BYTES]) == [MESSAGE[:FRAGMENT_BYTES]]
     assert Receiver().take(b"", b"\x80", MESSAGE[:FRAGMENT_BYTES]) == [b"", b"\x80", MESSAGE[:FRAGMENT_BYTES]]
 
 
-def test_no_message_begins_like_a_fragment() -> None:
+def test_no_message_starts_like_a_fragment() -> None:
     health = m.Health(run_id="a", seq=0, process="plant", status="ready", counters={}, note="")
     assert codec.encode(health)[:1] != MARK
 
 
-def test_fragments_make_the_message_in_any_order_and_twice() -> None:
+def test_fragments_are_joined_in_any_order_and_twice() -> None:
     parts = fragments()
     assert len(parts) == 6
     assert max(map(len, parts)) <= FRAGMENT_BYTES + HEADER_BYTES
@@ -75,14 +75,14 @@ def test_fragments_make_the_message_in_any_order_and_twice() -> None:
     assert receiver.bad.counters() == {}
 
 
-def test_a_lost_fragment_loses_its_message_and_no_other() -> None:
+def test_a_lost_fragment_loses_only_its_message() -> None:
     receiver = Receiver()
     assert receiver.take(*fragments()[1:], *fragments(number=1)) == [MESSAGE]
-    assert receiver.bad.counters() == {"bad x: pieces lost": 1}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 1}
     assert receiver.take(*fragments()[:1]) == []
     receiver.reassembler.end()
     assert receiver.reassembler.held == 0
-    assert receiver.bad.counters() == {"bad x: pieces lost": 2}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 2}
 
 
 def test_writers_and_topics_do_not_mix() -> None:
@@ -108,33 +108,33 @@ def test_writers_and_topics_do_not_mix() -> None:
         (altered(fragments()[0], writer="w" * 200), "malformed piece"),
     ],
 )
-def test_what_is_no_fragment_is_counted_and_disturbs_nothing(payload: bytes, reason: str) -> None:
+def test_an_invalid_fragment_is_counted_without_other_effect(payload: bytes, reason: str) -> None:
     receiver, parts = Receiver(), fragments()
     assert receiver.take(*parts[:3], payload, *parts[3:]) == [MESSAGE]
-    assert receiver.bad.counters() == {f"bad x: {reason}": 1}
+    assert receiver.bad.counters() == {m.counter_name("bad x", reason): 1}
 
 
-def test_a_message_that_is_not_what_was_sent_is_not_used() -> None:
+def test_a_corrupted_message_is_not_used() -> None:
     receiver, parts = Receiver(), fragments()
     assert receiver.take(altered(parts[0], data=bytes(FRAGMENT_BYTES)), *parts[1:]) == []
-    assert receiver.bad.counters() == {"bad x: pieces do not make the message": 1}
+    assert receiver.bad.counters() == {"bad_x_pieces_do_not_make_the_message": 1}
     assert receiver.take(parts[0], altered(parts[1], crc32=zlib.crc32(b"")), *parts[1:]) == [MESSAGE]
 
 
-def test_strangers_under_many_names_cannot_fill_it_either() -> None:
-    """With a byte each the bytes held are few."""
+def test_many_foreign_writers_cannot_fill_the_memory() -> None:
+    """With one byte each, few bytes are held."""
     receiver, small = Receiver(), altered(fragments()[0], size=FRAGMENT_BYTES + 1, index=1, data=b"x")
     for k in range(INCOMPLETE + 500):
-        receiver.take(altered(small, writer=f"stranger-{k}"))
+        receiver.take(altered(small, writer=f"foreign-{k}"))
     assert receiver.reassembler.held == INCOMPLETE
-    assert receiver.bad.counters() == {"bad x: pieces lost": 500}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 500}
     assert receiver.take(*fragments()) == [MESSAGE]
 
 
-def test_strangers_cannot_fill_the_memory() -> None:
+def test_a_foreign_writer_cannot_fill_the_memory() -> None:
     receiver = Receiver(limit=8 * FRAGMENT_BYTES)
     for k in range(300):
-        receiver.take(*fragments(writer=f"stranger-{k}")[:2])
+        receiver.take(*fragments(writer=f"foreign-{k}")[:2])
         assert receiver.reassembler.held <= 8 * FRAGMENT_BYTES
     assert receiver.take(*fragments()) == [MESSAGE]
 
@@ -155,16 +155,16 @@ def keyframe(size: int) -> m.Keyframe:
 
 
 @pytest.mark.live
-def test_on_the_bus_only_fragments_travel_and_every_reader_gets_the_message(config: Config) -> None:
+def test_only_fragments_are_sent_and_every_reader_gets_the_message(config: Config) -> None:
     sent = keyframe(3_000_000)
     travelled: list[int] = []
     with (
         Bus(config, "controller", "controller-a") as controller,
         Bus(config, "recorder", "recorder-a") as recorder,
-        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as stranger,
+        zenoh.open(session_config("client", config.bus.endpoint, 1500)) as foreign,
     ):
         all_of_it, one = recorder.everything(), recorder.queue(topics.KEYFRAME)
-        stranger.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
+        foreign.declare_subscriber("tandem/**", lambda sample: travelled.append(len(sample.payload)))
         wait_for(lambda: matched(controller, topics.KEYFRAME))
         controller.publish(topics.KEYFRAME, sent)
         wait_for(lambda: len(one) == 1 and len(all_of_it) == 1)
@@ -174,11 +174,11 @@ def test_on_the_bus_only_fragments_travel_and_every_reader_gets_the_message(conf
             assert delivery.payload == codec.encode(sent)
         wait_for(lambda: sum(travelled) > 3_000_000)
         assert max(travelled) <= FRAGMENT_BYTES + HEADER_BYTES
-        assert controller.counters()["sent bulk"] == len(travelled)
+        assert controller.counters()["sent_bulk"] == len(travelled)
 
 
 @pytest.mark.live
-def test_answers_travel_in_fragments(config: Config) -> None:
+def test_answers_are_sent_in_fragments(config: Config) -> None:
     answers = [codec.encode(keyframe(size)) for size in (700_000, 10, 2_000_000)]
     with (
         Bus(config, "controller", "controller-a") as controller,
@@ -188,4 +188,4 @@ def test_answers_travel_in_fragments(config: Config) -> None:
         found: list[list[bytes]] = []
         wait_for(lambda: bool(found.append(trainer.ask("controller/large", {}, HANG_S)) or found[-1]))
         assert found[-1] == answers
-        assert "bad controller/large: pieces lost" not in trainer.counters()
+        assert "bad_controller_large_pieces_lost" not in trainer.counters()

@@ -1,4 +1,4 @@
-"""Whom to obey, how old a message is, and that nothing that is wrong is obeyed."""
+"""The inbox: the sender to follow, the age of messages, and the rejection of invalid messages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def state(seq: int, t: float = 0.0, run_id: str = "plant-a", x: list[float] | No
     )
 
 
-# -- whom to obey ------------------------------------------------------------------------------------------
+# -- the sender to follow ----------------------------------------------------------------------------------
 
 
 def test_the_first_incarnation_is_followed_in_order() -> None:
@@ -56,15 +56,15 @@ def test_another_incarnation_takes_over_only_after_silence() -> None:
     assert follower.run_id == "b"
 
 
-def test_what_is_refused_keeps_nobody_in_power() -> None:
+def test_refused_messages_do_not_keep_a_sender_in_control() -> None:
     follower = Follower(silence=1.0)
     follower.accept("a", 2**60, 0.0)
-    # A forged number must not shut the true sender out for ever.
+    # A forged number must not exclude the true sender permanently.
     assert [follower.accept("a", k, 0.3 * k) for k in range(1, 5)] == ["out of order"] * 3 + ["ok"]
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 20), st.floats(0.0, 0.4))))
-def test_two_accepted_messages_rise_or_are_apart(messages: list[tuple[str, int, float]]) -> None:
+def test_accepted_messages_rise_or_follow_a_silence(messages: list[tuple[str, int, float]]) -> None:
     follower, now, accepted = Follower(silence=1.0), 0.0, []
     for run_id, seq, wait in messages:
         now += wait
@@ -74,17 +74,17 @@ def test_two_accepted_messages_rise_or_are_apart(messages: list[tuple[str, int, 
         assert (run_a == run_b and seq_b > seq_a) or at_b - at_a > 1.0
 
 
-# -- how old ---------------------------------------------------------------------------------------------
+# -- the age ---------------------------------------------------------------------------------------------
 
 
-def test_age_is_what_lies_above_the_shortest_delay() -> None:
+def test_age_is_the_excess_over_the_shortest_delay() -> None:
     ages, offset = AgeEstimate(), 1234.5
     for sent, delay in ((0.0, 0.004), (0.05, 0.001), (0.1, 0.003)):
         ages.observe(sent, sent + offset + delay)
     assert ages.age(0.1, 0.1 + offset + 0.003) == pytest.approx(0.002, abs=1e-4)
 
 
-def test_a_burst_after_an_outage_is_old_but_for_its_end() -> None:
+def test_a_burst_after_an_outage_is_old_except_its_end() -> None:
     ages = AgeEstimate()
     for k in range(100):
         ages.observe(0.05 * k, 0.05 * k + 0.001)
@@ -98,7 +98,7 @@ def test_a_burst_after_an_outage_is_old_but_for_its_end() -> None:
     assert sum(age > 0.04 for age in seen) == 60
 
 
-def test_clocks_that_drift_apart_do_not_age_the_messages() -> None:
+def test_clock_drift_does_not_age_messages() -> None:
     ages = AgeEstimate()
     oldest = 0.0
     for k in range(20_000):
@@ -109,16 +109,16 @@ def test_clocks_that_drift_apart_do_not_age_the_messages() -> None:
     assert oldest < 1e-4
 
 
-# -- counting --------------------------------------------------------------------------------------------
+# -- counters --------------------------------------------------------------------------------------------
 
 
-def test_bad_messages_are_counted_and_named_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_bad_messages_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     bad = RejectedMessages()
     with caplog.at_level(logging.WARNING):
         for k in range(50):
             bad.count("plant/state", "not finite", f"field x.{k}")
         bad.count("plant/state", "malformed", "truncated")
-    assert bad.counters() == {"bad plant/state: not finite": 50, "bad plant/state: malformed": 1}
+    assert bad.counters() == {"bad_plant_state_not_finite": 50, "bad_plant_state_malformed": 1}
     assert [record.getMessage().count("x.0") for record in caplog.records] == [1, 0]
 
 
@@ -135,12 +135,12 @@ def test_the_kinds_of_bad_messages_are_bounded() -> None:
 
 @pytest.fixture(scope="module")
 def buses() -> Iterator[tuple[Bus, zenoh.Session]]:
-    """A bus, and a stranger's session that may send any bytes."""
+    """Return a bus, and a foreign session that can send any bytes."""
     config = live_config("bus.follow_silence=30.0")
     with open_router(config), Bus(config, "controller", "controller-x") as bus:
-        stranger = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
-        yield bus, stranger
-        stranger.close()
+        foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        yield bus, foreign
+        foreign.close()
 
 
 class Sender:
@@ -149,7 +149,7 @@ class Sender:
         self.inbox: Inbox[m.PlantState] = Inbox(
             self.bus, topics.PLANT_STATE, states=4, inputs=1, sent=lambda message: message.t
         )
-        # A burst would overflow the control lane, which drops rather than waits.
+        # A burst would overflow the control lane, which drops messages instead of waiting.
         block = zenoh.CongestionControl.BLOCK
         key = topics.PLANT_STATE.key(self.bus.config.name)
         self.publisher = session.declare_publisher(key, congestion_control=block)
@@ -161,13 +161,13 @@ class Sender:
             self.publisher.put(payload if isinstance(payload, bytes) else codec.encode(payload))
 
     def counted(self) -> dict[str, int]:
-        """What was counted since the beginning of the test."""
+        """Return the counters since the start of the test."""
         now = self.bus.counters()
         return {key: now[key] - self.before.get(key, 0) for key in now if now[key] != self.before.get(key, 0)}
 
 
 @pytest.mark.live
-def test_nothing_wrong_is_obeyed_and_all_of_it_is_counted(buses: tuple[Bus, zenoh.Session]) -> None:
+def test_invalid_messages_are_rejected_and_counted(buses: tuple[Bus, zenoh.Session]) -> None:
     sender = Sender(buses)
     good = state(0)
     unknown_field = msgspec.msgpack.encode(msgspec.to_builtins(good) | {"extra": 1})
@@ -193,13 +193,13 @@ def test_nothing_wrong_is_obeyed_and_all_of_it_is_counted(buses: tuple[Bus, zeno
     wait_for(lambda: heard.extend(sender.inbox.take_all()) or (bool(heard) and heard[-1].message.seq == 5))
     assert [received.message.seq for received in heard] == [0, 5]
     assert sender.counted() == {
-        "bad plant/state: malformed": 6,
-        "bad plant/state: oversized": 1,
-        "bad plant/state: not finite": 2,
-        "bad plant/state: wrong size": 1,
-        "bad plant/state: out of order": 1,
-        "bad plant/state: foreign": 1,
-        "bad plant/state: implausible time": 1,
+        "bad_plant_state_malformed": 6,
+        "bad_plant_state_oversized": 1,
+        "bad_plant_state_not_finite": 2,
+        "bad_plant_state_wrong_size": 1,
+        "bad_plant_state_out_of_order": 1,
+        "bad_plant_state_foreign": 1,
+        "bad_plant_state_implausible_time": 1,
     }
 
 
@@ -207,7 +207,7 @@ def test_nothing_wrong_is_obeyed_and_all_of_it_is_counted(buses: tuple[Bus, zeno
 def test_garbage_behind_a_good_message_does_not_hide_it(buses: tuple[Bus, zenoh.Session]) -> None:
     sender = Sender(buses)
     sender.send(state(0), b"junk", state(1), b"junk", b"junk")
-    wait_for(lambda: sender.counted().get("bad plant/state: malformed", 0) == 0 and _waiting(sender) == 5)
+    wait_for(lambda: sender.counted().get("bad_plant_state_malformed", 0) == 0 and _waiting(sender) == 5)
     received = sender.inbox.take()
     assert received is not None
     assert received.message.seq == 1
@@ -215,8 +215,8 @@ def test_garbage_behind_a_good_message_does_not_hide_it(buses: tuple[Bus, zenoh.
 
 
 @pytest.mark.live
-def test_a_senders_clock_that_leapt_is_believed_after_silence(buses: tuple[Bus, zenoh.Session]) -> None:
-    """A machine that was suspended must not be shut out for ever."""
+def test_a_jumped_clock_is_accepted_after_a_silence(buses: tuple[Bus, zenoh.Session]) -> None:
+    """A machine that was suspended must not be excluded permanently."""
     sender = Sender(buses)
     sender.inbox.follower = Follower(silence=0.2)
     seqs, heard = itertools.count(), []
@@ -228,12 +228,12 @@ def test_a_senders_clock_that_leapt_is_believed_after_silence(buses: tuple[Bus, 
 
     wait_for(lambda: hears(0.0))
     wait_for(lambda: hears(100.0))
-    assert sender.counted()["bad plant/state: implausible time"] >= 1
+    assert sender.counted()["bad_plant_state_implausible_time"] >= 1
     assert sender.inbox.age(heard[-1], heard[-1].arrived) < 0.05
 
 
 class Endless:
-    """A mailbox that never runs out of garbage."""
+    """A mailbox with an endless stream of garbage."""
 
     def drain(self) -> list[Delivery]:
         return [self.get(0.0)]
@@ -243,7 +243,7 @@ class Endless:
 
 
 @pytest.mark.live
-def test_garbage_without_end_does_not_keep_anybody_waiting(
+def test_endless_garbage_does_not_block_a_reader(
     buses: tuple[Bus, zenoh.Session], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sender = Sender(buses)
@@ -258,7 +258,7 @@ def _waiting(sender: Sender) -> int:
 
 
 @pytest.mark.live
-def test_waiting_goes_on_past_what_must_not_be_obeyed(buses: tuple[Bus, zenoh.Session]) -> None:
+def test_waiting_skips_invalid_messages(buses: tuple[Bus, zenoh.Session]) -> None:
     sender = Sender(buses)
     sender.send(b"junk", b"junk", state(0))
     received = sender.inbox.wait(HANG_S)
@@ -273,7 +273,7 @@ def test_waiting_goes_on_past_what_must_not_be_obeyed(buses: tuple[Bus, zenoh.Se
 def test_old_data_in_a_burst_is_recognised(buses: tuple[Bus, zenoh.Session]) -> None:
     sender = Sender(buses)
     now = clock.now()
-    # Sent on time, then nothing for three seconds, then all of it at once.
+    # The first message is on time; after three seconds of silence all others arrive at once.
     sender.send(state(0, t=now))
     first = sender.inbox.wait(HANG_S)
     assert first is not None
@@ -285,5 +285,5 @@ def test_old_data_in_a_burst_is_recognised(buses: tuple[Bus, zenoh.Session]) -> 
     ages = [sender.inbox.age(received, received.arrived) for received in heard]
     assert all(age > 0.05 for age in ages[:-1])
     assert ages[0] > 2.9
-    # Only as old as it was under way: what was sent before it does not age it.
+    # Each is only as old as its own delay; messages before it have no effect.
     assert ages[-1] <= heard[-1].arrived - sent

@@ -1,4 +1,4 @@
-"""Configuration: what is wrong is said in one message with key, place and what would be right."""
+"""Configuration: each error is one message with the key, its place and the allowed values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def message(*overrides: str) -> str:
     return str(caught.value)
 
 
-def test_shipped_file_is_the_defaults():
+def test_shipped_file_equals_the_defaults():
     assert load(SHIPPED) == Config()
 
 
@@ -45,7 +45,7 @@ def test_shipped_file_names_every_key():
 
 def test_commented_values_of_the_shipped_file_are_valid():
     text = re.sub(r"(?m)^# (\w+ = )", r"\1", SHIPPED.read_text())
-    # Of the two ways to give the horizon, the one that is a comment.
+    # The file contains one of the two keys for the horizon as a comment.
     text = re.sub(r"(?m)^horizon = .*", "", text)
     shown = from_tree(tomllib.loads(text))
     assert shown.plant.x0 is not None
@@ -105,12 +105,12 @@ def test_wrong_value_names_key_value_and_what_is_allowed(given: str, expected: s
 
 
 @pytest.mark.parametrize("given", ["rate", "=3", "rate.x=3"])
-def test_override_that_is_none(given: str):
+def test_an_invalid_override_is_refused(given: str):
     with pytest.raises(ConfigError, match=f"^{re.escape(repr(given))}: "):
         override(Config(), [given])
 
 
-def test_a_file_is_named_and_so_is_the_override_that_spoils_it(tmp_path: Path):
+def test_errors_name_the_file_or_the_override(tmp_path: Path):
     file = tmp_path / "mine.toml"
     file.write_text("[trainer]\nbatch = 0\n")
     with pytest.raises(ConfigError, match=rf"^{re.escape(str(file))}: trainer\.batch = 0"):
@@ -128,25 +128,25 @@ def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes):
         load(file)
 
 
-def test_a_byte_order_mark_before_a_file_is_no_part_of_it(tmp_path: Path):
+def test_a_byte_order_mark_is_ignored(tmp_path: Path):
     path = tmp_path / "mine.toml"
     path.write_bytes(b"\xef\xbb\xbfrate = 50.0\n")
     assert load(path).rate == 50.0
 
 
-def test_a_file_in_another_encoding_is_named_as_such(tmp_path: Path):
+def test_a_file_in_another_encoding_is_reported(tmp_path: Path):
     path = tmp_path / "mine.toml"
     path.write_bytes("rate = 50.0\n".encode("utf-16"))
     with pytest.raises(ConfigError, match=r"mine\.toml: .*save it as UTF-8"):
         load(path)
 
 
-def test_a_file_that_is_not_there(tmp_path: Path):
+def test_a_missing_file(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"none\.toml: cannot be read: No such file"):
         load(tmp_path / "none.toml")
 
 
-def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
+def test_toml_and_json_are_read_back_equal(tmp_path: Path):
     changed = override(
         Config(), ["plant.x0=[0.2, 1.3, 1.1, 0.0]", "controller.solver.tolerance=1e-9", "network.hidden=[8]"]
     )
@@ -189,12 +189,12 @@ def test_toml_and_json_give_the_same_configuration_back(tmp_path: Path):
         ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),
     ],
 )
-def test_what_the_plant_does_not_have(given: str, expected: str):
+def test_unknown_names_of_the_plant_are_refused(given: str, expected: str):
     with pytest.raises(ConfigError, match=re.escape(expected)):
         plant_of(override(Config(), [given]), get_plant)
 
 
-def test_a_wrong_model_has_a_true_plant_beside_it():
+def test_a_wrong_model_has_a_separate_true_plant():
     config = override(Config(), ["plant.truth.slope=1.4"])
     model, truth = plant_of(config, get_plant), true_plant_of(config, get_plant, get_truth)
     assert model is get_plant("moore_greitzer")
@@ -203,7 +203,7 @@ def test_a_wrong_model_has_a_true_plant_beside_it():
     assert true_plant_of(Config(), get_plant, get_truth) is model
 
 
-def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_tilde_is_replaced_by_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     keys = ("log.path", "controller.checkpoint", "controller.sets", "bus.tls.keys")
     file = tmp_path / "config.toml"
@@ -215,20 +215,20 @@ def test_the_home_folder_stands_for_a_tilde_as_in_a_shell(tmp_path: Path, monkey
     assert load(None, [f"trainer.fleet=[{place}]"]).trainer.fleet[0].keys == f"{tmp_path}/keys"
 
 
-def test_a_tilde_that_is_part_of_a_name_or_of_a_log_stays():
+def test_a_tilde_in_a_name_or_a_log_is_kept():
     assert load(None, ["log.path=~backup.mcap"]).log.path == "~backup.mcap"
     assert load(None, ["log.path=a/~/b.mcap"]).log.path == "a/~/b.mcap"
-    # A log's configuration was another machine's: nothing of this one is put into it.
-    assert from_json('{"log": {"path": "~nobody-at-all/x.mcap"}}').log.path == "~nobody-at-all/x.mcap"
+    # The configuration in a log belongs to another machine, so this machine's folders are not inserted.
+    assert from_json('{"log": {"path": "~no-such-user/x.mcap"}}').log.path == "~no-such-user/x.mcap"
 
 
-def test_the_home_of_somebody_unknown_is_refused_with_the_cause():
-    said = message("bus.tls.keys=~nobody-at-all/keys")
-    assert "no home folder of ~nobody-at-all is known" in said
+def test_the_home_of_an_unknown_user_is_refused():
+    said = message("bus.tls.keys=~no-such-user/keys")
+    assert "no home folder of ~no-such-user is known" in said
     assert said.startswith("--set bus.tls.keys")
 
 
-def test_a_text_that_is_not_utf_8_is_refused_and_a_logs_name_may_be_any_bytes():
+def test_text_must_be_utf_8_except_the_path_of_the_log():
     odd = os.fsdecode(b"caf\xe9")
     for key in ("controller.sets", "bus.tls.keys", "controller.checkpoint"):
         assert f"{key} = 'caf\\udce9' is not UTF-8" in message(f"{key}={odd}")
@@ -240,7 +240,7 @@ def test_a_text_that_is_not_utf_8_is_refused_and_a_logs_name_may_be_any_bytes():
 
 
 def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> None:
-    """Reasons: what only scales or is compared, and sizes neither memory nor time."""
+    """Numbers without a limit are those that only scale or are compared, and determine neither memory nor time."""
     harmless = {
         "tolerance",
         "penalty",
@@ -288,14 +288,14 @@ def test_every_number_in_the_configuration_has_an_upper_limit_or_a_reason() -> N
     assert unlimited <= harmless
 
 
-def test_a_log_is_held_to_the_same_limits() -> None:
+def test_the_limits_apply_to_a_log() -> None:
     with pytest.raises(
         ConfigError, match=r"the log's configuration: controller\.horizon = 2000000000 is not"
     ):
         from_json('{"controller": {"horizon": 2000000000}}')
 
 
-def test_the_horizon_in_seconds_becomes_steps_and_nothing_else_stays() -> None:
+def test_the_horizon_in_seconds_is_converted_to_steps() -> None:
     for rate, seconds, steps in ((20.0, 3.0, 60), (100.0, 1.0, 100), (30.0, 0.05, 2), (1.0, 0.1, 1)):
         config = load(None, [f"rate={rate}", f"controller.horizon_seconds={seconds}"])
         assert config.controller.horizon == steps
@@ -304,7 +304,7 @@ def test_the_horizon_in_seconds_becomes_steps_and_nothing_else_stays() -> None:
         assert from_json(to_json(config)) == config
 
 
-def test_the_horizon_is_given_once(tmp_path: Path) -> None:
+def test_the_horizon_may_be_given_once(tmp_path: Path) -> None:
     file = tmp_path / "c.toml"
     file.write_text("[controller]\nhorizon = 20\nhorizon_seconds = 2.0\n")
     with pytest.raises(
@@ -314,7 +314,7 @@ def test_the_horizon_is_given_once(tmp_path: Path) -> None:
     both = ["controller.horizon=20", "controller.horizon_seconds=2"]
     with pytest.raises(ConfigError, match=r"--set controller\.horizon_seconds=2: .* both given"):
         load(None, both)
-    # What is said later, beside the file, changes it whichever of the two it is.
+    # An override changes either of the two keys of the file.
     for text in ("horizon = 20", "horizon_seconds = 2.0"):
         file.write_text(f"[controller]\n{text}\n")
         assert [load(file, [one]).controller.horizon for one in both] == [20, 40]
@@ -334,7 +334,7 @@ def test_a_delay_of_more_than_half_a_period_is_refused():
         override(Config(), ["controller.input_delay_ms=5", "rate=1000"])
 
 
-def test_shipped_configurations_are_found_by_name_and_a_file_of_that_name_comes_first(
+def test_shipped_configurations_are_found_by_name_after_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -354,8 +354,8 @@ def test_shipped_configurations_are_found_by_name_and_a_file_of_that_name_comes_
 
 
 @pytest.mark.parametrize("name", ["compressor-cheap", "published"])
-def test_a_derived_configuration_holds_only_what_differs(name: str) -> None:
-    """And each of its keys does: a value that is the default anyway would go stale there."""
+def test_a_derived_configuration_contains_only_changes(name: str) -> None:
+    """Every key differs from the default. A repeated default would become outdated there."""
 
     def leaves(tree: dict, path: str = "") -> dict[str, object]:
         found: dict[str, object] = {}

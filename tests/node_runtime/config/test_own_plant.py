@@ -1,4 +1,4 @@
-"""What a configuration says of a plant of one's own: references written out, bounds, and the way there and back."""
+"""Configuration of a user's plant: absolute references, bounds, and writing and reading back."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from node_runtime.config.strict import ConfigError
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Another folder than the configuration's."""
+    """Change into another folder than the configuration's."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -34,7 +34,7 @@ def test_a_reference_in_a_file_is_relative_to_the_file(tmp_path: Path, elsewhere
         assert read.plant.truth == f"{tmp_path.parent}/true.py:TRUE"
 
 
-def test_a_reference_given_by_hand_is_relative_to_the_current_folder(tmp_path: Path, elsewhere: Path):
+def test_an_overriding_reference_is_relative_to_the_current_folder(tmp_path: Path, elsewhere: Path):
     file = tmp_path / "tanks.toml"
     file.write_text('plant.model = "tanks.py:TANKS"\n')
     assert load(file, ["plant.model=a.py:A"]).plant.model == f"{elsewhere}/a.py:A"
@@ -42,19 +42,19 @@ def test_a_reference_given_by_hand_is_relative_to_the_current_folder(tmp_path: P
     assert load(None, ["plant.model=a.py:A"]).plant.model == f"{elsewhere}/a.py:A"
 
 
-def test_names_and_packages_stay_as_they_are(elsewhere: Path):
+def test_names_and_packages_are_unchanged(elsewhere: Path):
     assert load(None, ["plant.model=moore_greitzer"]).plant.model == "moore_greitzer"
     assert load(None, ["plant.model=mypackage.module:PLANT"]).plant.model == "mypackage.module:PLANT"
 
 
-def test_what_a_log_names_is_not_written_out(elsewhere: Path):
+def test_references_in_a_log_stay_unchanged(elsewhere: Path):
     logged = from_json('{"plant": {"model": "evil.py:PLANT", "truth": "evil.py:TRUE"}}')
     assert (logged.plant.model, logged.plant.truth) == ("evil.py:PLANT", "evil.py:TRUE")
     changed = override(logged, ["rate=10"])
     assert (changed.plant.model, changed.plant.truth) == ("evil.py:PLANT", "evil.py:TRUE")
 
 
-def test_bounds_there_and_back(tmp_path: Path):
+def test_bounds_are_written_and_read_back(tmp_path: Path):
     config = load(
         None, ["plant.bounds.z=[0, 1]", "plant.bounds.y=[-inf, 2.0]", "plant.bounds={u=[0.5, inf]}"]
     )
@@ -85,8 +85,8 @@ def test_bounds_there_and_back(tmp_path: Path):
             'plant.truth = {"slope":"a"} is not a table, each entry a number or a string',
         ),
         (
-            "plant.model=~nobody-at-all/a.py:A",
-            "--set plant.model=~nobody-at-all/a.py:A: plant.model = ~nobody-at-all/",
+            "plant.model=~no-such-user/a.py:A",
+            "--set plant.model=~no-such-user/a.py:A: plant.model = ~no-such-user/",
         ),
     ],
 )
@@ -95,21 +95,21 @@ def test_mistakes(given: str, text: str):
         override(Config(), [given])
 
 
-def test_rates_of_inputs_there_and_back(tmp_path: Path):
+def test_input_rates_are_written_and_read_back(tmp_path: Path):
     config = load(None, ["plant.input_rate_max={u=5.0}", "controller.S=[0.5]"])
     found = plant_of(config, get_plant)
     assert found.input_rates.tolist() == [5.0]
     file = tmp_path / "rates.toml"
     file.write_text(to_toml(config))
     assert load(file) == config
-    # In a log: the plant as it is known, and a configuration that says all of it.
+    # In a log: the known plant, and a configuration with all of its properties.
     known = found.known()
     assert Known.from_builtins(msgspec.json.decode(msgspec.json.encode(known.to_builtins()))).u_rate_max == [
         5.0
     ]
     assert spelt_out(load(None), found).plant.input_rate_max == {"u": 5.0}
     assert "u_rate_max" not in get_plant("moore_greitzer").known().to_builtins()
-    # A part of the inputs may have one.
+    # Some of the inputs may have a rate limit.
     two = Known.from_matrices(
         np.zeros((1, 1)) - 1.0, np.ones((1, 2)), W=[0.0], scale={"x1": 1.0, "u1": 1.0, "u2": 1.0}
     )
@@ -125,12 +125,12 @@ def test_rates_of_inputs_there_and_back(tmp_path: Path):
         ("controller.S=[-1.0]", "controller.S"),
     ],
 )
-def test_a_rate_that_is_none(setting: str, said: str):
+def test_an_invalid_rate_is_refused(setting: str, said: str):
     with pytest.raises(ConfigError, match=said):
         plant_of(load(None, [setting]), get_plant)
 
 
-def test_a_plant_whose_rate_is_none():
+def test_a_plant_with_an_invalid_rate_is_refused():
     for rates in ([1.0, 2.0], [0.0], [float("nan")], "fast"):
         with pytest.raises(PlantDefinitionError, match="u_rate_max"):
             Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], u_rate_max=rates, scale={"x1": 1.0, "u1": 1.0})
@@ -139,7 +139,7 @@ def test_a_plant_whose_rate_is_none():
 SURGE = "plant.rows.surge={z=1.0,y=-0.5,max=0.3,priority=1}"
 
 
-def test_rows_there_and_back(tmp_path: Path):
+def test_rows_are_written_and_read_back(tmp_path: Path):
     config = load(None, [SURGE])
     found = plant_of(config, get_plant)
     row = {"z": 1.0, "y": -0.5, "max": 0.3, "priority": 1}
@@ -153,7 +153,7 @@ def test_rows_there_and_back(tmp_path: Path):
     assert again.to_builtins() == known.to_builtins()
     assert spelt_out(load(None), found).plant.rows == {"surge": row}
     assert "rows" not in get_plant("moore_greitzer").known().to_builtins()
-    # Others stay, and one of the same name is another.
+    # Other rows stay, and a row of the same name is replaced.
     more = found.changed({}, rows={"slow": {"r": 1.0, "max": 1.5}, "surge": {"z": 1.0, "max": 0.5}})
     assert [more.state_rows.names, more.state_rows.upper.tolist()] == [("surge", "slow"), [0.5, 1.5]]
 
@@ -174,12 +174,12 @@ def test_rows_there_and_back(tmp_path: Path):
         ("{z=1.0,max=inf}", "plant.rows.few.max is not a finite number"),
     ],
 )
-def test_a_row_that_is_none(row: str, said: str):
+def test_an_invalid_row_is_refused(row: str, said: str):
     with pytest.raises(ConfigError, match=re.escape(said)):
         plant_of(load(None, [f"plant.rows.few={row}"]), get_plant)
 
 
-def test_a_plant_whose_rows_are_none():
+def test_a_plant_with_invalid_rows_is_refused():
     for rows in (3, {"x1": {"x1": 1.0, "max": 1.0}}, {"r": [1.0]}, {"r": {"x1": "a", "max": 1.0}}):
         with pytest.raises(PlantDefinitionError, match="row"):
             Known.from_matrices([[-1.0]], [[1.0]], W=[0.0], rows=rows, scale={"x1": 1.0, "u1": 1.0})

@@ -1,4 +1,4 @@
-"""Objects named by a reference: what is loaded, what is not, and what is said of what cannot be."""
+"""Objects named by references: loading, refusals, and error messages."""
 
 from __future__ import annotations
 
@@ -41,31 +41,31 @@ def test_object_of_a_file(here: Path):
     assert load(f"{here}/tanks.py:TANKS", is_table, "plant") == {"height": 3}
 
 
-def test_file_is_known_by_its_hash(here: Path):
+def test_file_is_identified_by_its_hash(here: Path):
     of = loaded("tanks.py:TANKS")
     assert (of.file, of.sha256) == (str(here / "tanks.py"), hashlib.sha256(TANKS.encode()).hexdigest())
 
 
-def test_file_runs_once_as_long_as_it_is_the_same(here: Path):
+def test_file_runs_once_until_it_changes(here: Path):
     first = load("tanks.py:TANKS")
     assert load("tanks.py:TANKS") is first
     (here / "tanks.py").write_text("TANKS = {'height': 4}\n")
     assert load("tanks.py:TANKS") == {"height": 4}
 
 
-def test_file_leaves_nothing_beside_it(here: Path):
+def test_loading_creates_no_other_files(here: Path):
     load("tanks.py:TANKS")
     assert [file.name for file in here.iterdir()] == ["tanks.py"]
 
 
-def test_file_with_the_name_of_an_installed_module_hides_nothing(here: Path):
+def test_file_named_as_an_installed_module_replaces_nothing(here: Path):
     (here / "json.py").write_text("import json\nPLANT = {'loads': json.loads('[1]')}\n")
     program = (
         "import sys; sys.path.remove('') if '' in sys.path else None\n"
         "from node_runtime.config.reference import load\n"
         f"print(load({str(here / 'json.py')!r} + ':PLANT'), sys.modules['json'].__file__)"
     )
-    # A process of its own: this one has imported json long ago.
+    # This needs a new process, because the present one has imported json already.
     done = subprocess.run(
         [sys.executable, "-P", "-c", program],
         env={"PYTHONPATH": str(ROOT)},
@@ -78,7 +78,7 @@ def test_file_with_the_name_of_an_installed_module_hides_nothing(here: Path):
     assert str(here) not in done.stdout
 
 
-def test_file_imports_its_neighbours_after_everything_installed(here: Path, monkeypatch: pytest.MonkeyPatch):
+def test_file_imports_its_neighbours_after_installed_modules(here: Path, monkeypatch: pytest.MonkeyPatch):
     folder = here / "plants"
     folder.mkdir()
     (folder / "neighbour_of_one.py").write_text("LENGTH = 2\n")
@@ -88,7 +88,7 @@ def test_file_imports_its_neighbours_after_everything_installed(here: Path, monk
     )
     assert load("plants/one.py:PLANT") == {"length": 2}
     assert sys.path[-1] == str(folder)
-    # Only the file may: it is no installed package.
+    # Only the file may import it, because it is not an installed package.
     assert "no package called 'neighbour_of_one' is installed" in message("neighbour_of_one:LENGTH")
 
 
@@ -170,7 +170,7 @@ def test_file_that_raises(here: Path, source: str, text: str):
     file.write_text(source)
     assert message("bad.py:TANKS").startswith(text.format(file=file))
     assert message("bad.py:TANKS").startswith(text.format(file=file))
-    # Nothing of it stays: the file put right is loaded.
+    # Nothing of the failed load remains, so the corrected file is loaded.
     file.write_text(TANKS)
     assert load("bad.py:TANKS") == {"height": 3}
 
@@ -200,5 +200,5 @@ def test_absolute(here: Path, monkeypatch: pytest.MonkeyPatch):
     assert absolute("/elsewhere/tanks.py:TANKS", here) == "/elsewhere/tanks.py:TANKS"
     assert absolute("~/tanks.py:TANKS", here) == "/home/me/tanks.py:TANKS"
     assert absolute("mypackage.module:PLANT", here) == "mypackage.module:PLANT"
-    with pytest.raises(ConfigError, match="no home folder of ~nobody-of-that-name is known"):
-        absolute("~nobody-of-that-name/tanks.py:TANKS", here)
+    with pytest.raises(ConfigError, match="no home folder of ~no-such-user is known"):
+        absolute("~no-such-user/tanks.py:TANKS", here)

@@ -1,4 +1,4 @@
-"""Slots: on an absolute grid, skipped when missed, never in a burst."""
+"""Slots lie on an absolute grid; missed ones are skipped and never run in a burst."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PERIOD = 0.05
 
 
 def run(grid: Grid, durations: list[float], start: float = 0.0) -> list[tuple[float, int, int]]:
-    """Steps that take `durations`: when each really began, its slot, how many were skipped before it."""
+    """Run steps that take `durations`; return the real start, the slot, and the skipped slots of each."""
     now, begun = start, []
     for duration in durations:
         slot = grid.next(now)
@@ -51,13 +51,13 @@ def test_never_a_burst(durations: list[float]) -> None:
     begun = run(grid, durations)
     gaps = [b[0] - a[0] for a, b in itertools.pairwise(begun)]
     assert all(gap >= 0.5 * PERIOD - 1e-9 for gap in gaps)
-    # Every slot is either run or counted.
+    # Every slot is either run or counted as skipped.
     assert begun[-1][1] == len(begun) - 1 + grid.skipped
     assert all(time >= index * PERIOD - 1e-9 for time, index, _ in begun)
 
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60))
-def test_slots_that_were_slept_through_are_skipped_not_run_in_a_burst(oversleeps: list[float]) -> None:
+def test_slots_missed_during_a_sleep_are_skipped(oversleeps: list[float]) -> None:
     grid, now = Grid(PERIOD, 0.0), 0.0
     begun: list[tuple[float, int]] = []
     for oversleep in oversleeps:
@@ -71,8 +71,8 @@ def test_slots_that_were_slept_through_are_skipped_not_run_in_a_burst(oversleeps
     assert begun[-1][1] == len(begun) - 1 + grid.skipped
 
 
-def test_a_frozen_loop_goes_on_with_the_newest_slot() -> None:
-    """What SIGSTOP and a host that takes the cores away do: the thread sleeps far longer than it asked for."""
+def test_a_frozen_loop_continues_with_the_newest_slot() -> None:
+    """SIGSTOP, or a host that takes the cores away, makes the thread sleep much longer than requested."""
     grid = Grid(PERIOD, 0.0)
     assert grid.next(0.0).index == 0
     slot = grid.next(0.01)
@@ -84,7 +84,7 @@ def test_a_frozen_loop_goes_on_with_the_newest_slot() -> None:
 
 
 @given(st.floats(-10.0, 10.0))
-def test_slewing_finds_the_phase_of_the_events_without_leaps(phase_of_events: float) -> None:
+def test_slewing_reaches_the_phase_of_the_events_without_jumps(phase_of_events: float) -> None:
     grid = Grid(PERIOD, 0.0)
     now, due = 0.0, []
     for k in range(300):

@@ -1,4 +1,4 @@
-"""One such site for all tests that ask for it."""
+"""A site that all tests of this folder share."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from tests.node_runtime.tls.site import Site
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     folder = tmp_path_factory.mktemp("site")
     certificate_authority.create("jet1", [], folder / "jet1", 30)
-    certificate_authority.create("jet1", [], folder / "other", 30)  # the same names from another authority
+    certificate_authority.create(
+        "jet1", [], folder / "other", 30
+    )  # the same names, but from another authority
     own = certificate_authority.create("jet2", [], folder / "jet2", 30)
     assert own
     issue(folder / "jet1", "expired", "trainer.jet1", -0.5)
-    issue(folder / "jet1", "nobody", "nobody.jet1", 30)
+    issue(folder / "jet1", "stranger", "stranger.jet1", 30)
     issue(folder / "jet1", "neighbour", "trainer.jet2", 30)
     remote = free_endpoint().replace("tcp/", "tls/")
     config = live_config(f'bus.remote="{remote}"', f'bus.tls.keys="{folder / "jet1" / "router"}"')

@@ -1,4 +1,4 @@
-"""A router with a local endpoint and one with certificates, and whom tests let in there."""
+"""A router with a local endpoint and one with certificates, and clients for it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.live import HANG_S, Process
 
 
 class Listener:
-    """What a process says on standard error, as it comes."""
+    """Collects the standard error of a process."""
 
     def __init__(self, process: Process):
         self._text = ""
@@ -36,7 +36,7 @@ class Listener:
 
 
 class Site:
-    """A router with the local endpoint and the one with certificates, and keys of two authorities."""
+    """A router with a local endpoint and one with certificates, and keys of two authorities."""
 
     def __init__(self, folder: Path, router: Process, config: Config):
         self.folder, self.router, self.local = folder, Listener(router), config
@@ -44,14 +44,14 @@ class Site:
         self.remote = config.bus.remote
 
     def far(self, role: str, authority: str = "jet1", *more: str) -> Config:
-        """The configuration of a process on another machine."""
+        """Return the configuration of a process on another machine."""
         keys = self.folder / authority / role
         return override(
             self.local, [f'bus.endpoint="{self.remote}"', f'bus.tls.keys="{keys}"', 'bus.remote=""', *more]
         )
 
     def session(self, role: str, authority: str = "jet1") -> zenoh.Session:
-        """A hostile program with that role's certificate: Zenoh alone, none of our checks."""
+        """Open a session with that role's certificate and none of our checks, as a hostile program would."""
         own = credentials.read(self.folder / authority / role)
         return zenoh.open(
             session_config("client", self.remote, 5000, more=access_control.client_settings(own))

@@ -1,4 +1,4 @@
-"""Rights, plain endpoints and the router's words on denials: what needs no router."""
+"""Rights, plain endpoints and the router's messages about denials, without a router."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from node_runtime.tls.zenoh_log import MAX_NAMES, Refusals
 from tests.helpers.live import live_config
 
 
-def test_an_address_with_a_zone_is_refused_where_certificates_are_needed() -> None:
+def test_an_address_with_a_zone_is_refused_with_certificates() -> None:
     with pytest.raises(ConfigError, match="a certificate cannot contain an address with a zone"):
         session_config("client", "tls/[fe80::1%2]:7448", 1000)
     session_config("client", "tcp/[fe80::1%2]:7447", 1000)
 
 
-def test_every_key_that_a_role_may_use_is_of_its_plant():
+def test_every_key_of_a_role_belongs_to_its_plant():
     control = access_control.access_control("jet1")
     of_plain, *of_roles = control["rules"]
     assert control["default_permission"] == "deny"
@@ -37,7 +37,7 @@ def test_every_key_that_a_role_may_use_is_of_its_plant():
     json.dumps(access_control.size_limits("jet1"))
 
 
-def test_a_router_lets_other_machines_in_with_certificates_only():
+def test_other_machines_need_certificates():
     for assignment, says in (
         ('bus.remote="tcp/0.0.0.0:7448"', "need certificates"),
         ('bus.remote="tls/0.0.0.0:7448"', r"bus\.tls\.keys is missing"),
@@ -59,11 +59,11 @@ def test_a_router_lets_other_machines_in_with_certificates_only():
         ("tls/0.0.0.0:7447", False),
     ],
 )
-def test_which_plain_endpoints_others_may_reach(endpoint: str, is_open: bool):
+def test_which_plain_endpoints_other_machines_can_reach(endpoint: str, is_open: bool):
     assert open_to_all(endpoint) is is_open
 
 
-def test_zenoh_s_questions_to_itself_are_no_denials():
+def test_zenohs_internal_checks_are_not_denials():
     bad = RejectedMessages()
     refusals = Refusals(bad)
     head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
@@ -81,14 +81,14 @@ def test_zenoh_s_questions_to_itself_are_no_denials():
     )
     assert refusals.read(head + who + "Put (ingress) on tandem/jet1/" + "x" * 500)
     assert bad.counters() == {
-        "bad from trainer.jet1: denied, put controller/tick": 1,
-        "bad from trainer.jet1: denied, put elsewhere": 1,
+        "bad_from_trainer_jet1_denied_put_controller_tick": 1,
+        "bad_from_trainer_jet1_denied_put_elsewhere": 1,
     }
-    assert not refusals.read("a line of somebody else")
+    assert not refusals.read("a line of another program")
 
 
-def test_who_was_denied_is_known_after_any_number_of_sessions():
-    """A health check alone opens one every few seconds."""
+def test_a_denied_sender_is_named_after_many_sessions():
+    """Health checks alone open a session every few seconds."""
     bad = RejectedMessages()
     refusals = Refusals(bad)
     head = "2026-11-23T01:14:25.0Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor::access_control: "
@@ -102,5 +102,5 @@ def test_who_was_denied_is_known_after_any_number_of_sessions():
         )
     last = head + "abcdef on Interface(lo)" + who.format("trainer.jet1", "un")
     refusals.read(last + "Put (ingress) on tandem/jet1/controller/command")
-    assert bad.counters() == {"bad from trainer.jet1: denied, put controller/command": 1}
+    assert bad.counters() == {"bad_from_trainer_jet1_denied_put_controller_command": 1}
     assert len(refusals._names) == MAX_NAMES

@@ -1,4 +1,4 @@
-"""Links with certificates: who is let in, what is said of a refusal, and how long a link lasts. A real router."""
+"""Links with certificates over a real router: admission, messages about refusals, and the end of a link."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from tests.node_runtime.tls.site import Site
 pytestmark = pytest.mark.live
 
 
-# -- who is let in ---------------------------------------------------------------------------------------------------
+# -- admission -------------------------------------------------------------------------------------------------------
 
 
-def test_a_trainer_elsewhere_hears_samples_asks_and_sends_weights(site: Site):
+def test_a_remote_trainer_receives_samples_queries_and_sends_weights(site: Site):
     with (
         Bus(site.far("trainer"), "trainer", "t-1") as trainer,
         Bus(site.local, "controller", "c-1") as controller,
@@ -42,7 +42,7 @@ def test_a_trainer_elsewhere_hears_samples_asks_and_sends_weights(site: Site):
         assert trainer.ask(topics.OUTBOX_QUERY, {}, HANG_S) == [b"answer"]
 
 
-def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site: Site):
+def test_controller_and_plant_can_be_remote_and_a_recorder_receives_all(site: Site):
     with (
         Bus(site.far("plant"), "plant", "p-1") as plant,
         Bus(site.far("controller"), "controller", "c-1") as controller,
@@ -56,7 +56,7 @@ def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site
         keys: dict[Mailbox, set[str]] = {box: set() for box in (logged, seen)}
 
         def all_hear() -> bool:
-            """The router may know of one listener before it knows of the other."""
+            """The router may know one subscriber before the other."""
             plant._put(topics.PLANT_STATE, b"state")
             controller._put(topics.COMMAND, b"command")
             for box, found in keys.items():
@@ -69,7 +69,7 @@ def test_controller_and_plant_may_be_elsewhere_too_and_a_recorder_hears_all(site
 
 
 def _loopback6() -> str | None:
-    """A free port on ::1; None where this machine has no such address."""
+    """Return a free port on ::1; None if this machine has no such address."""
     try:
         with socket.socket(socket.AF_INET6) as probe:
             probe.bind(("::1", 0))
@@ -80,7 +80,7 @@ def _loopback6() -> str | None:
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
 @pytest.mark.parametrize("written", ["[::1]", "[0:0::1]"])
-def test_a_router_at_an_ipv6_address_is_reached_by_certificates(
+def test_a_router_at_an_ipv6_address_is_reached_with_certificates(
     tmp_path: Path, protocol: str, written: str
 ) -> None:
     place = _loopback6()
@@ -117,21 +117,21 @@ def test_an_ipv6_router_that_its_certificate_does_not_name_is_refused(tmp_path: 
         ("nowhere", "jet1", "no such folder"),
     ],
 )
-def test_who_is_not_let_in_is_told_why(site: Site, role: str, authority: str, says: str):
+def test_a_refused_client_gets_the_reason(site: Site, role: str, authority: str, says: str):
     with pytest.raises(ConfigError, match=says), Bus(site.far(role, authority), "trainer", "t-1"):
         pass
 
 
-def test_no_certificate_is_told_at_once(site: Site):
+def test_a_missing_certificate_is_reported_at_once(site: Site):
     config = override(site.local, [f'bus.endpoint="{site.remote}"', 'bus.tls.keys=""'])
     with pytest.raises(ConfigError, match=r"bus\.tls\.keys is missing"), Bus(config, "trainer", "t-1"):
         pass
 
 
-def test_a_router_under_another_name_is_not_believed(site: Site):
+def test_a_router_with_another_name_is_refused(site: Site):
     far = site.far("trainer", "jet1", f'bus.endpoint="{site.remote.replace("127.0.0.1", "127.0.0.2")}"')
     own = credentials.read(site.folder / "jet1" / "trainer")
-    # Nobody listens on 127.0.0.2: that is no refusal, and is waited for.
+    # There is no router on 127.0.0.2. That is not a refusal, and the client waits.
     assert refusal(far.bus.endpoint, own) is None
     assert refusal(site.remote, own) is None
     relay = _relay(site.remote.replace("tls/", ""))
@@ -145,7 +145,7 @@ def test_a_router_under_another_name_is_not_believed(site: Site):
 
 
 def _relay(place: str) -> socket.socket:
-    """Listens on 127.0.0.2 and passes one connection on to `place`."""
+    """Listen on 127.0.0.2 and forward one connection to `place`."""
     listener = socket.create_server(("127.0.0.2", 0))
     host, _, port = place.rpartition(":")
 
@@ -160,8 +160,8 @@ def _relay(place: str) -> socket.socket:
     return listener
 
 
-def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
-    """What our own checks would stop before: an expired certificate, another authority's, none."""
+def test_router_and_client_report_the_reason_of_a_refusal(site: Site):
+    """Our own checks would reject these earlier: an expired certificate, another authority's, none."""
     reason = refusal(site.remote, credentials.read(site.folder / "jet1" / "expired"))
     assert reason is not None
     assert "our certificate has expired by its clock" in reason
@@ -190,11 +190,11 @@ def test_the_router_says_whom_it_refused_and_both_know_why(site: Site):
     site.router.heard("bad TLS link: refused, it has no certificate")
 
 
-# -- how long a link lasts, and the other protocol ---------------------------------------------------------------------
+# -- the end of a link, and the other protocol -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
-def test_a_link_ends_with_its_certificate_and_the_process_says_so(
+def test_a_link_ends_with_its_certificate_and_the_process_logs_it(
     site: Site, protocol: str, caplog: pytest.LogCaptureFixture
 ):
     place = f"short-{protocol}"
@@ -211,7 +211,7 @@ def test_a_link_ends_with_its_certificate_and_the_process_says_so(
     ):
         weights, commands = controller.queue(topics.HIDDEN_WEIGHTS), controller.queue(topics.COMMAND)
         heard = trainer.queue(topics.SAMPLES), brief.queue(topics.SAMPLES)
-        # The rights are the same by either protocol.
+        # The rights are the same with either protocol.
         wait_for(lambda: matched(trainer, topics.HIDDEN_WEIGHTS))
         trainer._lanes.session("bulk").put(topics.COMMAND.key("jet1"), b"bad")
         trainer._put(topics.HIDDEN_WEIGHTS, b"weights")

@@ -1,4 +1,4 @@
-"""What who is let in may do, and what reaches nobody. A real router."""
+"""Rights of admitted clients over a real router, and messages that are not delivered."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FOREIGN = [
     ("viewer", topics.OVERRIDE),
     ("viewer", topics.REFERENCE),
     ("commander", topics.COMMAND),
-    ("nobody", topics.HIDDEN_WEIGHTS),
+    ("stranger", topics.HIDDEN_WEIGHTS),
     ("neighbour", topics.HIDDEN_WEIGHTS),
 ]
 
@@ -38,11 +38,11 @@ def _allowed(role: str) -> Topic | None:
 
 
 def _until(mailbox: Mailbox, key: str, timeout_s: float = HANG_S) -> list[str]:
-    """The keys of all that arrives, up to and with the first at `key`."""
+    """Return the keys of all messages up to and including the first at `key`."""
     keys: list[str] = []
     deadline = clock.now() + timeout_s
     while key not in keys:
-        assert clock.now() < deadline, f"nothing at {key}, but {keys}"
+        assert clock.now() < deadline, f"nothing at {key}; received {keys}"
         delivery = mailbox.get(0.2)
         if delivery is not None:
             keys.append(delivery.key)
@@ -50,12 +50,12 @@ def _until(mailbox: Mailbox, key: str, timeout_s: float = HANG_S) -> list[str]:
 
 
 @pytest.mark.parametrize("role", dict.fromkeys(role for role, _ in FOREIGN))
-def test_what_a_role_may_not_publish_reaches_nobody(site: Site, role: str):
-    """The last message is one that it may publish, so all before it have arrived or never will."""
+def test_messages_without_the_right_to_publish_are_not_delivered(site: Site, role: str):
+    """The last message is allowed, so all messages before it have either arrived or never will."""
     with Bus(site.local, "viewer", "o-1") as ear, site.session(role) as session:
         heard, block = ear.everything(), zenoh.CongestionControl.BLOCK
         fast = ear._lanes.session("bulk").declare_subscriber(topics.COMMAND.direct_key("jet1"))
-        # Only now does the router know that somebody listens.
+        # Now the router knows the subscriber.
         _until(heard, topics.HEALTH["router"].key("jet1"))
         for name, topic in FOREIGN:
             if name == role:
@@ -67,16 +67,19 @@ def test_what_a_role_may_not_publish_reaches_nobody(site: Site, role: str):
         own = _allowed(role)
         if own is not None:
             session.put(own.key("jet1"), b"good", congestion_control=block)
-        # And where it may publish nothing, the router's next two words come after it.
+        # For a role that may publish nothing, the router's next two messages mark the end.
         last = own.key("jet1") if own is not None else topics.HEALTH["router"].key("jet1")
         arrived = [key for _ in range(1 if own else 2) for key in _until(heard, last)]
         assert set(arrived) <= {last, *(f"tandem/jet1/router/{name}" for name in ("health", "run_info"))}
         assert fast.try_recv() is None
-    named = {"nobody": "a certificate without rights here", "neighbour": "a certificate without rights here"}
+    named = {
+        "stranger": "a certificate without rights here",
+        "neighbour": "a certificate without rights here",
+    }
     site.router.heard(named.get(role, f"bad from {role}.jet1: denied, put"))
 
 
-def test_a_trainer_hears_no_commands_and_answers_no_questions(site: Site):
+def test_a_trainer_receives_no_commands_and_answers_no_queries(site: Site):
     with (
         Bus(site.local, "controller", "c-1") as controller,
         Bus(site.local, "trainer", "t-2") as asker,
@@ -106,7 +109,7 @@ def test_a_trainer_hears_no_commands_and_answers_no_questions(site: Site):
         lies.undeclare()
 
 
-def test_a_message_beyond_its_topic_s_size_ends_at_the_router(site: Site):
+def test_the_router_drops_oversized_messages(site: Site):
     health = topics.HEALTH["trainer"]
     with Bus(site.local, "recorder", "r-1") as ear, site.session("trainer") as session:
         heard = ear._lanes.session("bulk").declare_subscriber(health.key("jet1"))

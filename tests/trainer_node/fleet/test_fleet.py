@@ -1,4 +1,4 @@
-"""One trainer for many plants: together as alone, garbage kept apart, plants that come, go and come back."""
+"""One trainer for several plants: results as for single plants, separation, and plants that come and go."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from protocol.topics import Topic
 from trainer_node.descent import Problem, descend_together
 from trainer_node.fleet import discovery
 from trainer_node.fleet.discovery import LastHeard, SharedRouter
-from trainer_node.fleet.fleet import SAY_EVERY_S, Fleet, _Followed, seed_of
+from trainer_node.fleet.fleet import LOG_EVERY_S, Fleet, _Followed, seed_of
 from trainer_node.node import COUNTERS, TrainerNode
 from trainer_node.training import Draw, Trainer, use_one_thread
 from trainer_node.training_round import MOST_STACKED, train_round
@@ -56,7 +56,7 @@ def description(architecture: str = "mlp", window: int = 1) -> NetworkDescriptio
 
 
 class Pupil:
-    """A plant's trainer with samples of a plant of its own, and the K it trains under."""
+    """A plant's trainer with samples of its own plant, and the K for its training."""
 
     def __init__(self, network: NetworkDescription, number: int, samples: int):
         rng = np.random.default_rng([3, number])
@@ -81,7 +81,7 @@ class Pupil:
 
 
 @pytest.mark.parametrize(("architecture", "window"), [("mlp", 1), ("rnn", 3), ("cnn", 4)])
-def test_together_as_alone(architecture: str, window: int) -> None:
+def test_training_together_equals_training_alone(architecture: str, window: int) -> None:
     network = description(architecture, window)
     alone = [Pupil(network, k, count) for k, count in enumerate(SAMPLES)]
     found = [pupil.trainer.train(pupil.output, "c") for pupil in alone]
@@ -96,12 +96,12 @@ def test_together_as_alone(architecture: str, window: int) -> None:
         sent = [layer.numpy() for layer in one.layers]
         moved = max(np.abs(a - b).max() for a, b in zip(sent, pupil.hidden, strict=True))
         apart = max(np.abs(a - b).max() for a, b in zip(sent, many.hidden, strict=True))
-        # float32, 40 steps: the order of the sums is all that differs.
+        # float32, 40 steps: only the order of the sums differs.
         assert apart < 1e-3 * moved
         assert pupil.trainer.finish(draw, many) is not None
 
 
-def test_a_plant_that_diverges_changes_no_bit_of_the_others() -> None:
+def test_a_diverging_plant_does_not_affect_the_others() -> None:
     healthy = [Pupil(description(), k, 100) for k in range(3)]
     draws = [pupil.draw() for pupil in healthy]
     problems = [draw.problem for draw in draws]
@@ -119,7 +119,7 @@ def test_a_plant_that_diverges_changes_no_bit_of_the_others() -> None:
             np.testing.assert_array_equal(a, b)
 
 
-def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
+def test_a_silent_plant_is_dropped_and_can_return() -> None:
     heard = LastHeard("jet*")
     heard.note("tandem/jet1/controller/samples", 0.0)
     heard.note("tandem/pump/controller/samples", 0.0)
@@ -129,32 +129,32 @@ def test_a_plant_that_is_silent_is_dropped_and_comes_back() -> None:
     assert heard.present(20.0) == ["jet1"]
 
 
-def test_a_stranger_who_invents_names_fills_no_memory() -> None:
+def test_invented_names_do_not_fill_the_memory() -> None:
     heard = LastHeard("*")
     for k in range(discovery.MOST_PLANTS + 100):
         heard.note(f"tandem/x{k}/controller/samples", 0.0)
     assert len(heard.present(0.0)) == discovery.MOST_PLANTS
 
 
-class Nobody(SharedRouter):
-    """A router behind which there is no plant."""
+class NoPlants(SharedRouter):
+    """A router without plants."""
 
     def __init__(self) -> None:
         super().__init__(Config(), "jet*", cast(Lanes, None))
 
 
-def test_a_fleet_without_plants_says_what_it_waits_for_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_fleet_without_plants_logs_regularly(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    fleet = Fleet(Nobody())
-    for now in (0.0, 1.0, SAY_EVERY_S - 1.0, SAY_EVERY_S + 1.0):
+    fleet = Fleet(NoPlants())
+    for now in (0.0, 1.0, LOG_EVERY_S - 1.0, LOG_EVERY_S + 1.0):
         fleet.turn(now)
     assert caplog.messages == ["waiting for a plant that matches 'jet*'"] * 2
 
 
-def test_a_plant_that_was_away_between_two_looks_is_taken_in_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a round of training that took longer than the renewal of its certificate."""
+def test_a_plant_with_new_lanes_is_added_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This happens after a round of training that took longer than the renewal of a certificate."""
 
-    class Renewed(Nobody):
+    class Renewed(NoPlants):
         def present(self, now: float) -> list[str]:
             return ["jet1"]
 
@@ -163,17 +163,17 @@ def test_a_plant_that_was_away_between_two_looks_is_taken_in_anew(monkeypatch: p
     fleet, end = Fleet(Renewed()), ExitStack()
     end.callback(ended.append, "jet1")
     fleet._nodes["jet1"] = _Followed(cast(TrainerNode, None), cast(Lanes, "those before"), end)
-    monkeypatch.setattr(Fleet, "_take_in", lambda _fleet, name: taken.append(name))
+    monkeypatch.setattr(Fleet, "_add_plant", lambda _fleet, name: taken.append(name))
     fleet._update_plants(0.0)
     assert (ended, taken) == (["jet1"], ["jet1"])
 
 
-def test_the_seed_is_the_name_and_not_the_order() -> None:
+def test_the_seed_depends_on_the_name_and_not_on_the_order() -> None:
     assert seed_of(0, "jet1") == seed_of(0, "jet1") != seed_of(0, "jet2") != seed_of(1, "jet2")
 
 
 class Silent:
-    """In place of a bus and of a health: what is published is counted."""
+    """Replaces a bus and a health publisher, and counts the published messages."""
 
     def __init__(self, config: Config):
         self.config, self.bad, self.run_id, self.published = config, RejectedMessages(), "trainer", 0
@@ -189,7 +189,7 @@ class Silent:
 
 
 def waiting(network: NetworkDescription, number: int, since: float) -> tuple[TrainerNode, Silent]:
-    """A plant that has waited for its training since then."""
+    """Return a plant that has waited for its training since the given time."""
     pupil, bus = Pupil(network, number, 40), Silent(Config(trainer=TRAINING))
     health, askers = cast(HealthPublisher, bus), cast(Executor, None)
     node = TrainerNode(bus.config, cast(Bus, bus), health, dict.fromkeys(COUNTERS, 0), askers)
@@ -198,7 +198,7 @@ def waiting(network: NetworkDescription, number: int, since: float) -> tuple[Tra
     return node, bus
 
 
-def test_who_has_waited_longest_comes_first_and_nobody_is_left_behind() -> None:
+def test_the_longest_waiting_plant_is_trained_first() -> None:
     wide = description("rnn", 3)
     since = np.random.default_rng(0).permutation(40)
     fleet_of = [waiting(wide if k % 4 == 0 else description(), k, float(since[k])) for k in range(40)]
@@ -212,6 +212,6 @@ def test_who_has_waited_longest_comes_first_and_nobody_is_left_behind() -> None:
     assert all(len(round_) <= MOST_STACKED for round_ in trained)
     assert sorted(k for round_ in trained for k in round_) == list(range(40))
     for round_, later in itertools.pairwise(trained):
-        # The first of a round has waited longer than everybody who comes later.
+        # The first plant of a round has waited longer than all plants of later rounds.
         assert min(since[round_]) < min(since[later])
     assert all(len({k % 4 == 0 for k in round_}) == 1 for round_ in trained)

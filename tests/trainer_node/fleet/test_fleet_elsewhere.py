@@ -1,4 +1,4 @@
-"""One trainer, plants with a router each: every link has its own certificate, and none holds up another."""
+"""One trainer and plants with a router each: every link has its own certificate, and none delays another."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.live
 
 
 def site(folder: Path, name: str, *more: str) -> Config:
-    """The configuration of one plant's machine: a router with a local endpoint and one for others, and its keys."""
+    """Return the configuration of one plant's machine: a router with a local and a remote endpoint, and its keys."""
     certificate_authority.create(name, [], folder / name, 30)
     door = free_endpoint().replace("tcp/", "tls/")
     return live_config(
@@ -34,7 +34,7 @@ def site(folder: Path, name: str, *more: str) -> Config:
 
 
 def fleet(folder: Path, *sites: Config) -> Config:
-    """The trainer's configuration: all sites, with the trainer's folder of each."""
+    """Return the trainer's configuration: all sites, with the trainer's folder of each."""
     places = ", ".join(
         f'{{name="{one.name}", endpoint="{one.bus.remote}", keys="{folder / one.name / "trainer"}"}}'
         for one in sites
@@ -46,7 +46,7 @@ def fleet(folder: Path, *sites: Config) -> Config:
 def routing(config: Config) -> Iterator[None]:
     with Process("node_runtime.router", config) as process:
         assert any("with certificates, on" in line for line in process.lines())
-        # Read on: a full pipe would stop it.
+        # Keep reading, because a full pipe would block the process.
         threading.Thread(target=lambda: list(process.lines()), daemon=True).start()
         yield
 
@@ -86,7 +86,7 @@ def test_plants_behind_routers_of_their_own_get_weights_from_one_trainer(tmp_pat
             assert plant.adopted[-1].for_run == plant.run_id
 
 
-def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_relent(
+def test_a_refusing_router_delays_no_other_plant_and_is_retried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN_S", 0.2)
@@ -102,15 +102,15 @@ def test_a_router_that_refuses_one_plants_trainer_holds_up_no_other_and_may_rele
         stack.enter_context(training(fleet(tmp_path, good, other)))
         first.until(published, tick=True)
         assert any("jet2" in text and "no such folder" in text for text in caplog.messages)
-        # Its folder is copied there at last.
+        # Its folder is copied to the right place at last.
         kept.rename(right)
         second.until(published, tick=True)
 
 
-def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
+def test_an_unexpected_error_of_one_plant_does_not_end_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("trainer_node.fleet.fleet.LEFT_ALONE_S", 0.5)
+    monkeypatch.setattr("trainer_node.fleet.fleet.PAUSE_S", 0.5)
     listen = TrainerNode.listen
     looks: list[float] = []
 
@@ -134,7 +134,7 @@ def test_a_plant_that_nobody_foresaw_does_not_end_the_others(
     assert any("jet1 is left alone" in text for text in caplog.messages)
 
 
-def test_no_plant_is_told_of_the_others(tmp_path: Path) -> None:
+def test_no_plant_receives_the_list_of_the_others(tmp_path: Path) -> None:
     sites = [site(tmp_path, name) for name in ("jet1", "jet2")]
     config = fleet(tmp_path, *sites)
     said = to_json(RouterPerPlant(config, config.trainer.fleet, threading.Event()).config("jet1"))
@@ -147,7 +147,7 @@ def test_a_pattern_chooses_from_the_list(tmp_path: Path, caplog: pytest.LogCaptu
     assert "no plant of trainer.fleet matches 'pump*'; it has jet1" in caplog.text
 
 
-def test_the_list_in_a_file(tmp_path: Path) -> None:
+def test_the_list_is_read_from_a_file(tmp_path: Path) -> None:
     file = tmp_path / "fleet.toml"
     text = '[[trainer.fleet]]\nname = "jet1"\nendpoint = "tls/10.0.0.5:7448"\n'
     file.write_text(text)
@@ -169,7 +169,7 @@ def test_the_list_in_a_file(tmp_path: Path) -> None:
         assert str(file) in str(raised.value)
 
 
-def test_a_link_whose_certificate_is_over_is_opened_anew_with_the_next(
+def test_a_link_with_an_expired_certificate_is_reopened_with_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("trainer_node.fleet.discovery.TRY_AGAIN_S", 0.2)

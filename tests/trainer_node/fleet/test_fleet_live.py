@@ -1,4 +1,4 @@
-"""The trainer of a fleet on a real bus: plants are found by what they say, and each gets its own weights."""
+"""The trainer of a fleet on a real bus: plants are found by their messages, and each gets its own weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.live
 
 @pytest.fixture
 def fleet(config: Config) -> Iterator[Config]:
-    """A trainer of all jets in a thread."""
+    """Run a trainer of all jets in a thread."""
     stop = threading.Event()
     thread = threading.Thread(target=main, args=[config, stop, "jet*"])
     thread.start()
@@ -33,7 +33,7 @@ def named(config: Config, name: str) -> Config:
     return msgspec.structs.replace(config, name=name)
 
 
-def test_two_plants_get_weights_each_and_a_stranger_gets_none(
+def test_two_plants_get_weights_and_an_unmatched_one_gets_none(
     fleet: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -54,8 +54,8 @@ def test_two_plants_get_weights_each_and_a_stranger_gets_none(
     assert "pump" not in caplog.text
 
 
-def test_many_plants_have_no_thread_each(fleet: Config) -> None:
-    """Between the second plant and the sixth, the trainer starts none but those that wait for answers."""
+def test_the_number_of_threads_does_not_grow_with_the_plants(fleet: Config) -> None:
+    """Between the second plant and the sixth, the trainer starts only threads that wait for answers."""
     with ExitStack() as stack:
 
         def comes(name: str) -> None:

@@ -1,0 +1,1 @@
+"""A log as tables for other tools: CSV, Parquet and Rerun."""
