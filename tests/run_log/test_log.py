@@ -63,6 +63,17 @@ def test_attachments_say_what_ran(whole: Path, config: Config) -> None:
     assert "state_verdict" in schemas["types"]["Tick"]["properties"]
 
 
+def test_metadata_have_it_too_and_name_the_clock(whole: Path, config: Config) -> None:
+    with whole.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert found["tandem"]["clock"] == "Unix time of the machine that recorded"
+    assert found["tandem"]["log_time"] == "arrival at the recorder"
+    assert found["units"]["rdot"] == "1/s"
+    assert (found["seeds"], found["versions"]) == ({"seed": "7"}, {"python": "3.11"})
+    assert found["configuration"]["controller.keyframe_every"] == "20"
+    assert found["configuration"]["controller.solver.mode"] == config.controller.solver.mode
+
+
 def test_a_reader_that_is_not_ours_reads_it_all(whole: Path, messages: list[Logged]) -> None:
     raw, views, series = 0, 0, 0
     with whole.open("rb") as stream:
