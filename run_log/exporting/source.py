@@ -27,7 +27,7 @@ class Logged(NamedTuple):
     """One message of a log, as it travelled."""
 
     name: str
-    """Of its topic, its key below `tandem/<plant>/`."""
+    """The key of its topic below `tandem/<plant>/`."""
     log_time: int
     """ns, as `Entry.log_time`."""
     payload: bytes

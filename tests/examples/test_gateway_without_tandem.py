@@ -183,7 +183,7 @@ ODD += [{}, {"x": 1.0}, {b"x": 1.0}, [{1: 1.0}], [1.0], [[1e308], [-1e308]], "x"
 
 
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:20])
-def test_no_message_stops_it(odd: Any) -> None:
+def test_no_message_stops_the_monitor(odd: Any) -> None:
     good = msgspec.msgpack.decode(some_command(np.random.default_rng(2), 0, 0))
     payloads = [msgspec.msgpack.encode(odd), msgspec.msgpack.encode(odd) * 2]
     for key in good:

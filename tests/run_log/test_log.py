@@ -51,7 +51,7 @@ def test_every_byte_comes_back(whole: Path, config: Config, messages: list[Logge
     assert len(run.samples) == STEPS - 1
 
 
-def test_attachments_say_what_ran(whole: Path, config: Config) -> None:
+def test_attachments_have_versions_configuration_and_plant(whole: Path, config: Config) -> None:
     attached = read_run(whole).attachments
     assert from_json(attached["config.json"].decode()) == config
     assert b"keyframe_every = 20" in attached["config.toml"]
@@ -63,7 +63,7 @@ def test_attachments_say_what_ran(whole: Path, config: Config) -> None:
     assert "state_verdict" in schemas["types"]["Tick"]["properties"]
 
 
-def test_metadata_have_it_too_and_name_the_clock(whole: Path, config: Config) -> None:
+def test_metadata_has_units_versions_configuration_and_the_clock(whole: Path, config: Config) -> None:
     with whole.open("rb") as stream:
         found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
     assert found["tandem"]["clock"] == "Unix time of the machine that recorded"
@@ -74,7 +74,7 @@ def test_metadata_have_it_too_and_name_the_clock(whole: Path, config: Config) ->
     assert found["configuration"]["controller.solver.mode"] == config.controller.solver.mode
 
 
-def test_a_reader_that_is_not_ours_reads_it_all(whole: Path, messages: list[Logged]) -> None:
+def test_a_foreign_reader_reads_every_message(whole: Path, messages: list[Logged]) -> None:
     raw, views, series = 0, 0, 0
     with whole.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -125,7 +125,7 @@ def test_views_have_the_plants_names(whole: Path) -> None:
     assert "view/controller/keyframe" not in shown
 
 
-def test_garbage_is_logged_as_it_came(tmp_path: Path, config: Config) -> None:
+def test_garbage_is_logged_unchanged(tmp_path: Path, config: Config) -> None:
     state = m.PlantState(run_id="p", seq=0, t=0.0, x=[0.0] * 4, applied=None, source="hold", command_seq=-1)
     nan = codec.encode(msgspec.structs.replace(state, x=[float("nan"), 0.0, 0.0, 0.0]))
     short = codec.encode(msgspec.structs.replace(state, x=[1.0, 2.0]))
@@ -221,7 +221,7 @@ def file_size_limit(limit: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_after_a_full_disk_the_log_goes_on_where_it_stopped(
+def test_after_a_full_disk_the_log_continues_where_it_stopped(
     tmp_path: Path, config: Config, messages: list[Logged]
 ) -> None:
     path = tmp_path / "run.mcap"
