@@ -51,7 +51,7 @@ def test_a_wheel_by_way_of_the_source_distribution_is_the_same(
     assert content(build_wheel(unpacked, tmp_path / "wheel")) == expected
 
 
-def test_the_wheel_names_its_extras(wheel: Path):
+def test_the_wheel_declares_its_extras(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
         said = archive.read(name).decode().splitlines()

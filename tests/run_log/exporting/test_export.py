@@ -232,7 +232,7 @@ def test_fields_that_come_late_are_empty_before(exported: Exported, out: Path) -
     assert not list(out.rglob("*.old"))
 
 
-def test_what_has_no_row_is_counted(exported: Exported) -> None:
+def test_messages_without_a_row_are_counted(exported: Exported) -> None:
     assert exported.bad == {"plant/state: malformed": 1}
     assert exported.strangers == {"plant/unheard_of": 1}
     assert exported.damage == exported.notes == []
