@@ -25,7 +25,16 @@ if TYPE_CHECKING:
 
 FROM_CONFIG = "(default: the configuration's)"
 OPTIONAL_PACKAGES = (
-    "torch", "mcap", "msgpack", "zstandard", "matplotlib", "jinja2", "pyarrow", "rerun", "websockets", "distributed"
+    "torch",
+    "mcap",
+    "msgpack",
+    "zstandard",
+    "matplotlib",
+    "jinja2",
+    "pyarrow",
+    "rerun",
+    "websockets",
+    "distributed",
 )
 """Packages of the extras. If one is missing, the command ends with a message."""
 NO_SETS, INTERRUPTED = 3, 130
