@@ -81,7 +81,9 @@ def found(name: str) -> list[str]:
     """What is wrong with a file."""
     text = (ROOT / name).read_text(encoding="utf-8")
     said = [f"{len(line)} characters: {line.strip()[:60]}..." for line in long_lines(name, text)]
-    said += [f"{mark[0]}: a merge that was not finished" for mark in re.finditer("^[<>]{7} ", text, re.MULTILINE)]
+    said += [
+        f"{mark[0]}: a merge that was not finished" for mark in re.finditer("^[<>]{7} ", text, re.MULTILINE)
+    ]
     read = prose(name, text)
     why = list(PATTERNS.values())
     said += [
