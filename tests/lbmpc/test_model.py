@@ -116,7 +116,7 @@ def test_the_published_P_is_not_multiplied_by_the_period() -> None:
 
 def test_an_invalid_terminal_cost_is_refused_with_a_remedy() -> None:
     with pytest.raises(
-        ModelError, match=r"'published' at a period of 0\.5 s does not bound .* take 'riccati'"
+        ModelError, match=r"'published' at a period of 0\.5 s does not bound .* use 'riccati'"
     ):
         build_model(PLANT, 0.5, terminal="published")
 

@@ -321,7 +321,7 @@ def test_perfect_replays_a_named_truth_once_it_is_named_again(here: Path, capsys
     ("body", "text"),
     [
         ("raise RuntimeError('no licence')", "Own.step: RuntimeError: no licence"),
-        ("return [1.0]", "Own.step: it returned (1,) numbers, the state has (2,)"),
+        ("return [1.0]", "Own.step: it returned an array of shape (1,), but the state has (2,)"),
         ("return [float('nan'), 1.0]", "Own.step: the state is not finite"),
         ("return 'nonsense'", "Own.step: ValueError"),
     ],
