@@ -1,4 +1,4 @@
-"""Messages to bytes and back. What cannot be trusted raises `BadMessage`, with a reason that can be counted."""
+"""Messages to bytes and back. An invalid payload raises `BadMessage`, with a reason that can be counted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.topics import Topic
 Reason = Literal["oversized", "malformed", "not finite", "wrong size"]
 T = TypeVar("T", bound=msgspec.Struct)
 UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError)
-"""All that msgspec raises for bytes that are none of ours."""
+"""All exceptions that msgspec raises for invalid bytes."""
 
 
 class BadMessage(ValueError):
@@ -40,14 +40,14 @@ def encode(message: m.Message) -> bytes:
 
 
 class Head(msgspec.Struct):
-    """What every message begins with, whatever else is in it."""
+    """The first fields of every message."""
 
     run_id: m.RunId
     seq: m.Sequence
 
 
 def head_of(payload: bytes) -> Head | None:
-    """Who wrote a message, and its number, without a look at the rest of it; None where that cannot be read."""
+    """Return a message's writer and number without decoding the rest; None if they cannot be read."""
     try:
         return decode_as(Head, payload)
     except UNREADABLE:
@@ -89,7 +89,7 @@ WITHOUT_FLOATS = (
 
 @cache
 def _fields_with_floats(kind: type[msgspec.Struct]) -> tuple[str, ...]:
-    """The fields of a Struct in which there can be a float: most of a message's fields are texts and counts."""
+    """Return the fields of a Struct that may contain a float; most fields are texts and counts."""
     fields = msgspec.structs.fields(kind)
     return tuple(field.name for field in fields if _may_hold_float(inspect.type_info(field.type)))
 
@@ -110,7 +110,7 @@ def _may_hold_float(kind: inspect.Type) -> bool:
 
 
 def _surely_finite(value: object) -> bool:
-    """False where `first_non_finite` has to look closer; quick, for it is asked of every message of a fast loop."""
+    """Return False if `first_non_finite` must look closer; fast, because it runs on every message of a fast loop."""
     if isinstance(value, float):
         return isfinite(value)
     if value is None or value is msgspec.UNSET:
@@ -131,7 +131,7 @@ def _surely_finite(value: object) -> bool:
 
 
 def first_non_finite(value: object, path: str = "") -> str | None:
-    """Name of the first field that holds a NaN or an infinity, or None. msgspec lets both pass."""
+    """Return the name of the first field with a NaN or an infinity, or None. msgspec accepts both."""
     if isinstance(value, float):
         return None if isfinite(value) else path or "value"
     if value is None:
@@ -157,7 +157,7 @@ def first_non_finite(value: object, path: str = "") -> str | None:
 
 
 def check_dimensions(topic: Topic, message: m.Message, d: int, m_inputs: int) -> None:
-    """Raise `BadMessage` when a vector's length is not the plant's: d states, m_inputs inputs."""
+    """Raise `BadMessage` if a vector's length is not the plant's: d states, m_inputs inputs."""
 
     def wrong(detail: str) -> BadMessage:
         return BadMessage(topic.name, "wrong size", detail)

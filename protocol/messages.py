@@ -20,30 +20,30 @@ import msgspec
 import numpy as np
 
 LARGEST = 2**63 - 1
-"""Memories, logs and third parties' readers hold numbers in 64 bits with a sign."""
+"""Largest number: memories, logs and other programs hold signed 64-bit integers."""
 Count = Annotated[int, msgspec.Meta(ge=0, le=LARGEST)]
 Sequence = Annotated[int, msgspec.Meta(ge=-1, le=LARGEST)]
-"""A sequence number; -1 stands for "none yet"."""
+"""A sequence number; -1 means "none yet"."""
 RunId = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Digest = Annotated[str, msgspec.Meta(max_length=64)]
 
 InputSource = Literal["hold", "command", "plan", "safe", "manual"]
-"""What drove the plant: held at x0, a fresh command, the backup policy or else the last plan, the local safe input, a
-person."""
+"""Source of the input: held at x0, a fresh command, the backup policy or else the last plan, the local safe input, or
+manual control."""
 CommandMode = Literal["solver", "shifted_plan", "feedback"]
 StateVerdict = Literal["fresh", "stale", "missing"]
 WeightsOutcome = Literal["none", "adopted", "refused"]
 TargetStatus = Literal["none", "reached", "nearest", "no rest"]
 ReferenceKind = Literal["set", "hold", "configured"]
-"""set: outputs go to values; hold: the plant stays where it is, as far as it can rest there; configured: what the
-configuration says."""
+"""set: outputs go to values; hold: the plant stays at the nearest equilibrium; configured: the reference of the
+configuration."""
 ProcessStatus = Literal["starting", "ready", "running", "stopping", "failed"]
 BAD = "bad_"
-"""What the counters of messages that are not obeyed begin with."""
+"""Prefix of the counters of messages that are not obeyed."""
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every message carries: who wrote it, and its place in that writer's sequence."""
+    """Fields of every message: its writer, and its number within that run."""
 
     run_id: RunId
     seq: Sequence
@@ -61,7 +61,7 @@ class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     data: bytes
 
     def __post_init__(self) -> None:
-        # A shape with a 0 in it fits no data at all, whatever its other numbers; numpy refuses those it cannot hold.
+        # A shape with a 0 in it has no data, whatever its other numbers; numpy refuses those it cannot hold.
         if len(self.shape) > DIMENSIONS or math.prod(max(1, length) for length in self.shape) > LONGEST:
             raise ValueError(f"no array has the shape {str(self.shape)[:80]}")
         expected = math.prod(self.shape) * np.dtype(self.dtype).itemsize
@@ -76,7 +76,7 @@ class Array(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(dtype, list(packed.shape), packed.tobytes())
 
     def numpy(self) -> np.ndarray:
-        """A fresh writable copy, in this machine's byte order."""
+        """Return a new writable copy, in this machine's byte order."""
         return np.frombuffer(self.data, dtype=self.dtype).reshape(self.shape).astype(self.dtype[1:])
 
 
@@ -88,25 +88,25 @@ class Piece(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlantState(Message, frozen=True, kw_only=True):
-    """One sample of the plant, x(t), and the input that really acted since the sample before."""
+    """One sample of the plant, x(t), and the input that acted since the previous sample."""
 
     t: float
     """Seconds on the plant's own monotonic clock."""
     x: list[float]
     applied: list[float] | None
-    """Time average of the input over the last period; None where that period was not a whole one."""
+    """Time average of the input over the last period; None if that period was incomplete."""
     pieces: list[Piece] = msgspec.field(default_factory=list)
-    """The inputs that made up that period, in order, where there was more than one; else empty. Where it was not a
-    whole one, those that acted in it: the last still acts."""
+    """The inputs of that period, in order, if there were several; else empty. In an incomplete period, those that acted
+    in it: the last still acts."""
     source: InputSource
     command_seq: Sequence
     """Tick of the last command received, -1 before the first."""
     missing: list[str] | msgspec.UnsetType = msgspec.UNSET
-    """States of which no number came, by name; their entries of x count nothing. Unset, and no byte, where all did."""
+    """Names of the states without a reading; their entries of x are ignored. Unset, and no byte, if there are none."""
 
     @property
     def acting(self) -> list[float] | None:
-        """The input that acts at this sample, (m,); None where that is not known."""
+        """The input that acts at this sample, (m,); None if it is not known."""
         return self.pieces[-1].u if self.pieces else self.applied
 
 
@@ -115,7 +115,7 @@ class Command(Message, frozen=True):
 
     state_run_id: str
     state_seq: Sequence
-    """The `PlantState` that this command answers; -1 when it answers none (follows the shifted plan)."""
+    """Number of the `PlantState` that this command answers; -1 if it answers none (it follows the shifted plan)."""
     period: float
     """Seconds between the entries of `plan`."""
     mode: CommandMode
@@ -125,7 +125,7 @@ class Command(Message, frozen=True):
 
 
 class Backup(Message, frozen=True):
-    """What to follow when no command comes any more, from one period after command `seq` began to act.
+    """What to follow if no further command comes, from one period after command `seq` began to act.
 
     In the i-th period from then on u = inputs[i] + gain x, with x as the plant's own sensors have it at that period's
     beginning; plant units.
@@ -150,42 +150,41 @@ class HiddenWeights(Message, frozen=True):
     """Hash of the hidden weights that the controller held at T_k."""
     samples: Count
     loss_before: float
-    """On what it was trained on; where labels have a variance on what was held out, in units of that variance."""
+    """Loss on the training data; if labels have a variance, on held-out data in units of that variance."""
     loss_after: float
     network_sha256: Digest
     sha256: Digest
     layers: list[Array]
     """Hidden layer i as (1 + n_{i-1}, n_i); the first row is the bias."""
     newest: Sequence | msgspec.UnsetType = msgspec.UNSET
-    """The last sample of that run that had a part in it, -1: none; unset, and no byte, where labels are exact."""
+    """The last sample of that run in the training data, -1: none; unset, and no byte, if labels are exact."""
 
 
 MOST_POINTS = 1000
 Lease = Annotated[float, msgspec.Meta(gt=0, le=60)]
-"""Seconds for which a person's word counts that is not said again."""
+"""Seconds for which a person's message counts without a repetition."""
 
 
 class Reference(Message, frozen=True):
-    """Where the plant shall go, from the tick on that latches it.
+    """A reference for the plant, from the tick on that latches it.
 
-    From where the reference is then it leads in a straight line to the first point, and from point to point. It stays
-    at the last. Two points of one time are a jump. To say it again in time is a lease; it is not followed from its
-    beginning again then.
+    It leads in a straight line from the present reference to the first point, and from point to point. It stays at the
+    last one. Two points of one time are a step. A repetition renews the lease and does not start the reference again.
     """
 
     kind: ReferenceKind = "set"
     outputs: list[str] = []
     """Names of the states that are outputs; with `set` only."""
     times: Annotated[list[float], msgspec.Meta(max_length=MOST_POINTS)] = []
-    """Of the points, seconds from that tick on, none of them less than the one before."""
+    """Times of the points, seconds from that tick on, in ascending order."""
     values: Annotated[list[list[float]], msgspec.Meta(max_length=MOST_POINTS)] = []
     """(points, outputs), plant units."""
     lease: Lease | None = None
-    """After so long without a repetition the configured reference is back; None: it stays."""
+    """Seconds without a repetition until the configured reference returns; None: it does not."""
 
 
 class Override(Message, frozen=True):
-    """A hand on the plant's input. It counts until `auto`, or until its lease is over."""
+    """Manual control of the plant's input. It counts until `auto`, or until its lease ends."""
 
     mode: Literal["manual", "auto"]
     u: list[float] = []
@@ -194,7 +193,7 @@ class Override(Message, frozen=True):
 
 
 class Tick(Message, frozen=True):
-    """All that one control step depends on: the latched inputs and every verdict that depended on time."""
+    """Everything on which one control step depends: the latched inputs and every verdict that depended on time."""
 
     slot: Count
     """Slots since the loop began; seq + the slots skipped so far."""
@@ -208,11 +207,11 @@ class Tick(Message, frozen=True):
     state_verdict: StateVerdict
     state: PlantState | None
     weights: HiddenWeights | None
-    """Hidden weights that arrived since the tick before; adopted or refused within this tick."""
+    """Hidden weights that arrived since the previous tick; adopted or refused within this tick."""
     truth: dict[str, float] = msgspec.field(default_factory=dict)
-    """Parameters of the true plant that are others from this tick on: what an experiment tells the oracle `perfect`."""
+    """Parameters of the true plant that change in this tick: an experiment tells them to the oracle `perfect`."""
     reference: Reference | msgspec.UnsetType = msgspec.UNSET
-    """That arrived since the tick before, the last of several; unset, and no byte, where there was none."""
+    """The last one that arrived since the previous tick; unset, and no byte, if there was none."""
 
     @classmethod
     def punctual(
@@ -225,7 +224,7 @@ class Tick(Message, frozen=True):
         truth: Mapping[str, float] | None = None,
         reference: Reference | msgspec.UnsetType = msgspec.UNSET,
     ) -> Tick:
-        """Of a loop that never skips a slot; a state that is there is fresh."""
+        """A tick of a loop that never skips a slot; a state, if there is one, is fresh."""
         return cls(
             run_id=run_id,
             seq=seq,
@@ -243,7 +242,7 @@ class Tick(Message, frozen=True):
 
 
 class TickResult(Message, frozen=True):
-    """What one control step concluded; a pure function of the ticks up to this one."""
+    """The result of one control step; a pure function of the ticks up to this one."""
 
     x: list[float]
     u: list[float]
@@ -253,7 +252,7 @@ class TickResult(Message, frozen=True):
     slack: float
     """Largest state-constraint violation of the nominal plan, as a share of that state's half-width."""
     slack_row: str
-    """Which row that is, as "y at step 3"; empty when none."""
+    """That row, as "y at step 3"; empty if none."""
     h: list[float] | None
     """Measured h(x_{t-1}, u_{t-1}) = x_t - A x_{t-1} - B u_{t-1}, in deviation coordinates."""
     h_hat: list[float] | None
@@ -265,51 +264,51 @@ class TickResult(Message, frozen=True):
     hidden_version: Sequence
     hidden_sha256: Digest
     tick_crc32: Count
-    """Of the tick's bytes: a replay of a tick that was changed in any bit cannot reproduce this result."""
+    """Hash of the tick's bytes: a replay of a tick with any changed bit cannot reproduce this result."""
     input_delay: float
     """Seconds for which the state was predicted ahead before the problem was solved."""
     weights_verdict: str
     """"none", "adopted", or "refused: <reason>"."""
     set_margin: float | None = None
     """Distance of the state to the boundary of the certified sets, as a share of X's half-widths, negative outside;
-    None where there are no such sets, or no state."""
+    None without such sets, or without a state."""
     set_piece: int = -1
-    """Which of the certified sets the state is in; -1: none."""
+    """Number of the certified set that holds the state; -1: none."""
     weights_rolled_back: str = ""
-    """Why the hidden weights and K from before came back in this tick; empty where they did not."""
+    """Why the previous hidden weights and K came back in this tick; empty if they did not."""
     target_status: TargetStatus = "none"
-    """Of the target: whether its outputs are where they should be, as near as a rest allows, or no rest was found.
-    none: the configuration has no reference, and the plan aims at the equilibrium."""
+    """reached: the target's outputs are at their reference; nearest: as near as an equilibrium allows; no rest: no
+    equilibrium was found; none: there is no reference, and the plan aims at x_e."""
     target_x: list[float] = []
-    """x of the target; empty where there is none."""
+    """x of the target; empty if there is none."""
     target_u: list[float] = []
     target_distance: float | None = None
-    """How far its outputs are from where they should be: the largest, as a share of the output's half-width."""
+    """Largest distance of its outputs from their reference, as a share of the output's half-width."""
     sensor_faults: dict[str, str] = msgspec.field(default_factory=dict)
-    """Sensors that are not believed, by the names of their states: what is wrong, and what is known of these states."""
+    """Sensor faults, by the names of their states: the fault, and what is known of these states."""
     reference: dict[str, float] = {}
-    """Where the outputs should be in this tick, by name, plant units; empty where there are none."""
+    """Reference of the outputs in this tick, by name, plant units; empty if there is none."""
     reference_verdict: str = "none"
-    """Of the tick's reference: "none", "taken", or "refused: <reason>"."""
+    """Verdict on the tick's reference: "none", "taken", or "refused: <reason>"."""
     reference_from: str = ""
-    """run_id of who sent that; empty without one."""
+    """run_id of its sender; empty without one."""
     weight: list[float] = []
-    """What of the network counts in the prediction of each state, 0 to 1; empty where nothing weighs it."""
+    """Weight of the network in the prediction of each state, 0 to 1; empty if nothing weighs it."""
     constant_weight: list[float] = []
-    """What counts of a constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
+    """Weight of the constant beside it, that of `lbmpc.oracles.dnn.evidence`, likewise."""
     deviation: list[float] = []
-    """Standard deviation of each state as it is estimated, its own units; empty where a sample is the state."""
+    """Standard deviation of each estimated state, its own units; empty if the sample is the state."""
     noise: list[float] = []
-    """Standard deviation of what is measured of each state as the estimator found it, its own units, 0 of those that
-    are not measured; empty where it was told."""
+    """Standard deviation of each state's measurement noise as found by the estimator, its own units, 0 for unmeasured
+    states; empty if the noise is configured."""
 
     def noise_of(self, states: tuple[str, ...]) -> dict[str, float] | None:
-        """`noise` by the names of those that are measured; None where none was found."""
+        """`noise` by the names of the measured states; None if none was found."""
         return {name: one for name, one in zip(states, self.noise, strict=False) if one > 0.0} or None
 
     @property
     def weights_outcome(self) -> WeightsOutcome:
-        """What became of the hidden weights on offer."""
+        """Verdict on the hidden weights of a tick."""
         outcome = self.weights_verdict.partition(": ")[0]
         return "adopted" if outcome == "adopted" else "refused" if outcome == "refused" else "none"
 
@@ -320,18 +319,18 @@ def counter_name(*words: str) -> str:
 
 
 def words_of_fault(state: str, fault: str, since: float) -> str:
-    """One entry of `TickResult.sensor_faults` that is there since so many seconds, for a person."""
+    """Return one entry of `TickResult.sensor_faults` that exists since so many seconds, as text for a person."""
     kind, _, known = fault.partition("; ")
     return f"sensor {state} is {kind} since {since:.1f} s; {known}"
 
 
 def weights_verdict(outcome: WeightsOutcome, reason: str = "") -> str:
-    """The text of `TickResult.weights_verdict`."""
+    """Return the text of `TickResult.weights_verdict`."""
     return f"{outcome}: {reason}" if reason else outcome
 
 
 class TickTiming(Message, frozen=True):
-    """What one control step cost on this machine; never part of a replay comparison."""
+    """Durations of one control step on this machine; never part of a replay comparison."""
 
     solve_ms: float
     tick_ms: float
@@ -349,7 +348,7 @@ class Sample(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     past: list[list[float]] = msgspec.field(default_factory=list)
     """The k - 1 pairs (x, u) before this one, oldest first, as the controller's network saw them; empty for k = 1."""
     variance: list[float] = msgspec.field(default_factory=list)
-    """Of h; empty where the label is exact, as what was measured is taken to be."""
+    """Variance of h; empty if the label is exact."""
 
 
 class Samples(Message, frozen=True):
@@ -359,10 +358,10 @@ class Samples(Message, frozen=True):
 
 
 class OutputWeights(Message, frozen=True):
-    """K_t after the adaptation of tick `seq`, and which hidden weights it belongs to."""
+    """K_t after the adaptation of tick `seq`, and the hidden weights to which it belongs."""
 
     hidden_version: Sequence
-    """Highest that was adopted so far: what is trained next needs a higher one. After a rollback the hash says more."""
+    """Highest version adopted so far: new weights need a higher one. After a rollback the hash names the weights."""
     hidden_sha256: Digest
     K: Array
     """(1 + n_L, d), first row the bias; scaled outputs."""
@@ -375,15 +374,15 @@ class HiddenSnapshot(Message, frozen=True):
     """
 
     hidden_version: Sequence
-    """Highest that was adopted so far."""
+    """Highest version adopted so far."""
     hidden_sha256: Digest
     description: str
     """The `NetworkDescription`, as JSON."""
     layers: list[Array]
     judged_version: Sequence = -1
-    """Of the hidden weights that this run adopted or refused last, as their sender numbered them; -1: none yet."""
+    """Version of the hidden weights that this run judged last, as numbered by their sender; -1: none yet."""
     judged_sha256: Digest = ""
-    """As their sender gave it."""
+    """Hash of those, as given by their sender."""
 
 
 class Keyframe(Message, frozen=True):
@@ -391,11 +390,11 @@ class Keyframe(Message, frozen=True):
 
     arrays: dict[str, Array]
     resumed: str = ""
-    """Before the first tick: the run whose memory this one goes on from, from a checkpoint; empty: it began afresh."""
+    """Before the first tick: the run whose memory continues here, from a checkpoint; empty: a new memory."""
 
 
 class CertifiedSets(Message, frozen=True):
-    """The certified sets that a controller keeps its plant in, whole: a replay needs no other file."""
+    """The certified sets of a controller, complete: a replay needs no other file."""
 
     kind: str
     sha256: Digest
@@ -404,7 +403,7 @@ class CertifiedSets(Message, frozen=True):
 
 
 class RunInfo(Message, frozen=True):
-    """What a log needs to be understood and replayed on its own."""
+    """Information with which a log can be understood and replayed on its own."""
 
     process: str
     config: str
@@ -420,18 +419,18 @@ class Gathered(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     topic: str
     ago_ns: Count
-    """How long before the `Batch` was sent it was published."""
+    """Nanoseconds between its publication and that of the `Batch`."""
     payload: bytes
 
 
 class Batch(Message, frozen=True):
-    """Messages of a fast loop that nobody waits for, in the order in which they were published."""
+    """Messages of a fast loop that no process waits for, in the order of their publication."""
 
     messages: list[Gathered]
 
 
 class Health(Message, frozen=True):
-    """How one process is, about twice a second and at every change."""
+    """State of one process, about twice a second and at every change."""
 
     process: str
     status: ProcessStatus

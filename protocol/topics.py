@@ -1,4 +1,4 @@
-"""The one table of topics: what is published, on which lane, how large it may be.
+"""The table of topics: messages, lanes and sizes.
 
 `control` is dropped rather than queued, sent at once, and never waits behind anything. `bulk` blocks, on a
 session and a thread of its own. Everything that travels is logged; what a fast loop leaves out of a topic, and out
@@ -18,7 +18,7 @@ PREFIX = "tandem"
 DIRECT = "@direct"
 PROCESSES = ("router", "plant", "controller", "trainer", "recorder")
 COMMANDER = "commander"
-"""Whoever says where the plant shall go, and takes it by hand."""
+"""The role that gives set-points and drives the plant manually."""
 
 
 @dataclass(frozen=True)
@@ -31,47 +31,47 @@ class Topic:
     writer: str
     max_bytes: int = 64 * 1024
     max_hz: float = math.inf
-    """A loop that ticks faster publishes it at every n-th tick only, and where what it says has changed."""
+    """A faster loop publishes it at every n-th tick only, and when its content changes."""
     view_hz: float = math.inf
-    """Messages a second that get a view in the log; their bytes are all in it, whatever the rate."""
+    """Messages a second that have a view in the log; the log has the bytes of all messages, whatever the rate."""
     batched: bool = False
-    """In a fast loop those who log and show it get many of its messages in one `Batch`; see `batched_at`."""
+    """In a fast loop the log and the viewers get many of its messages in one `Batch`; see `batched_at`."""
 
     @property
     def shared(self) -> bool:
-        """Whether several may write it at a time, and the newest word counts: nobody is shut out for another's sake."""
+        """Whether several clients may write it at a time, and the newest message counts."""
         return self.writer == COMMANDER
 
     def every(self, period: float) -> int:
-        """Ticks from one message to the next in a loop of this period, in seconds."""
+        """Return the number of ticks from one message to the next in a loop of this period, in seconds."""
         return max(1, math.ceil(1.0 / (period * self.max_hz) - 1e-9))
 
     def batched_at(self, rate: float) -> bool:
-        """Whether its messages are logged from a `Batch` at this sampling rate, in Hz."""
+        """Return whether its messages are logged from a `Batch` at this sampling rate, in Hz."""
         return self.batched and rate > BATCH_ABOVE_HZ
 
     def key(self, plant: str) -> str:
         return below(plant, self.name)
 
     def direct_key(self, plant: str) -> str:
-        """Where a fast loop's control messages travel: no wildcard covers it, so only who needs them is woken."""
+        """Key of a fast loop's control messages: no wildcard matches it, so only its subscribers are woken."""
         return below(plant, f"{DIRECT}/{self.name}")
 
     def keys(self, plant: str) -> list[str]:
-        """Every key that its messages may travel at, whatever the rate."""
+        """Return every key at which its messages may travel, whatever the rate."""
         direct = [self.direct_key(plant)] if self.batched and self.lane == "control" else []
         return [self.key(plant), *direct]
 
 
 WEIGHTS_LIMIT = 16 * 1024 * 1024
 
-# Above this rate, in Hz, what is logged and shown travels together; up to it every message travels alone.
+# Above this rate, in Hz, messages for log and viewers travel together; up to it every message travels alone.
 BATCH_ABOVE_HZ = 100.0
-# Seconds for which messages wait for each other, and bytes beyond which they do not.
+# Seconds for which messages of a batch wait, and bytes above which they do not.
 BATCH_S = 0.02
 BATCH_BYTES = 1024 * 1024
 
-# More points than that in a second no plot shows, and each costs as much as the logging itself.
+# No plot shows more points a second, and each costs as much as the logging itself.
 VIEW_HZ = 100.0
 
 PLANT_STATE = Topic("plant/state", m.PlantState, "control", "plant", view_hz=VIEW_HZ, batched=True)
@@ -124,35 +124,35 @@ OUTBOX_QUERY = "controller/outbox"
 HIDDEN_QUERY = "controller/hidden"
 """Queryable: answers with the controller's current `HiddenSnapshot`."""
 USER = "user"
-"""Keys below `tandem/<plant>/user/` are free: anyone's own topics, which are recorded and never obeyed."""
+"""Keys below `tandem/<plant>/user/` are free for topics of users, which are recorded and never obeyed."""
 USER_MAX_BYTES = 256 * 1024
-"""Of one message on such a topic: as large as a command may be."""
+"""Largest message on such a topic: as large as a command may be."""
 LARGEST_QUESTION = 4096
 """Characters of the parameters of a query."""
 
 
 def below(plant: str, name: str) -> str:
-    """The full key of a topic, or of a queryable, of one plant."""
+    """Return the full key of a topic, or of a queryable, of one plant."""
     return f"{PREFIX}/{plant}/{name}"
 
 
 def is_user(name: str) -> bool:
-    """Whether a key below `tandem/<plant>/` is that of a user's own topic."""
+    """Return whether a key below `tandem/<plant>/` belongs to a user's topic."""
     return name.startswith(f"{USER}/")
 
 
 def user_keys(plant: str) -> str:
-    """The key expression that covers all of the users' own topics."""
+    """Return the key expression that covers all topics of users."""
     return below(plant, f"{USER}/**")
 
 
 def everything(plant: str) -> str:
-    """The key expression that covers all of a plant's topics."""
+    """Return the key expression that covers all of a plant's topics."""
     return below(plant, "**")
 
 
 def topic_of(key: str) -> Topic | None:
-    """The topic a full key belongs to, or None for a stranger's key."""
+    """Return the topic of a full key, or None for an unknown key."""
     parts = key.split("/", 2)
     if len(parts) != 3 or parts[0] != PREFIX:
         return None

@@ -1,4 +1,4 @@
-"""The plant file that whoever reads a log names beside it, for what numbers are not enough for."""
+"""A plant file that the reader of a log names, for features that need more than numbers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def name_plant(run: Run, reference: str) -> list[str]:
 
 
 def name_truth(run: Run, reference: str) -> list[str]:
-    """`name_plant`, for the equations that moved in the run. Where the log names a truth of its own it gets `truth`."""
+    """`name_plant`, for the true equations of the run. If the log names a truth of its own, it gets `truth`."""
     if not isinstance(run.config.plant.truth, str):
         return name_plant(run, reference)
     named, notes = _named(run, reference)
@@ -50,7 +50,7 @@ def name_truth(run: Run, reference: str) -> list[str]:
 
 
 def _named(run: Run, reference: str) -> tuple[Known | Plant, list[str]]:
-    """The plant, and in words whether its file is another than the log's."""
+    """Return the plant, and a sentence if its file differs from the log's."""
     whole = absolute(reference, Path.cwd())
     named = load_plant(whole) if is_reference(whole) else PLANTS.get(whole)
     if named is None:
@@ -100,7 +100,7 @@ def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
 
 
 def _other(logged: Known, plant: Known | Plant) -> list[str]:
-    """The fields in which they differ."""
+    """Return the fields in which they differ."""
     here = plant if isinstance(plant, Known) else plant.known()
 
     def same(name: str) -> bool:

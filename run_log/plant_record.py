@@ -1,4 +1,4 @@
-"""The attachment plant.json: what the controller knew of its plant, as numbers, and the hashes of the files named."""
+"""The attachment plant.json: the controller's numbers of its plant, and the hashes of the named files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 from lbmpc.plants import Known, Plant, PlantDefinitionError
 
 LARGEST = 1_000_000
-"""Bytes; two hundred states."""
+"""Bytes; enough for two hundred states."""
 
 
 class PlantRecordError(ValueError):
@@ -23,14 +23,14 @@ class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def encode(plant: Known | Plant, files: Mapping[str, str]) -> str:
-    """plant: as it is controlled; files: the sha256 of what the configuration names, by key."""
+    """plant: the known numbers; files: the sha256 of the files that the configuration names, by key."""
     known = plant if isinstance(plant, Known) else plant.known()
     content = _Content(known.to_builtins(), dict(files))
     return msgspec.json.format(msgspec.json.encode(content)).decode()
 
 
 def decode(data: bytes) -> tuple[Known, dict[str, str]]:
-    """What `encode` was given, bit for bit. Raises `PlantRecordError`: it is something else, or cannot be used."""
+    """Decode the arguments of `encode`, bit for bit. Raises `PlantRecordError` if the bytes cannot be used."""
     if len(data) > LARGEST:
         raise PlantRecordError(f"{len(data)} bytes, and {LARGEST} is the most")
     try:

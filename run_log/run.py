@@ -1,4 +1,4 @@
-"""A run in memory: every message of it decoded, beside its exact bytes. Read from a log, or never in a file at all."""
+"""A run in memory: every message decoded, beside its exact bytes. Read from a log, or made without a file."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Entry(Generic[M]):
     """One message as it was logged."""
 
     log_time: int
-    """ns; Unix time of arrival for a live run, virtual time for a simulated one."""
+    """Nanoseconds; Unix time of arrival for a live run, virtual time for a simulated one."""
     payload: bytes
     message: M
 
 
 class Messages(Generic[M]):
-    """Of one topic, or of several in the order of their times: an attribute of a `Run`."""
+    """An attribute of a `Run` with the messages of one topic, or of several in the order of their times."""
 
     def __init__(self, *of: Topic):
         self._of = of
@@ -48,7 +48,7 @@ class Messages(Generic[M]):
 
 @dataclass
 class Run:
-    """All that a log says. The lists are in the order of the log; `entries` has the bytes as well."""
+    """The content of a log. The lists are in the order of the log; `entries` has the bytes as well."""
 
     path: Path
     config: Config
@@ -58,23 +58,25 @@ class Run:
     bad: dict[str, int] = field(default_factory=dict)
     """Logged payloads that are no valid messages, by topic and reason."""
     strangers: dict[str, int] = field(default_factory=dict)
-    """Messages on keys that are no topic of ours, by key."""
+    """Messages on unknown keys, by key."""
+    user: dict[str, list[tuple[int, bytes]]] = field(default_factory=dict)
+    """Messages on topics of users, by key: (log_time in ns, bytes). A controller never depends on them."""
     truncated: bool = False
     recovered: bool = False
     part: int = 1
-    """Which one of its run's logs this is (`run_log.writing.parts`)."""
+    """Number of this part among the parts of its run (`run_log.writing.parts`)."""
     continued: str | None = None
-    """Name of the next one; None: this is the last, or was cut short."""
+    """Name of the next part; None: this is the last, or was cut off."""
     note: str = ""
-    """What a person should know about the file, e.g. where it was cut."""
+    """Notes on the file for a person, for example where it was cut off."""
     plant: Known | None = None
-    """What its controllers knew of the plant, as numbers; None: it does not say."""
+    """The controllers' numbers of the plant; None: the log has none."""
     files: dict[str, str] = field(default_factory=dict)
     """The sha256 of the files that its configuration named, by key."""
     truth: Known | Plant | TrueMotion | None = None
-    """How the plant really moved; None: a log does not say."""
+    """The true motion of the plant; None: a log does not have it."""
     named: Known | Plant | None = None
-    """The plant that whoever reads the log has named beside it."""
+    """The plant that the reader of the log named."""
 
     plant_states = Messages[m.PlantState](topics.PLANT_STATE)
     commands = Messages[m.Command](topics.COMMAND)
@@ -97,7 +99,7 @@ class Run:
 
     @property
     def run_infos(self) -> list[m.RunInfo]:
-        """One for each process incarnation, the first that it sent."""
+        """One entry for each process incarnation, the first that it sent."""
         first: dict[str, m.RunInfo] = {}
         for info in self._all_run_infos:
             first.setdefault(info.run_id, info)
@@ -121,18 +123,18 @@ class Run:
 
     @property
     def ends_within(self) -> bool:
-        """The log ends while its run goes on: the last tick may lack some of its messages."""
+        """Whether the log ends while its run continues: the last tick may lack some of its messages."""
         return self.truncated or self.recovered or self.continued is not None
 
     @property
     def unreadable(self) -> str:
-        """What ends a sentence about something that the log lacks: it may be there, and be no valid message."""
+        """End of a sentence about something that the log lacks: it may exist as an invalid message."""
         found = ", ".join(f"{count} {what}" for what, count in self.bad.items())
         return f". In the log but not readable: {found}" if found else ""
 
 
 def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], path: str | Path = "") -> Run:
-    """A `Run` of messages that never were in a file: (topic, message, log_time in ns)."""
+    """Make a `Run` of messages that were never in a file: (topic, message, log_time in ns)."""
     run = Run(Path(path), config)
     for topic, message, log_time in messages:
         run.streams.setdefault(topic.name, []).append(Entry(log_time, codec.encode(message), message))
@@ -157,7 +159,7 @@ def recorded_plant(run: Run, config: Config) -> Known | Plant | None:
 
 
 def as_logged(run: Run, config: Config, changed: Collection[str] = ()) -> Config:
-    """`config` without what the log's numbers of the plant hold already, except for the keys that were changed."""
+    """Return `config` without the values that the log's numbers contain, except for the changed keys."""
     if run.plant is None or "plant" in changed:
         return config
     held = {

@@ -133,7 +133,9 @@ def _layout(plant: Description) -> rrb.Blueprint:
     times = [f"/controller/timing/{name}" for name in ("solve_ms", "tick_ms")]
     plots.append(rrb.TimeSeriesView(name="time of a tick [ms]", origin="/", contents=times))
     events = rrb.TextLogView(name="events", origin="/events")
-    return rrb.Blueprint(rrb.Tabs(rrb.Vertical(*plots, name="plots"), events), collapse_panels=True)
+    return rrb.Blueprint(
+        rrb.Tabs(rrb.Grid(*plots, grid_columns=2, name="plots"), events), collapse_panels=True
+    )
 
 
 def _plot(plant: Description, name: str, series: Sequence[str], what: str = "") -> rrb.TimeSeriesView:

@@ -31,7 +31,7 @@ class Tables:
         self._writers = writers
         self._of: dict[str, _Rows] = {}
         self.rows: dict[str, int] = {}
-        """Of each table, by its name."""
+        """Number of rows written so far, by the name of the table."""
 
     def add(self, shown: Shown, log_time: int, since_start: float) -> None:
         """A row more. Raises `OSError`: it cannot be written."""

@@ -1,4 +1,4 @@
-"""What a log lacks: ticks that a controller made and whose messages never reached the recorder."""
+"""Gaps of a log: ticks of a controller whose messages never reached the recorder."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from protocol import topics
 from run_log.run import Run
 
 EACH_TICK = (topics.TICK, topics.COMMAND, topics.RESULT)
-"""Every tick has one of each, so a number that is missing is a message that was lost."""
+"""Every tick has one of each, so a missing number is a lost message."""
 
 
 def holes(there: Iterable[int], first: int, last: int) -> list[tuple[int, int]]:
-    """(first, how many) of every stretch of first..last of which nothing is there.
+    """(first, number) of every stretch of first..last that is missing.
 
     As much work as there are numbers, not as many as there could be: a log says what its numbers are.
     """
@@ -22,7 +22,7 @@ def holes(there: Iterable[int], first: int, last: int) -> list[tuple[int, int]]:
 
 
 def lost_ticks(run: Run) -> list[tuple[str, int, int]]:
-    """(run id, first tick, how many) of every gap between a controller's first and last tick in the log."""
+    """(run id, first tick, number) of every gap between a controller's first and last tick in the log."""
     found = []
     for run_id in run.controllers:
         logged = [
@@ -30,7 +30,7 @@ def lost_ticks(run: Run) -> list[tuple[str, int, int]]:
         ]
         if not all(logged):
             logged = [set.union(*logged), set()]
-        # Where a log begins or ends within a run, it is no loss that a tick has some of its messages only.
+        # If a log begins or ends within a run, an incomplete tick there is no loss.
         first = (max if run.part > 1 else min)(min(seqs) for seqs in logged if seqs)
         last = (min if run.ends_within else max)(max(seqs) for seqs in logged if seqs)
         found += [(run_id, at, count) for at, count in holes(set.intersection(*logged), first, last)]

@@ -1,4 +1,4 @@
-"""Walks an MCAP file record by record and knows three things apart: whole, cut short, damaged.
+"""Read an MCAP file record by record, and distinguish complete, cut off and damaged files.
 
 Every byte is covered by a checksum of the format: chunks and attachments have their own, the data section
 and the summary have one each. A file that was cut short (power, kill -9) lacks the last two and ends in the
@@ -44,7 +44,7 @@ Record: TypeAlias = Header | Attachment | Metadata | Schema | Channel | Message
 
 @dataclass
 class Scan:
-    """Iterate over it once; afterwards the fields say what the file is like.
+    """Iterate over it once; afterwards the attributes describe the file.
 
     With `keep_going`, damage is noted and the reading goes on where that is possible; without, it raises.
     """
@@ -52,11 +52,11 @@ class Scan:
     path: Path
     keep_going: bool = False
     cut_at: int | None = None
-    """Byte at which a truncated file ends in the middle; None for a whole one."""
+    """Byte at which a truncated file ends; None for a complete one."""
     damage: list[str] = field(default_factory=list)
     size: int = 0
     unpacked: int = 0
-    """Bytes of the chunks so far, without their compression."""
+    """Bytes of the chunks so far, uncompressed."""
 
     def __iter__(self) -> Iterator[Record]:
         """Raises `LogError`: the file cannot be opened, is no MCAP file, or is damaged."""
@@ -116,7 +116,7 @@ class Scan:
                     return [Attachment.read(data)]
                 case Opcode.CHUNK:
                     return self._chunk(Chunk.read(data))
-                case _:  # indexes, and what later versions of the format may add
+                case _:  # indexes, and records of later versions of the format
                     return []
         except UNREADABLE as error:
             name = Opcode(opcode).name.lower()
@@ -143,7 +143,7 @@ class Scan:
             self._damaged(position, "the checksum over all data does not fit")
 
     def _summary(self, stream: IO[bytes], start: int) -> Iterator[Record]:
-        """The schemas and channels once more: a damaged chunk may have held their first mention."""
+        """Read the schemas and channels again: a damaged chunk may have held their first occurrence."""
         rest = stream.read()
         summary, magic = rest[: -len(MCAP0_MAGIC)], rest[-len(MCAP0_MAGIC) :]
         footer = summary[-FOOTER.size :]

@@ -1,4 +1,4 @@
-"""Makes a log that was cut short, or damaged, whole again: in a new file, of all that is still good."""
+"""Write a complete copy of a log that was cut off or damaged, with all intact records."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHUNK_BYTES = 256 * 1024
 
 
 class Recovery(msgspec.Struct, frozen=True, kw_only=True):
-    """What was saved. `log` is null when the file was whole already and no new one was made."""
+    """Result of a recovery. `log` is null if the file was complete and no new one was made."""
 
     source: str
     log: str | None
@@ -25,17 +25,17 @@ class Recovery(msgspec.Struct, frozen=True, kw_only=True):
     """Messages that travelled (their views are not counted)."""
     attachments: int
     seconds: float
-    """From the first message saved to the last."""
+    """From the first to the last recovered message."""
     cut_at: int | None
-    """Byte at which the source was cut; null when it was not."""
+    """Byte at which the source was cut off; null if it was not."""
     lost_bytes: int
     """Bytes of the incomplete record at the cut."""
     damage: list[str]
-    """Parts that do not fit their checksum and were left out."""
+    """Parts with a wrong checksum, which were left out."""
 
 
 def recover(path: str | Path, out: str | Path) -> Recovery:
-    """Copy all good records of `path` to the new file `out`, with an index.
+    """Copy all intact records of `path` to the new file `out`, with an index.
 
     Raises:
         LogExistsError: something is at `out` already.

@@ -1,4 +1,4 @@
-"""The samples of a log as motion: where the plant was, what acted, where it was a period later."""
+"""The samples of a log as transitions: the state, the input, and the state a period later."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from run_log.run import Run
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """n samples as the controllers saw them, in the order of time."""
+    """n samples as the controllers saw them, in order of time."""
 
     transitions: Transitions
     missed: np.ndarray
-    """(n, d): h, what the log's own model missed the next sample by; plant units."""
+    """(n, d): h, the error of the log's own model at the next sample; plant units."""
 
 
 def observed(run: Run, model: Model) -> Observed:

@@ -1,1 +1,1 @@
-"""Computing every command of a log again."""
+"""Compute every command of a log again."""

@@ -1,4 +1,4 @@
-"""What a replay makes beside what was recorded: how much of it differs, and the first field that does, in words."""
+"""Compare the output of a replay with the recorded messages: number of differences, and the first differing field."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Shown = float | int | str | bool | None
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
-    """One field of one tick that did not come out as it was recorded."""
+    """One field of one tick that differs from the recording."""
 
     run_id: str
     tick: int
@@ -28,7 +28,7 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Comparison:
-    """Counts what was compared, and keeps the first difference."""
+    """Counts comparisons, and keeps the first difference."""
 
     def __init__(self) -> None:
         self.ticks = 0
@@ -40,7 +40,7 @@ class Comparison:
         """See `ReplayResult.largest_difference`."""
 
     def compare(self, entry: Entry[Any], replayed: m.Message | None, name: str) -> None:
-        """Byte for byte; `name` begins the field that a difference is in. None: the replay made no such message."""
+        """Compare byte for byte; `name` begins the name of a differing field. None: the replay made no such message."""
         payload = b"" if replayed is None else codec.encode(replayed)
         if payload == entry.payload or _without_later_fields(payload, entry) == entry.payload:
             return
@@ -59,7 +59,7 @@ class Comparison:
         self.keyframes += 1
 
     def measure(self, recorded: m.Command, replayed: m.Command) -> None:
-        """How far two plans are apart."""
+        """Return the largest difference of two plans."""
         a, b = recorded.plan, replayed.plan
         if self.largest is None or [len(row) for row in a] != [len(row) for row in b]:
             self.largest = None
@@ -68,7 +68,7 @@ class Comparison:
 
 
 def first_difference(recorded: Any, replayed: Any, path: str) -> tuple[str, Shown, Shown] | None:
-    """(field, recorded, replayed) of the first field that differs, or None; floats bit for bit."""
+    """(field, recorded, replayed) of the first differing field, or None; floats bit for bit."""
     if isinstance(recorded, Array) and isinstance(replayed, Array):
         return _arrays(recorded, replayed, path)
     if type(recorded) is not type(replayed):
@@ -112,7 +112,7 @@ def _without_later_fields(payload: bytes, entry: Entry[Any]) -> bytes:
 
 
 def first_byte(recorded: bytes, replayed: bytes, path: str) -> tuple[str, Shown, Shown]:
-    """For payloads that differ although their fields do not: the place of the first byte that does."""
+    """For payloads that differ although their fields do not: the position of the first differing byte."""
     shorter = min(len(recorded), len(replayed))
     at = next((i for i in range(shorter) if recorded[i] != replayed[i]), shorter)
     return f"{path} (byte {at})", recorded[at : at + 8].hex(" "), replayed[at : at + 8].hex(" ")

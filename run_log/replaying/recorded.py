@@ -1,4 +1,4 @@
-"""What a log says of each controller: its messages by tick, its configuration and its certified sets."""
+"""The content of a log for each controller: its messages by tick, its configuration and its certified sets."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class RecordedController:
     keyframes: dict[int, Entry[m.Keyframe]]
     sets: CertifiedSets | None
     known: str
-    """sha256 of what it knew of the plant; empty where it does not say."""
+    """sha256 of the controller's numbers of the plant; empty if the log does not have it."""
     architecture: str
-    """Of the network: file, name in it and hash of its text; empty where it is none of a stranger's."""
+    """The network's file, name in it and hash of its text; empty for an architecture of Tandem."""
     complete: bool
-    """The log holds the run to its end; if not, its last tick may lack some of its messages."""
+    """Whether the log holds the run to its end; if not, its last tick may lack some of its messages."""
 
     @property
     def last(self) -> int:
-        """The last tick, of which a log that ends early may have some messages only."""
+        """The last tick; a log that ends early may have some of its messages only."""
         ends = [max(found, default=-1) for found in (self.ticks, self.commands, self.results)]
         return max(ends) if self.complete else min(ends)
 

@@ -1,4 +1,4 @@
-"""`tandem replay`: a fresh controller, the recorded ticks, and all that comes out compared byte for byte."""
+"""`tandem replay`: run the recorded ticks through a fresh controller, and compare its output byte for byte."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from run_log.replaying.segments import replayable
 from run_log.run import Run
 
 ROUNDING = 1e-7
-"""Units of u: the inputs of a log from another machine or build come out as near as this."""
+"""Units of u: largest difference of the inputs of a log from another machine or build."""
 SAID = ("machine", "processor", "kernels", "blas")
-"""What a log says of the arithmetic that it was made with, beside versions; a log may lack it."""
+"""Facts on the arithmetic of a log's machine, beside versions; a log may lack them."""
 Progress = Callable[[int, int], None]
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a replay found. Equal means: every command, backup, result, output weight and keyframe, every byte."""
+    """Result of a replay. Equal means: every command, backup, result, output weight and keyframe, every byte."""
 
     ticks: int
     """Replayed and compared."""
@@ -41,21 +41,21 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     first_difference: Difference | None
     differing_ticks: int
     largest_difference: float | None
-    """Largest |recorded - replayed| among the inputs of all plans, in units of u; null where sizes differ."""
+    """Largest |recorded - replayed| among the inputs of all plans, in units of u; null if sizes differ."""
     keyframes: int
     """Compared."""
     first_tick: int
-    """Where the replay began: the tick after a keyframe."""
+    """Start of the replay: the tick after a keyframe."""
     run_ids: list[str]
     rounding: bool
-    """Not equal, and no input of a plan differs by more than `ROUNDING`."""
+    """Not equal, but no input of a plan differs by more than `ROUNDING`."""
     elsewhere: bool | None
     """Recorded with another processor, BLAS kernel, compiler or version than this replay has; None: a log does not say
     all of that, and what it says is the same."""
     lost_ticks: int
-    """Ticks that could not be replayed, or not compared whole: the log lacks them, or the memory they began with."""
+    """Ticks that could not be replayed or not be compared completely: the log lacks them, or their initial memory."""
     notes: list[str]
-    """What a person should know: other versions, changed settings, an incomplete last tick."""
+    """Notes for a person: other versions, changed settings, an incomplete last tick."""
 
 
 def replay(
@@ -156,7 +156,7 @@ def _know_architecture(
     if config.controller.oracle != "dnn":
         return
     if reference != recorded.config.network.architecture:
-        # Named by whoever replays.
+        # Named by the person who replays.
         register_architecture(config)
     elif own is not None and not is_reference(reference):
         raise LogError(
@@ -209,7 +209,7 @@ def _replay_tick(
 def _restore(
     run: Run, recorded: RecordedController, core: ControllerCore, start: int, comparison: Comparison
 ) -> None:
-    """Put the core where the log's keyframe says that the controller was."""
+    """Put the core into the state of the log's keyframe."""
     entry = recorded.keyframes[start]
     if start == -1 and not entry.message.resumed:
         # The memory before the first tick follows from the configuration and the seed: that is compared too.
@@ -264,7 +264,7 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
 def _foreign(
     run: Run, recorded: list[RecordedController], here: dict[str, str]
 ) -> tuple[list[str], list[str]]:
-    """What the log says of its versions and arithmetic and is otherwise here, and what of `SAID` it does not say."""
+    """Versions and arithmetic that differ between log and machine, and the facts of `SAID` that the log lacks."""
     differs: list[str] = []
     said: set[str] = set()
     runs = {r.run_id for r in recorded}

@@ -1,4 +1,4 @@
-"""Which ticks of a run can be replayed: those behind a keyframe, up to the next one that the log lacks."""
+"""Ticks of a run that can be replayed: those after a keyframe, up to the next missing one."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from run_log.replaying.recorded import RecordedController
 from run_log.run import Run
 
 NAMED = 8
-"""Tick numbers that a note lists before it says how many more there are."""
+"""Number of tick numbers that a note lists before it says how many more there are."""
 
 
 @dataclass
 class Segments:
-    """(keyframe, last tick) of each segment in `ranges`, and a note on all that lies between them."""
+    """(keyframe, last tick) of each segment in `ranges`, and a note on all gaps between them."""
 
     start: int
     """The keyframe at which the replay begins."""
     ranges: list[tuple[int, int]] = field(default_factory=list)
     lost: int = 0
-    """Ticks that cannot be replayed, or not be compared whole."""
+    """Ticks that cannot be replayed, or not be compared completely."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -33,7 +33,7 @@ def replayable(run: Run, recorded: RecordedController, from_tick: int | None) ->
     """
     segments = _begin(run, recorded, from_tick)
     last, begin = recorded.last, segments.start
-    # A missing tick ends a segment: what the controller knew after it is known again at the next keyframe.
+    # A missing tick ends a segment: the controller's memory is known again at the next keyframe.
     for gap, length in holes(recorded.ticks, begin + 1, last):
         if gap <= begin:
             continue
@@ -58,7 +58,7 @@ def replayable(run: Run, recorded: RecordedController, from_tick: int | None) ->
 
 
 def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Segments:
-    """Where to begin, and a note on what comes before it."""
+    """Return where to begin, and a note on the ticks before it."""
     wanted = 0 if from_tick is None else from_tick
     before = [seq for seq in recorded.keyframes if seq < wanted]
     if before:
@@ -81,7 +81,7 @@ def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Seg
 
 
 def _note_uncompared(run: Run, recorded: RecordedController, segments: Segments) -> None:
-    """Ticks that are replayed although the log lacks something that they are compared with."""
+    """Note on ticks that are replayed although the log lacks some of their recorded messages."""
     every, end = recorded.config.controller.keyframe_every, recorded.last + recorded.complete
     replayed = [seq for begin, last in segments.ranges for seq in range(begin + 1, last + 1)]
     uncompared: set[int] = set()

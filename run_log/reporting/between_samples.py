@@ -1,4 +1,4 @@
-"""How far the true motion leaves X between samples, where nothing measures it."""
+"""Largest distance of the true motion outside X between samples."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lbmpc.plants.truth import dop853
 from run_log.reporting.motion import Pieces, Trajectory
 
 POINTS = 8
-"""At which a stretch under one input is looked at, its end included."""
+"""Shares of a stretch under one input at which the motion is evaluated, its end included."""
 SAME = 1e-6
-"""A motion that ends this close to the next sample, in half-widths, is the plant's own. Nothing is known closer."""
+"""Half-widths. A motion that ends this close to the next sample is the plant's own."""
 AT_ONCE = 4096
 """Periods in memory together."""
 
@@ -41,7 +41,7 @@ def excess(motion: Trajectory, plant: Description, truth: object) -> float | Non
         start, end = motion.x[[k - 1 for k in ends]], motion.x[ends]
         pieces = [motion.pieces[k] for k in ends]
         passed = _fixed_steps(steps, start, pieces)
-        # Steps of that length do not do for every plant.
+        # Steps of that length are too long for some plants.
         wrong = np.flatnonzero(~_arrived(passed, end, truth))
         if wrong.size:
             exact = Truth(truth)
@@ -82,7 +82,7 @@ def behind(motion: Trajectory, dead_time: float) -> Trajectory:
 
 
 def _beyond(x: np.ndarray, plant: Description) -> float:
-    """Of x, (..., d), in half-widths."""
+    """Distance of x, (..., d), in half-widths."""
     with np.errstate(over="ignore"):
         return max(0.0, float(plant.beyond_x(x).max()))
 
@@ -101,7 +101,7 @@ def _fixed_steps(steps: ca.Function, start: np.ndarray, pieces: list[Pieces]) ->
     """(points, k, d): k periods side by side, one step from point to point."""
     together, now, passed = steps.map(len(start)), start.T, []
     for at in range(max(map(len, pieces))):
-        # A period of fewer pieces stands still for the rest.
+        # A period with fewer pieces stands still for the rest.
         acting = [p[at] if at < len(p) else (0.0, p[-1][1]) for p in pieces]
         u, dt = np.array([u for _seconds, u in acting]).T, np.array([[s / POINTS for s, _u in acting]])
         for _ in range(POINTS):

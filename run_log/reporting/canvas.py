@@ -1,4 +1,4 @@
-"""Where pictures are drawn: Matplotlib as it comes, whatever settings the person or the machine has for it.
+"""Drawing with Matplotlib's own defaults, independent of the settings of person and machine.
 
 Nothing here imports Matplotlib before something is drawn: its import alone fails for some settings.
 """
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LONGEST = 200
-"""Characters of a reason: LaTeX gives its whole log."""
+"""Largest length of a reason in characters: LaTeX returns its whole log."""
 
 
 def words(text: str) -> str:
-    """Somebody's name or unit as it is written: Matplotlib would read what is between two `$` as a formula."""
+    """Escape a name or unit: Matplotlib would read text between two `$` as a formula."""
     return printable(text).replace("$", r"\$")
 
 
 class PictureError(LogError):
-    """A picture cannot be drawn or written; the text says which and why. Nothing else depends on it."""
+    """A picture cannot be drawn or written; the text says which and why. No other result depends on it."""
 
 
 @contextmanager
 def drawing(what: str | Path) -> Iterator[None]:
-    """What is drawn within depends on nobody's settings. Raises `PictureError`, whatever fails.
+    """Draw independently of local settings. Raises `PictureError` for every failure.
 
     what: the picture's name or file, for the message.
     """
@@ -44,13 +44,13 @@ def drawing(what: str | Path) -> Iterator[None]:
         load_matplotlib()
         from matplotlib import rc_context, rcParamsDefault
 
-        # A `Figure` without pyplot has no use for a backend, and to set one would import it.
+        # A `Figure` without pyplot needs no backend, and setting one would import it.
         with rc_context({key: rcParamsDefault[key] for key in rcParamsDefault if key != "backend"}):
             yield
     except (
         ModuleNotFoundError,
         PictureError,
-    ):  # nothing can be drawn here; whoever asked says what to install
+    ):  # drawing is not possible here; the caller says what to install
         raise
     except OSError as error:
         raise PictureError(f"{what}: cannot be written: {error.strerror}") from error
@@ -62,7 +62,7 @@ def drawing(what: str | Path) -> Iterator[None]:
 
 
 def load_matplotlib() -> None:
-    """Import it with the settings that it comes with: a person's backend or settings file may be a mistake.
+    """Import Matplotlib with its own defaults: a person's backend or settings file may be invalid.
 
     Its import reads the first `matplotlibrc` of the current folder, `MATPLOTLIBRC`, and the person's configuration; one
     that is no text ends it.
@@ -85,7 +85,7 @@ def load_matplotlib() -> None:
 
 @contextmanager
 def _elsewhere(folder: Path) -> Iterator[None]:
-    """With `folder` as the current one."""
+    """Run with `folder` as the current one."""
     here = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.chdir(folder)
@@ -96,7 +96,7 @@ def _elsewhere(folder: Path) -> Iterator[None]:
 
 
 def save(make: Callable[[], Figure], path: Path, dpi: int | None = None) -> Path:
-    """Draw a figure and write it to `path`, in the format that the name's ending says; whole or not at all.
+    """Draw a figure and write it to `path`, in the format of the name's ending; completely or not at all.
 
     dpi: dots per inch; None: the figure's own.
 

@@ -33,20 +33,20 @@ class Trajectory(msgspec.Struct, frozen=True):
     applied: np.ndarray
     """(n, m) mean input over the period before the sample; NaN where none was reported."""
     pieces: tuple[Pieces, ...]
-    """(n,) what acted in that period; empty where it was not reported, or samples are missing before this one."""
+    """(n,) inputs of that period; empty if not reported, or if samples are missing before this one."""
     starts: tuple[int, ...] = (0,)
-    """Where in these arrays the episodes begin."""
+    """Indices of the first samples of the episodes."""
     by_hand: tuple[tuple[float, float], ...] = ()
-    """(from, to) in seconds since the start: while a person drove it; not of a part."""
+    """(from, to) in seconds since the start: intervals of manual control; none in a part."""
     goal: np.ndarray | None = None
     """(n, d) where the states should be, plant units, where somebody gave another reference than the configured one;
     None: nobody did."""
 
     def part(self, first: int, last: int) -> Trajectory:
-        """The motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
+        """Return the motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
         within = slice(first, last + 1)
         applied = self.applied[within].copy()
-        # What acted before the first sample is not of this part.
+        # The input before the first sample does not belong to this part.
         applied[:1] = np.nan
         step, t = self.step[within], self.t[within]
         pieces = ((), *self.pieces[within][1:])
@@ -54,7 +54,7 @@ class Trajectory(msgspec.Struct, frozen=True):
         return Trajectory(step - step[:1], t - t[:1], self.x[within], applied, pieces, goal=goal)
 
     def episodes(self) -> list[Trajectory]:
-        """Each of them as a trajectory of its own."""
+        """Return each episode as a trajectory of its own."""
         return [self.part(first, behind - 1) for first, behind in pairwise((*self.starts, len(self.step)))]
 
 
@@ -77,7 +77,7 @@ def trajectory(run: Run, plant: Description) -> Trajectory:
     for s in states:
         by_plant.setdefault(s.run_id, []).append(s)
     moved = [found for one in by_plant.values() if (found := _after_the_hold(one))]
-    # Of a plant that never moved its last sample is all there is.
+    # For a plant that never moved, its last sample is everything.
     starts = moved or [states[-1:]]
     whole = motion(starts, plant, run.config.period)
     return msgspec.structs.replace(whole, goal=_asked(run, [s for one in starts for s in one], plant))
@@ -94,14 +94,14 @@ def goal(plant: Description, config: Config) -> np.ndarray:
 
 
 def with_outputs(plant: Description, values: Mapping[str, float]) -> np.ndarray:
-    """x_e, (d,), plant units, but for the states that are given by name."""
+    """x_e, (d,), plant units, with the given values of states."""
     wanted = plant.x_e.copy()
     wanted[[plant.states.index(name) for name in values]] = [*values.values()]
     return wanted
 
 
 def _asked(run: Run, states: list[PlantState], plant: Description) -> np.ndarray | None:
-    """(n, d) of `Trajectory.goal`. A sample that no tick of the log answers has the goal of the sample before."""
+    """(n, d) of `Trajectory.goal`. A sample without a tick has the goal of the previous sample."""
     given = {(r.run_id, r.seq): r.reference for r in run.results if r.reference}
     configured = goal(plant, run.config)
     goals = {key: with_outputs(plant, values) for key, values in given.items()}
@@ -123,7 +123,7 @@ def motion(episodes: list[list[PlantState]], plant: Description, period: float) 
     states = [s for one in episodes for s in one]
     nothing = [np.nan] * plant.m
     applied = [nothing if s.applied is None or len(s.applied) != plant.m else s.applied for s in states]
-    # A plant that was started again counts its samples from zero again; on another machine its seconds too.
+    # A restarted plant counts its samples from zero again; on another machine its seconds too.
     step: list[int] = []
     t: list[float] = []
     offset, t_offset = -states[0].seq, -states[0].t
@@ -144,14 +144,14 @@ def motion(episodes: list[list[PlantState]], plant: Description, period: float) 
 
 
 def _by_hand(states: list[PlantState], t: list[float], period: float) -> tuple[tuple[float, float], ...]:
-    """A sample says what acted before it."""
+    """A sample reports the input before it."""
     groups = groupby(zip(t, states, strict=True), key=lambda one: one[1].source == "manual")
     driven = [[at for at, _state in group] for by_hand, group in groups if by_hand]
     return tuple((times[0] - period, times[-1]) for times in driven)
 
 
 def _after_the_hold(states: list[PlantState]) -> list[PlantState]:
-    """From the sample that the first command answers on; nothing where none came."""
+    """The samples from the one that the first command answers; empty if no command came."""
     # A machine that cannot be held waits under its safe input.
     moving = next((i for i, s in enumerate(states) if s.source != "hold" and s.command_seq >= 0), None)
     return [] if moving is None else states[max(moving - 1, 0) :]

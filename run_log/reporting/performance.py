@@ -1,4 +1,4 @@
-"""The yardstick: how well a true motion goes to the equilibrium, in the objective and beside it."""
+"""The yardstick: quality of a true motion, in the objective and beside it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from run_log.reporting.between_samples import behind, excess
 from run_log.reporting.motion import Trajectory, goal
 
 TOLERANCE = 1e-6
-"""Of a half-width: what is further outside X or U is a violation."""
+"""Half-widths: a larger distance outside X or U is a violation."""
 SETTLED = 0.04
-"""Of a half-width: a performance state this close to its equilibrium is settled."""
+"""Half-widths: a performance state this close to its equilibrium is settled."""
 FARTHEST = 1e100
-"""Where a plant that was lost counts as being: its square is still a number."""
+"""Position of a lost plant: its square is still a number."""
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,7 +86,7 @@ def performance(
         np.ones(n) if w is None else np.array(w)
         for n, w in ((plant.d, config.controller.Q), (plant.m, config.controller.R))
     )
-    # The period from a sample to the next one; more than one where samples are missing.
+    # Periods from a sample to the next one; more than one where samples are missing.
     seconds = np.diff(motion.step) / config.rate
     squares = dx[:-1] ** 2
     stages = squares @ q + du**2 @ r
@@ -112,7 +112,7 @@ def performance(
 
 
 def of_episodes(every: Sequence[Performance]) -> Performance:
-    """The figures of several episodes together; of a single one its own."""
+    """Return the figures of several episodes together; a single one keeps its own."""
     names = list(every[0].overshoot)
     overshoots = {name: [v for one in every if (v := one.overshoot[name]) is not None] for name in names}
     return Performance(
@@ -140,7 +140,7 @@ def outside(motion: Trajectory, plant: Description) -> np.ndarray:
     x, u = motion.x, motion.applied
     x_room, u_room = TOLERANCE * plant.x_scale, TOLERANCE * plant.u_scale
     state = (x < plant.x_min - x_room) | (x > plant.x_max + x_room)
-    applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false where there was none
+    applied = (u < plant.u_min - u_room) | (u > plant.u_max + u_room)  # false without an input
     rows = outside_rows(motion, plant).values()
     return np.asarray(state.any(axis=1) | applied.any(axis=1) | np.any([*rows], axis=0))
 
@@ -155,7 +155,7 @@ def outside_rows(motion: Trajectory, plant: Description) -> dict[str, np.ndarray
 
 
 def _largest(values: list[float | None]) -> float | None:
-    """None where one of them is."""
+    """None if one of them is None."""
     known = [value for value in values if value is not None]
     return max(known) if len(known) == len(values) else None
 

@@ -1,4 +1,4 @@
-"""Pictures of a run. Told apart by line style and marker as well as by colour (Okabe and Ito's)."""
+"""Pictures of a run. Curves differ by line style and marker as well as by colour (Okabe and Ito's)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from run_log.reporting.traces import Traces
 BLACK, BLUE, SKY, VERMILION, GREEN = "#000000", "#0072B2", "#56B4E9", "#D55E00", "#009E73"
 GREY = "#6F6F6F"
 WIDTH = 8.0
-# Model errors this much smaller than the largest are no part of the story.
+# Model errors this much smaller than the largest are left out.
 MATTERS = 0.02
 
 Draw = Callable[[Axes], None]
 
 
 def overview(data: Traces, title: str = "") -> Figure:
-    """The whole run on one page: what is performed, commanded, learned, and what it costs."""
+    """The whole run on one page: performance, inputs, learning, and cost."""
     performed = [partial(_state, data, i) for i in data.plant.performance]
     commanded = [partial(_input, data, j) for j in range(data.plant.m)]
     learned = [partial(_error, data), *([partial(_weights, data)] if _learns(data) else [])]
@@ -33,7 +33,7 @@ def overview(data: Traces, title: str = "") -> Figure:
 
 
 def pictures(data: Traces) -> dict[str, Callable[[], Figure]]:
-    """What draws each separate picture, by name; what the run has not (hidden weights, timings) has no picture."""
+    """Functions of the separate pictures, by name; missing data (hidden weights, timings) have no picture."""
     plant = data.plant
     drawn: dict[str, Callable[[], Figure]] = {
         "states": partial(_figure, "States", [partial(_state, data, i) for i in range(plant.d)]),
@@ -64,7 +64,7 @@ def _figure(title: str, draws: list[Draw], height: float = 2.0) -> Figure:
         ax.set_axisbelow(True)
         ax.spines[["top", "right"]].set_visible(False)
         if ax.get_legend_handles_labels()[1]:
-            # Beside the axes, so that it hides nothing.
+            # Beside the axes, so that it covers no curve.
             ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), fontsize=8, frameon=False)
     axes[-1].set_xlabel("time since the first command (s)")
     figure.align_ylabels()
@@ -79,7 +79,7 @@ def _label(plant: Description, name: str, what: str = "") -> str:
 
 
 def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, aims: np.ndarray, scale: float) -> None:
-    """Bounds, and what lies beyond them shaded; a bound far from everything would only flatten the curve.
+    """Draw bounds, with the area beyond them shaded; a bound far from the curve would flatten it.
 
     aims: what else is to be seen; scale: the half-width.
     """
@@ -111,14 +111,14 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, aims: np.nda
 
 
 def _mark_by_hand(data: Traces, ax: Axes) -> None:
-    """Where a person drove the input."""
+    """Mark the intervals of manual control."""
     for i, (began, ended) in enumerate(data.motion.by_hand):
         label = "by hand" if i == 0 else "_nolegend_"
         ax.axvspan(began, ended, color=GREEN, alpha=0.12, linewidth=0, label=label)
 
 
 def _aim(data: Traces, ax: Axes, target: np.ndarray, rest: float) -> np.ndarray:
-    """Draws and gives back where the plan leads: the targets, or the equilibrium where there are none."""
+    """Draw and return the targets of the plan, or the equilibrium if there are none."""
     if not np.isfinite(target).any():
         ax.axhline(rest, color=GREY, linestyle=":", linewidth=1.2, label="equilibrium")
         return np.array([rest])
@@ -131,7 +131,7 @@ def _state(data: Traces, i: int, ax: Axes) -> None:
     plant, motion = data.plant, data.motion
     _mark_by_hand(data, ax)
     x = motion.x[:, i]
-    # A plant that starts again jumps, which is no motion.
+    # A restarted plant jumps, which is no motion.
     later = list(motion.starts[1:])
     t, unbroken = np.insert(motion.t, later, np.nan), np.insert(x, later, np.nan)
     ax.plot(t, unbroken, color=BLUE, linewidth=1.6, label="state")
@@ -206,7 +206,7 @@ def _timing(data: Traces, ax: Axes) -> None:
 
 
 def _mark_weights(data: Traces, ax: Axes, heights: np.ndarray, size: int, what: str = "") -> None:
-    """The ticks at which something became of hidden weights; `heights`: (n,) where in the picture."""
+    """Mark the ticks with a verdict on hidden weights; `heights`: (n,) positions in the picture."""
     for mask, marker, colour, fate in (
         (data.adopted, "^", GREEN, "adopted"),
         (data.refused, "x", VERMILION, "refused"),

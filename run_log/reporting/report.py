@@ -44,7 +44,7 @@ def report(run: Run, out_dir: str | Path) -> Report:
 
 
 def picture(run: Run, path: str | Path) -> Path:
-    """The whole run on one page.
+    """Draw the whole run on one page.
 
     Raises:
         LogError: the run holds nothing to draw.
@@ -57,7 +57,7 @@ def picture(run: Run, path: str | Path) -> Path:
 
 
 def title(run: Run) -> str:
-    """Plant, oracle, rate and seed."""
+    """Return plant, oracle, rate and seed."""
     config = run.config
     cut = ", log cut short" if run.truncated or run.recovered else ""
     return (

@@ -1,4 +1,4 @@
-"""A run in figures: what `tandem run`, `simulate` and `report` print."""
+"""Figures of a run, as `tandem run`, `simulate` and `report` print them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from run_log.run import Run, plant_of, true_plant_of
 
 SOFT = 1e-9
 ADDS = 0.1
-"""What of h_hat counts, at least in one state, or else learning adds nothing."""
+"""Largest weight of h_hat in any state below which learning adds nothing."""
 ADDS_NOTHING = "learning adds nothing: noise exceeds h"
 
 
@@ -46,11 +46,11 @@ class Summary(Performance, frozen=True, kw_only=True):
     """Ticks that began late, or ended after their period."""
     skipped_slots: int
     lost_ticks: int
-    """Ticks of which the log lacks something: it never reached the recorder, and all figures lack it too."""
+    """Incomplete ticks of the log: they never reached the recorder, and all figures lack them too."""
     weights_adopted: int
     weights_refused: int
     weights_rolled_back: int
-    """Sets that were adopted and did not hold what their trial promised."""
+    """Sets that were adopted and then rolled back."""
     iteration_limit_ticks: int
     """Ticks whose solve was stopped by `controller.solver.max_iterations`."""
     soft_ticks: int
@@ -58,11 +58,11 @@ class Summary(Performance, frozen=True, kw_only=True):
     fallback_ticks: int
     """Ticks whose input did not come from the solver."""
     unreached_ticks: int | None
-    """Ticks whose target's outputs are not where they should be, or that found no rest; null without a reference."""
+    """Ticks whose target's outputs differ from the reference, or without an equilibrium; null without a reference."""
     sensor_faults: list[str]
-    """Which sensors were not believed, and when, in words."""
+    """Sensor faults with their times, in words."""
     target_distance: float | None
-    """How far the outputs of the last tick's target are from there, the largest share of an output's half-width."""
+    """Distance of the last target's outputs from the reference, the largest share of an output's half-width."""
     solve_ms: Spread | None
     tick_ms: Spread | None
     prediction_error: PredictionError
@@ -70,12 +70,12 @@ class Summary(Performance, frozen=True, kw_only=True):
     """What of the network counted in the prediction of each state, 0 to 1: the mean of the last second, or period if
     longer; null where nothing weighs it."""
     constant_weight: dict[str, float] | None
-    """What counted of the constant beside it, likewise."""
+    """Weight of the constant beside it, likewise."""
     noise: dict[str, float] | None
     """Standard deviation of what is measured of each state as the estimator had found it at the end, plant units; null
     where it was told, or where there is no estimator."""
     outside_ticks: int | None
-    """Ticks in a state outside the certified sets, where nothing is guaranteed; null where none are in force."""
+    """Ticks in a state outside the certified sets, where nothing is guaranteed; null without sets."""
     smallest_set_margin: float | None
     """Smallest distance of a tick's state to their boundary, as a share of X's half-widths, negative outside."""
     log: str | None
@@ -159,7 +159,7 @@ def _prediction_error(period: float, ticks: list[m.Tick], results: list[m.TickRe
     def mean(of: str, *, first: bool) -> float | None:
         run = [(r, error) for r, error in known if r.run_id == of]
         t = np.array([when.get((r.run_id, r.seq), r.seq * period) for r, _error in run])
-        # Half a period of slack, since the slots are on a grid that floats only approximate.
+        # Half a period of tolerance, because the grid of slots is only approximate in floating point.
         near = t < t[0] + window - period / 2 if first else t > t[-1] - window + period / 2
         errors = [error for (_r, error), inside in zip(run, near, strict=True) if inside]
         # A second may hold no tick.

@@ -1,4 +1,4 @@
-"""What the pictures show, as arrays on one time axis: seconds since the plant began to move."""
+"""The data of the pictures, as arrays on one time axis: seconds since the plant began to move."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Traces:
     error: np.ndarray
     """(n,) |h_hat - h|."""
     reference: np.ndarray
-    """(n, d) where each state should be, NaN for what is no output, plant units."""
+    """(n, d) reference of each state, NaN for states that are no outputs, plant units."""
     target_x: np.ndarray
     target_u: np.ndarray
-    """(n, d) and (n, m) the rest that the plan leads to; NaN where that is the equilibrium."""
+    """(n, d) and (n, m) the target of the plan; NaN if that is the equilibrium."""
     weight: np.ndarray
     constant_weight: np.ndarray
-    """(n, d) what counted of the network, and of a constant beside it."""
+    """(n, d) weights of the network, and of a constant beside it."""
     fallback: np.ndarray
     """(n,) whether the input did not come from the solver."""
     version: np.ndarray
@@ -70,7 +70,7 @@ def traces(run: Run) -> Traces:
         absent = [np.nan] * length
         return np.array([absent if row is None or len(row) != length else row for row in rows])
 
-    # Where a tick is not in the log (a cut), the grid of slots says when it was.
+    # For a tick that is not in the log (a cut), the grid of slots gives the time.
     t0 = next(iter(when.values()), 0.0)
     return Traces(
         plant=plant,

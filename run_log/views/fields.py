@@ -121,5 +121,5 @@ FIELDS: dict[str, Meaning] = {
 
 
 def meaning_of(message: str, field: str) -> Meaning:
-    """Of a field of a message (`TickResult`) or of a series (`targets`)."""
+    """Return the meaning of a field of a message (`TickResult`) or of a series (`targets`)."""
     return FIELDS.get(f"{message}.{field}") or FIELDS[field]

@@ -1,4 +1,4 @@
-"""A file that keeps its place when the disk is full.
+"""A file that continues where it stopped when the disk was full.
 
 The MCAP library writes to this as to any file. What the disk refuses stays in memory, in order, and is tried
 again; so when there is room again the file goes on at the very byte where it stopped, and is never corrupt.
@@ -18,7 +18,7 @@ PENDING_LIMIT = 64 * 1024 * 1024
 
 
 class Sink:
-    """An append-only file, created exclusively, with bounded memory for what cannot be written yet.
+    """An append-only file, created exclusively, with bounded memory for data that cannot be written yet.
 
     Args:
         path: a file that does not exist yet; missing folders above it are made.
@@ -33,10 +33,10 @@ class Sink:
         self.path = Path(path)
         self.limit = limit
         self.error: str | None = None
-        """What went wrong in the last attempt to write; None when it went well."""
+        """Error of the last attempt to write; None if it succeeded."""
         self.errors = 0
         self.written = 0
-        """Bytes that the operating system has taken."""
+        """Bytes that the operating system has accepted."""
         self._pending: deque[memoryview] = deque()
         self._length = 0
         self._fd: int | None = None
@@ -58,7 +58,7 @@ class Sink:
             self._length += len(data)
 
     def flush(self) -> bool:
-        """Write all that waits, as far as the disk takes it; True when nothing waits any more."""
+        """Write the waiting data as far as the disk accepts it; return True if nothing waits any more."""
         if self._fd is None:
             try:
                 self._open()
@@ -83,7 +83,7 @@ class Sink:
         return True
 
     def close(self) -> bool:
-        """Write what can be written and close; True when the file holds everything."""
+        """Write as much as possible and close; return True if the file holds everything."""
         whole = self.flush()
         if self._fd is not None:
             try:
@@ -115,6 +115,6 @@ class Sink:
 
 
 def mcap_writer(sink: Sink, chunk_bytes: int) -> Writer:
-    """Every log is written so: compressed chunks of about this size, and a checksum over everything."""
-    # Of a file it uses write, tell and flush only.
+    """Options of every log: compressed chunks of about this size, and checksums over everything."""
+    # The MCAP library only uses write, tell and flush of a file.
     return Writer(sink, chunk_size=chunk_bytes, compression=CompressionType.ZSTD, enable_data_crcs=True)

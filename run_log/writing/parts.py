@@ -1,4 +1,4 @@
-"""The log of a long run, in parts: each is a whole log, and can be plotted and replayed without the others.
+"""The log of a long run, in parts: each is a complete log that can be plotted and replayed alone.
 
 The index of an MCAP file grows in memory until the file ends, and so does the file. Two parts overlap: the new one
 is written beside the old one until it holds a keyframe, which is where its replay begins, and `OVERLAP_S` more, so
@@ -21,11 +21,11 @@ from run_log.writing.writer import LogWriter
 log = logging.getLogger(__name__)
 
 OVERLAP_S = 1.0
-"""After the new part's first keyframe."""
+"""Seconds after the new part's first keyframe."""
 WITHOUT_KEYFRAME_S = 60.0
-"""The old part waits no longer for a keyframe in the new one: there may be no controller."""
+"""Seconds after which the old part no longer waits for a keyframe in the new one: there may be no controller."""
 REPEATED = frozenset({*(topic.name for topic in topics.RUN_INFO.values()), topics.SETS.name})
-"""Topics that are sent once, and without which a part could not be read on its own."""
+"""Topics that are sent once, and that every part needs."""
 MOST_REPEATED = 8
 """Senders of each of them that are remembered, the latest."""
 
@@ -36,7 +36,7 @@ def part_path(first: Path, number: int) -> Path:
 
 
 def existing_parts(first: Path) -> list[Path]:
-    """Those on disk of the log whose first part is, or was, at `first`, in order."""
+    """The parts on disk of the log whose first part is, or was, at `first`, in order."""
     start = f"{first.stem}.part"
     later = {}
     for path in first.parent.iterdir() if first.parent.is_dir() else ():
@@ -78,13 +78,13 @@ class PartedLog:
         self._paths = [self._first]
         self._began = now
         self._keyframe_at: float | None = None
-        """Of the new part's first keyframe, while both overlap."""
+        """Time of the new part's first keyframe, while both overlap."""
         self._repeated: dict[str, dict[str, bytes]] = {name: {} for name in REPEATED}
-        """By topic and run, what the next part begins with."""
+        """Messages with which the next part begins, by topic and run."""
         self._before: dict[str, int] = {}
         self._bad_before: dict[str, int] = {}
         self._lost_before: dict[str, int] = {}
-        """What the earlier parts had counted when this one began."""
+        """Counters of the earlier parts when this one began."""
         self._last_bad_before: str | None = None
         self._torn: str | None = None
         """Why an earlier part does not hold everything."""
@@ -96,24 +96,24 @@ class PartedLog:
 
     @property
     def error(self) -> str | None:
-        """Why something cannot be written at the moment; None when all can."""
+        """Why something cannot be written at the moment; None if all can."""
         return self._writer.sink.error or (self._old.sink.error if self._old is not None else None)
 
     @property
     def counters(self) -> dict[str, int]:
-        """Of all parts together, each message once."""
+        """Counters of all parts together, each message once."""
         writer = self._writer
-        own = {**writer.counters, "write errors": writer.sink.errors, "file bytes": writer.sink.written}
+        own = {**writer.counters, "write_errors": writer.sink.errors, "file_bytes": writer.sink.written}
         return _sum(self._before, own)
 
     @property
     def lost(self) -> dict[str, int]:
-        """By topic, messages that never arrived here."""
+        """Messages that never arrived here, by topic."""
         return _sum(self._lost_before, self._writer.lost)
 
     @property
     def bad(self) -> dict[str, int]:
-        """By topic and reason, what is in the log as it came and has no view."""
+        """Payloads that are in the log without a view, by topic and reason."""
         return _sum(self._bad_before, self._writer.bad)
 
     @property
@@ -131,20 +131,20 @@ class PartedLog:
                 self._keyframe_at = now
 
     def flush(self, now: float, unix_ns: int) -> None:
-        """Hand all to the operating system; begin a part, or end the one before, when it is time."""
+        """Hand all data to the operating system; begin a part, or end the previous one, when it is due."""
         self._writer.flush()
         if self._old is not None:
             self._old.flush()
             seen = now - OVERLAP_S if self._keyframe_at is None else self._keyframe_at
             waited = self._keyframe_at is not None or now - self._began > WITHOUT_KEYFRAME_S
-            # What comes now must be safe in the new part before the old one ends.
+            # The old part ends only when later messages are safe in the new part.
             if waited and now - seen >= OVERLAP_S and self._writer.sink.error is None:
                 self._end_old()
         elif 0.0 < self._config.log.split_minutes * 60.0 <= now - self._began:
             self._begin_part(now, unix_ns)
 
     def close(self) -> None:
-        """End every part that is still written. Raises `LogError`: a part does not hold everything."""
+        """End every open part. Raises `LogError`: a part does not hold everything."""
         if self._old is not None:
             self._end_old()
         try:

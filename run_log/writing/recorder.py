@@ -118,13 +118,13 @@ def _finish(writer: PartedLog) -> int:
         log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
     if writer.lost:
         log.error(
-            "%s: %d ticks never arrived here and are not in it", writer.path, writer.counters["lost ticks"]
+            "%s: %d ticks never arrived here and are not in it", writer.path, writer.counters["lost_ticks"]
         )
     try:
         writer.close()
     except LogError as error:
         log.error("%s", error)
-    if writer.counters["file bytes"] == 0:
+    if writer.counters["file_bytes"] == 0:
         return EXIT_NOTHING_WRITTEN
     log.info("%s: %d messages", writer.path, writer.counters["messages"])
     return 0

@@ -1,1 +1,1 @@
-"""`tandem run`: its processes, watched and shown."""
+"""`tandem run`: its processes, their supervision and their display."""

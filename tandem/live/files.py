@@ -1,4 +1,4 @@
-"""The files a run leaves: NAME.mcap (after long, NAME.part2.mcap and so on), NAME.png and the folder NAME.processes.
+"""The files of a run: NAME.mcap (in a long run NAME.part2.mcap and so on), NAME.png and the folder NAME.processes.
 
 None is ever overwritten.
 """
@@ -25,7 +25,7 @@ class RunFiles:
     log: Path
     picture: Path
     folder: Path
-    """Configuration and output of every process."""
+    """Folder of configuration and output of every process."""
 
     @classmethod
     def of(cls, log: Path) -> RunFiles:
@@ -36,7 +36,7 @@ class RunFiles:
         return self.folder / "config.toml"
 
     def there(self) -> list[Path]:
-        """Those that exist, all parts of the log among them."""
+        """The files that exist, all parts of the log among them."""
         paths = dict.fromkeys([self.log, self.picture, self.folder, *existing_parts(self.log)])
         return [path for path in paths if os.path.lexists(path)]
 
@@ -100,7 +100,7 @@ def _busy(log: Path) -> str:
 
 
 def _lock(folder: Path) -> int | None:
-    """Hold the folder for as long as this process lives; None when another process does."""
+    """Hold the folder for as long as this process lives; None if another process does."""
     handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Follows a live run: messages off the bus in, what a person wants to see out. `tandem.live.view` draws it."""
+"""Follow a live run: messages from the bus in, the content of the display out. `tandem.live.view` draws it."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ RECENT_TICKS = 1000
 RATE_WINDOW_S = 2.0
 TREND_SECONDS = 40
 EVENTS = 10
-# Until it is said that learning adds nothing.
+# Seconds until a note says that learning adds nothing.
 PATIENCE_S, PATIENCE_TICKS = 3.0, 10
 
-# Of no use here, and large: not even decoded.
+# Not needed here, and large: not decoded.
 UNSEEN = (topics.KEYFRAME, topics.SETS, topics.OUTPUT_WEIGHTS, topics.SAMPLES)
-# Nothing is counted over all of these: a fast loop's are looked at now and then.
+# These are only sampled in a fast loop, because nothing is counted over them.
 ONLY_SHOWN = (topics.PLANT_STATE, topics.COMMAND, topics.TIMING)
 
 
 class Monitor:
-    """Feed it deliveries (`feed`) and ask for a `snapshot`. Never raises for what arrives."""
+    """Feed it deliveries (`feed`) and ask for a `snapshot`. Never raises for any message."""
 
     def __init__(self, config: Config, plant: Description, seconds: float):
         self.config, self.plant, self.seconds = config, plant, seconds
         self.bad = RejectedMessages()
         self.phase = ""
-        """See `Snapshot`; whoever supervises says it. While it is empty, a plant is waited for that is silent."""
+        """See `Snapshot`; the supervisor sets it. While it is empty, a silent plant is waited for."""
         self.first_command: float | None = None
         """When the first command arrived; seconds on the monotonic clock."""
         self.slots = 0
-        """Of the controller, up to its newest tick."""
+        """State of the controller, up to its newest tick."""
         self._seen = Snapshot(config, plant, seconds)
         self._followers: dict[str, Follower] = {}
         self._plant = Presence(config.period)
         self._x: list[float] | None = None
         self._u: list[float] | None = None
         self._health: dict[str, tuple[m.Health, float]] = {}
-        """By process: the newest, and when it came."""
+        """The newest health by process, and when it came."""
         self._ended: set[str] = set()
         self._asked_by = ""
-        """Who said last where to go: who says it again renews a lease."""
+        """Sender of the last reference: a repetition renews its lease."""
         self._tick_times: deque[float] = deque(maxlen=RECENT_TICKS)
         self._solve_ms: deque[float] = deque(maxlen=RECENT_TICKS)
         self._tick_ms: deque[float] = deque(maxlen=RECENT_TICKS)
@@ -69,7 +69,7 @@ class Monitor:
         self._bad_elsewhere: dict[tuple[str, str], int] = {}
 
     def feed_all(self, deliveries: Sequence[Delivery]) -> None:
-        """Take note of what arrived together, in order; of what is only shown, the newest is enough."""
+        """Process messages that arrived together, in order; of those that are only shown, the newest is enough."""
         newest = {delivery.key: i for i, delivery in enumerate(deliveries)}
         shown = (
             {topic.key(self.config.name) for topic in ONLY_SHOWN} if self.first_command is not None else ()
@@ -79,11 +79,12 @@ class Monitor:
                 self.feed(delivery)
 
     def feed(self, delivery: Delivery) -> None:
-        """Take note of one message, unless it is not shown or must not be believed."""
+        """Process one message, unless it is not shown or not valid."""
         topic = topics.topic_of(delivery.key)
         now = delivery.received_ns * 1e-9
         if topic is None:
-            self.bad.count("unknown topic", "foreign", delivery.key)
+            if not topics.is_user(delivery.key.removeprefix(topics.below(self.config.name, ""))):
+                self.bad.count("unknown topic", "foreign", delivery.key)
             return
         if topic in UNSEEN:
             return
@@ -134,7 +135,7 @@ class Monitor:
                 self._take_health(message, now)
 
     def _take_source(self, state: m.PlantState, now: float) -> None:
-        """Say where a person took over, and where they gave back or it was taken from them."""
+        """Report the begin and the end of manual control."""
         before = self._seen.source
         if before and (state.source == "manual") != (before == "manual"):
             by_hand = state.source == "manual"
@@ -144,7 +145,7 @@ class Monitor:
             self._u = state.acting
 
     def miss_plant(self, now: float) -> None:
-        """Say it, once, when a plant that was there is silent."""
+        """Report once that a plant has fallen silent."""
         if text := self._plant.miss(now):
             self.say(text, now, "bad")
 
@@ -236,9 +237,9 @@ class Monitor:
         self._health[health.process] = health, now
         self._ended.discard(health.process)
         for name, count in health.counters.items():
-            if name.startswith("bad "):
+            if name.startswith(m.BAD):
                 if (health.process, name) not in self._bad_elsewhere:
-                    self.say(f"{health.process}: {name}; not obeyed", now, "bad")
+                    self.say(f"{health.process}: {name.replace('_', ' ')}; not obeyed", now, "bad")
                 self._bad_elsewhere[health.process, name] = count
 
     def say(self, text: str, now: float, weight: Weight = "note") -> None:
@@ -258,16 +259,16 @@ class Monitor:
         return events
 
     def status(self, process: str) -> str | None:
-        """The status in the newest Health of a process; None when it was not heard of."""
+        """The status in the newest Health of a process; None if there is none."""
         return self._health[process][0].status if process in self._health else None
 
     def forget(self, process: str) -> None:
-        """A new incarnation was started: what the old one said no longer holds."""
+        """A new incarnation was started: the old one's messages no longer count."""
         self._health.pop(process, None)
         self._ended.discard(process)
 
     def snapshot(self, now: float) -> Snapshot:
-        """What there is to see at `now`, seconds on the monotonic clock."""
+        """The content of the display at `now`, seconds on the monotonic clock."""
         plant, silent = self.plant, self._plant.silent(now)
         x, u = (None, None) if silent else (self._x, self._u)
         recent = [error for at, error in self._errors if at > now - 1.0]
@@ -288,7 +289,7 @@ class Monitor:
         )
 
     def _goal(self) -> np.ndarray:
-        """Where the states should come to rest, (d,)."""
+        """The target of the states, (d,)."""
         known = self.plant.states
         return with_outputs(
             self.plant, {name: r for name, r in self._seen.reference.items() if name in known}

@@ -1,4 +1,4 @@
-"""Whether the plant is there, by its states alone: it comes, falls silent, comes back, or is started again. Pure."""
+"""Presence of the plant, from its states alone: it appears, falls silent, returns, or is restarted. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ SILENT_S, SILENT_PERIODS = 2.0, 3.0
 
 
 class Presence:
-    """Of one plant; times in seconds on any monotonic clock. What is to be said is told once."""
+    """Presence of one plant; times in seconds on any monotonic clock. Each event is reported once."""
 
     def __init__(self, period: float):
         self._limit = max(SILENT_S, SILENT_PERIODS * period)
@@ -17,7 +17,7 @@ class Presence:
 
     @property
     def known(self) -> bool:
-        """Whether it was ever there."""
+        """Whether it ever appeared."""
         return self._at is not None
 
     def silent(self, now: float) -> bool:
@@ -25,7 +25,7 @@ class Presence:
         return self._at is None or now - self._at > self._limit
 
     def came(self, run_id: str, now: float) -> str:
-        """A state came; what there is to say about it."""
+        """A state came; return the event, if any."""
         missed, away = self._missed, "" if self._at is None else f" after {now - self._at:.1f} s"
         again = self.known and run_id != self._run_id
         self._run_id, self._at, self._missed = run_id, now, False
@@ -34,7 +34,7 @@ class Presence:
         return f"the plant is back{away}" if missed else ""
 
     def miss(self, now: float) -> str:
-        """What there is to say where a plant that was there is silent."""
+        """Return the event if a plant has fallen silent."""
         if self._at is None or self._missed or not self.silent(now):
             return ""
         self._missed = True

@@ -1,4 +1,4 @@
-"""Where a live run is shown: a full view on a terminal, one line a second anywhere else."""
+"""Display of a live run: a full view on a terminal, one line a second elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tandem.terminal import say
 
 
 class Screen:
-    """A context manager; `show` may be called as often as one likes."""
+    """A context manager; `show` may be called at any rate."""
 
     def __init__(self, console: Console, new_events: Callable[[], list[Event]]):
         self._console = console
@@ -23,7 +23,7 @@ class Screen:
         self._live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
 
     def show(self, now: Snapshot) -> None:
-        """Bring the screen up to date; nothing where its reader does not read, for whom no loop waits."""
+        """Update the screen; skip it if the terminal does not accept output, so that no loop waits."""
         if blocked(self._console.file):
             return
         if self._console.is_terminal:
@@ -39,7 +39,7 @@ class Screen:
             self._plain(view.line(now))
 
     def _plain(self, text: str) -> None:
-        # Nothing that a stranger says in several lines looks like one of ours.
+        # A text of another process with several lines must not imitate a line of ours.
         say(self._console, text.replace("\n", "\n" + 10 * " "))
 
     def __enter__(self) -> Screen:

@@ -1,4 +1,4 @@
-"""What the live view shows of a run at one moment."""
+"""Content of the live view at one moment."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Gauge:
     high: float
     target: float
     scale: float
-    """What counts as 1: the half-width where both bounds are finite."""
+    """Unit of the gauge: the half-width if both bounds are finite."""
 
 
 @dataclass(frozen=True)
 class ProcessRow:
-    """One process as it says itself, and how long ago it said so."""
+    """One process as it reports itself, and the age of its report."""
 
     name: str
     status: str
-    """Of its Health; "not heard of", "not configured", "silent" or "ended" where there is none."""
+    """Status of its Health; "not heard of", "not configured", "silent" or "ended" if there is none."""
     note: str
     counters: dict[str, int]
 
@@ -47,38 +47,38 @@ class Event:
 
 @dataclass
 class Snapshot:
-    """All that the live view shows at one moment. The monitor counts in one, and gives copies."""
+    """Everything that the live view shows at one moment. The monitor updates one, and gives copies."""
 
     config: Config
     plant: Description
     seconds: float
     phase: str = ""
-    """What is being waited for, e.g. "the trainer" or "the plant"; empty while the run goes on."""
+    """What the run waits for, e.g. "the trainer" or "the plant"; empty during the run."""
     elapsed: float | None = None
     """Seconds since the first command, None before it."""
     states: tuple[Gauge, ...] = ()
     inputs: tuple[Gauge, ...] = ()
     source: str = ""
-    """What drives the plant: hold, command, plan, safe, manual."""
+    """Source of the input: hold, command, plan, safe, manual."""
     ticks: int = 0
     measured_rate: float | None = None
     late: int = 0
     skipped: int = 0
     mode: str = ""
     sensor_faults: dict[str, str] = field(default_factory=dict)
-    """What is wrong with sensors that are not believed, in words, by the names of their states."""
+    """Sensor faults in words, by the names of their states."""
     fallback: int = 0
     slack: float = 0.0
     slack_row: str = ""
-    """Which state constraint gives way, as "y at step 3"."""
+    """Violated state constraint, as "y at step 3"."""
     soft: int = 0
     set_margin: float | None = None
-    """To the boundary of the certified sets, negative outside; None where none are in force, or no state."""
+    """Distance to the boundary of the certified sets, negative outside; None without sets or without a state."""
     set_piece: int = -1
     outside: int = 0
     """Ticks outside of them."""
     reference: dict[str, float] = field(default_factory=dict)
-    """Where outputs should be now, by name; empty where there are none."""
+    """Reference of the outputs now, by name; empty if there is none."""
     target_status: str = "none"
     solve_ms: tuple[float, float] | None = None
     """p50 and p99 of the recent ticks."""
@@ -89,7 +89,7 @@ class Snapshot:
     """What of the network, or of the constant beside it, counts in the prediction of some state: the most; None where
     nothing weighs it."""
     adds_nothing: bool = False
-    """Whether it has been nearly nothing for seconds."""
+    """Whether it has been nearly zero for seconds."""
     noise: dict[str, float] | None = None
     """Standard deviation of what is measured as the estimator found it, by the names of states; None where it was
     told."""
@@ -100,7 +100,7 @@ class Snapshot:
     refused: int = 0
     rolled_back: int = 0
     loss: tuple[float, float] | None = None
-    """Of the last training: before, after."""
+    """Loss of the last training: before, after."""
     samples: int = 0
     processes: tuple[ProcessRow, ...] = ()
     bad_messages: int = 0

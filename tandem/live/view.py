@@ -1,4 +1,4 @@
-"""Draws a live run: `render` for a terminal, `line` for anything else. Pure: data in, text out."""
+"""Draw a live run: `render` for a terminal, `line` for other outputs. Pure: data in, text out."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ FIGURES = 9
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
-TROUBLE = ("bad", "overflow", "not sent", "write errors", "dropped")
-DULL = ("sent control", "sent bulk")
+TROUBLE = ("bad_", "bulk_overflow", "overflow_", "not_sent_", "write_errors", "dropped", "user_dropped")
+DULL = ("sent_control", "sent_bulk")
 
 STATUS_STYLE = {
     "running": "green",
@@ -36,7 +36,7 @@ EVENT_STYLE = {"note": "default", "good": "green", "bad": "bold red"}
 
 
 def render(now: Snapshot, width: int, height: int) -> RenderableType:
-    """The whole view in `width` by `height` cells; leaves out the least important where there is no room."""
+    """The whole view in `width` by `height` cells; leaves out the least important parts if there is no room."""
     loop, learning = _panel("loop", _loop(now)), _panel("learning", _learning(now, width // 2))
     # With the height of each, the most important first.
     parts: list[tuple[RenderableType, int]] = [
@@ -95,7 +95,7 @@ def line(now: Snapshot) -> str:
 
 
 def _sets(now: Snapshot) -> tuple[str, str]:
-    """Where the state is to the certified sets, in words, and their style."""
+    """Position of the state relative to the certified sets, in words, and the style."""
     if now.set_margin is None:
         return "none in force", "dim"
     if now.set_margin < 0.0:
@@ -104,11 +104,11 @@ def _sets(now: Snapshot) -> tuple[str, str]:
 
 
 RESTS = {"nearest": "; out of reach, at the nearest rest", "no rest": "; no rest was found"}
-"""What is said of a target that is not one where the outputs are as they should be."""
+"""Text about a target whose outputs are not at their reference."""
 
 
 def _set_point(now: Snapshot) -> str:
-    """Where outputs should be, how far off they are, and whether the plant can rest there."""
+    """Reference of the outputs, their distance from it, and whether the plant can rest there."""
     if not now.reference:
         return "the equilibrium"
     at = {gauge.name: gauge.value for gauge in now.states}
@@ -184,7 +184,7 @@ def _gauge_style(gauge: Gauge) -> str:
 
 
 def _bar(gauge: Gauge, cells: int) -> Text:
-    """low ├────┼───●───┤ high; ┼ is where it should come to rest, and an end without a bound is ╌."""
+    """low ├────┼───●───┤ high; ┼ is the target, and an end without a bound is ╌."""
     bounded = math.isfinite(gauge.low), math.isfinite(gauge.high)
     low = gauge.low if bounded[0] else gauge.target - gauge.scale
     high = gauge.high if bounded[1] else gauge.target + gauge.scale
@@ -272,7 +272,7 @@ def _noise(found: Mapping[str, float]) -> str:
 
 
 def _weight(now: Snapshot) -> tuple[str, str]:
-    """What of h_hat counts, in words, and their style."""
+    """Weights of h_hat in words, and their style."""
     if now.counts is None:
         return "", "default"
     return ("adds nothing", "bold yellow") if now.adds_nothing else (f"counts {now.counts:.0%}", "default")
@@ -294,16 +294,20 @@ def _processes(rows: Sequence[ProcessRow]) -> Table:
     for row in rows:
         calm = row.status in ("running", "ready")
         trouble, usual = _counters(row.counters)
-        words = [Text(f"{name} {row.counters[name]}", "bold yellow") for name in trouble]
+        words = [Text(f"{_words(name)} {row.counters[name]}", "bold yellow") for name in trouble]
         words += [Text(row.note, "default" if calm else "yellow")] if row.note else []
-        words += [Text(f"{name} {row.counters[name]}", "dim") for name in usual]
+        words += [Text(f"{_words(name)} {row.counters[name]}", "dim") for name in usual]
         status = Text(row.status, STATUS_STYLE.get(row.status, "default"))
         table.add_row(row.name, status, Text(", ").join(words))
     return table
 
 
+def _words(counter: str) -> str:
+    return counter.replace("_", " ")
+
+
 def _counters(counters: dict[str, int]) -> tuple[list[str], list[str]]:
-    """Those that are not zero: what ought to be, and the others, the telling ones first."""
+    """Counters that are not zero: expected ones, and then the others, the most important first."""
     counted = sorted(name for name in counters if counters[name])
     trouble = [name for name in counted if name.startswith(TROUBLE)]
     rest = [name for name in counted if name not in (*trouble, *COUNTERS, *DULL)]

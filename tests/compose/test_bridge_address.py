@@ -22,6 +22,6 @@ def test_the_bridge_s_ipv4_address_is_found(addresses: tuple[dict, ...]) -> None
 
 
 @pytest.mark.parametrize("text", [shown(V6), "[{}]", "[]"])
-def test_a_bridge_without_one_is_said(text: str) -> None:
+def test_a_bridge_without_an_address_is_reported(text: str) -> None:
     with pytest.raises(AssertionError, match="no IPv4 address on this machine"):
         bridge_address(text)

@@ -31,7 +31,7 @@ def costs(name: str, steps: int, *oracles: str) -> tuple[dict[str, float], dict[
         ("gymnasium_pendulum", 60, 0.025, 0.015, {"linear": 0.98, "constant 0.2": 1.0}),
     ],
 )
-def test_learning_takes_the_offset_away_and_is_worth_it(
+def test_learning_removes_the_offset_and_lowers_J(
     name: str, steps: int, linear_off: float, dnn_off: float, shares: dict[str, float]
 ) -> None:
     """linear_off, dnn_off: off by so much at the end. shares: J of the network is less than this share of theirs."""

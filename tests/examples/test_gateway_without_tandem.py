@@ -66,8 +66,8 @@ class Foreign:
         self._until(t)
         before = self.gateway.refused.copy()
         self.gateway.receive(payload, t, t)
-        (refused,) = (self.gateway.refused - before) or ("bad controller/command: ok",)
-        return refused.removeprefix("bad controller/command: ")
+        (refused,) = (self.gateway.refused - before) or ("bad_controller_command_ok",)
+        return refused.removeprefix("bad_controller_command_").replace("_", " ")
 
     def sample(self, t: float) -> m.PlantState:
         self._until(t)
@@ -183,7 +183,7 @@ ODD += [{}, {"x": 1.0}, {b"x": 1.0}, [{1: 1.0}], [1.0], [[1e308], [-1e308]], "x"
 
 
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:20])
-def test_no_message_stops_it(odd: Any) -> None:
+def test_no_message_stops_the_monitor(odd: Any) -> None:
     good = msgspec.msgpack.decode(some_command(np.random.default_rng(2), 0, 0))
     payloads = [msgspec.msgpack.encode(odd), msgspec.msgpack.encode(odd) * 2]
     for key in good:

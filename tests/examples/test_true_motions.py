@@ -58,7 +58,7 @@ SLIDING_BOX = """
 """
 
 
-def test_what_mujocos_contact_solver_remembers_is_forgotten() -> None:
+def test_mujocos_warm_start_is_reset() -> None:
     """It begins where it ended the last time, unless it is told not to, and ends some rounding away."""
     crane, _ = loaded(CRANE)
     model = type(crane.model).from_xml_string(SLIDING_BOX)
@@ -70,7 +70,7 @@ def test_what_mujocos_contact_solver_remembers_is_forgotten() -> None:
         assert box.step(x, np.array([4.0]), 0.02).tobytes() == once.tobytes()
 
 
-def test_the_crane_without_wind_and_with_the_known_load_moves_as_the_matrices_say() -> None:
+def test_the_crane_without_wind_and_with_the_known_load_moves_by_the_matrices() -> None:
     """In the first instant, but for the load's size, of which a point mass has none."""
     true, known = loaded(CRANE)
     model = type(true.model).from_xml_path(str(ROOT / "examples" / "mujoco_crane" / "crane.xml"))

@@ -20,7 +20,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return loop.run(30).save(tmp_path_factory.mktemp("what-if") / "tanks.mcap")
 
 
-def test_a_change_that_is_none_commands_what_was_commanded(log: Path) -> None:
+def test_an_unchanged_setting_gives_the_recorded_commands(log: Path) -> None:
     run = read_run(log)
     recorded = np.array([command.u for command in run.commands])
     np.testing.assert_array_equal(commanded(run, "controller.oracle=constant"), recorded)
@@ -29,7 +29,7 @@ def test_a_change_that_is_none_commands_what_was_commanded(log: Path) -> None:
     assert linear[-1, 0] < recorded[-1, 0] - 2.0
 
 
-def test_the_script_says_how_far_each_change_moves_the_input_and_draws_it(
+def test_the_script_prints_and_draws_how_far_each_change_moves_the_input(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main(log, ("controller.oracle=constant", "controller.R=[0.1]"), tmp_path / "u.png")

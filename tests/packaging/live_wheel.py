@@ -89,7 +89,7 @@ def test_with_all_extras_every_command_works(whole: Environment, command: str, l
     assert (tmp_path / leaves).exists()
 
 
-def test_a_plant_of_ones_own_in_an_empty_folder(whole: Environment, tmp_path: Path):
+def test_a_users_plant_in_an_empty_folder(whole: Environment, tmp_path: Path):
     file = write_tanks(tmp_path)
     mine = ("--set", "plant.model=tanks.py:TANKS", "--set", "rate=20", "--set", "controller.horizon=20")
     sets = ("sets", "compute", "--kind", "box", "--set", "plant.model=tanks.py:TANKS", "--set", "rate=1")
@@ -132,7 +132,7 @@ def test_without_extras_router_plant_and_controller_run(bare: Environment, tmp_p
         ("experiment paper --out paper", "experiment"),
     ],
 )
-def test_without_extras_the_rest_says_which_it_wants(
+def test_without_extras_the_other_commands_name_the_missing_one(
     bare: Environment, command: str, extras: str, tmp_path: Path
 ):
     done = bare.tandem(tmp_path, *command.split())

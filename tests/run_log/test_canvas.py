@@ -62,7 +62,7 @@ def test_a_picture_is_the_same_under_any_settings(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", [["experiment", "list"], ["report", "none.mcap"]])
-def test_settings_that_are_no_text_end_no_command(tmp_path: Path, command: list[str]) -> None:
+def test_settings_that_are_not_utf_8_stop_no_command(tmp_path: Path, command: list[str]) -> None:
     (tmp_path / "matplotlibrc").write_bytes(b"font.size: \xff\n")
     done = subprocess.run(
         [sys.executable, "-m", "tandem", *command],
@@ -77,7 +77,7 @@ def test_settings_that_are_no_text_end_no_command(tmp_path: Path, command: list[
     assert (done.returncode == 0) == (command[0] == "experiment")
 
 
-def test_the_current_folder_and_the_environment_are_as_before(tmp_path: Path) -> None:
+def test_the_current_folder_and_the_environment_do_not_change(tmp_path: Path) -> None:
     (tmp_path / "matplotlibrc").write_text("font.size: 31\n")
     code = (
         "import os\nfrom run_log.reporting.canvas import load_matplotlib\nload_matplotlib()\n"
@@ -96,14 +96,14 @@ def test_the_current_folder_and_the_environment_are_as_before(tmp_path: Path) ->
     assert done.stdout.split() == [str(tmp_path.resolve()), "None", "nonsense"]
 
 
-def test_settings_of_the_program_around_are_as_before() -> None:
+def test_settings_of_the_calling_program_do_not_change() -> None:
     with matplotlib.rc_context({"font.size": 31.0}):
         with drawing("x"):
             assert matplotlib.rcParams["font.size"] == matplotlib.rcParamsDefault["font.size"]
         assert matplotlib.rcParams["font.size"] == 31.0
 
 
-def test_whatever_fails_in_drawing_is_one_line_about_that_picture(tmp_path: Path) -> None:
+def test_any_failure_of_a_picture_is_one_line(tmp_path: Path) -> None:
     def broken() -> Figure:
         figure = Figure()
         figure.text(0, 0, r"$\bad{$")
@@ -115,7 +115,7 @@ def test_whatever_fails_in_drawing_is_one_line_about_that_picture(tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_format_or_a_folder_that_cannot_be_is_said(tmp_path: Path) -> None:
+def test_an_impossible_format_or_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(PictureError, match=r"x\.zzz: no picture has that ending; name it \.png"):
         save(Figure, tmp_path / "x.zzz")
     (tmp_path / "file").write_text("")

@@ -56,7 +56,7 @@ def test_any_flipped_bit_is_found(whole: Path, tmp_path: Path) -> None:
         assert str(edited) in str(caught.value)
 
 
-def test_damage_says_where_and_what_to_do(whole: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_with_its_place_and_a_remedy(whole: Path, tmp_path: Path) -> None:
     edited = tmp_path / "edited.mcap"
     data = bytearray(whole.read_bytes())
     data[len(data) // 2] ^= 4
@@ -91,7 +91,7 @@ def test_foreign_files_are_named(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-def test_a_lying_chunk_does_not_take_the_memory(whole: Path, tmp_path: Path) -> None:
+def test_a_chunk_with_a_wrong_size_uses_no_extra_memory(whole: Path, tmp_path: Path) -> None:
     """A chunk that says it is 2^62 bytes when unpacked."""
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks(data)[0] + 9 + 16, 2**62)

@@ -35,7 +35,9 @@ def timing(seq: int) -> m.TickTiming:
 
 @pytest.mark.live
 @pytest.mark.parametrize("rate", [20, 1000])
-def test_a_recorder_without_a_core_for_longer_than_the_lease_loses_nothing(tmp_path: Path, rate: int) -> None:
+def test_a_recorder_without_processor_time_for_longer_than_the_lease_loses_nothing(
+    tmp_path: Path, rate: int
+) -> None:
     """Real-time loops that need both cores did that: the router cut the recorder's link, and seconds were lost."""
     path = tmp_path / "run.mcap"
     config = live_config(f"bus.lease_ms={LEASE_S * 1e3:.0f}", f'log.path="{path}"', f"rate={rate}")
@@ -57,14 +59,14 @@ def test_a_recorder_without_a_core_for_longer_than_the_lease_loses_nothing(tmp_p
     assert [one.seq for one in read_run(path).timings] == list(range(seq + 1))
 
 
-def test_only_those_who_obey_each_other_are_given_up_soon() -> None:
+def test_only_processes_that_obey_each_other_have_a_short_lease() -> None:
     config = override(live_config(), ["bus.lease_ms=300"])
     assert [lease_ms(config, name) for name in ("plant", "controller")] == [300, 300]
     assert [lease_ms(config, name) for name in ("recorder", "monitor", "trainer")] == [PATIENT_LEASE_MS] * 3
     assert lease_ms(override(config, ["bus.lease_ms=60000"]), "recorder") == 60000
 
 
-def test_what_never_arrived_is_counted_by_the_recorder_and_said_in_the_figures(tmp_path: Path) -> None:
+def test_lost_messages_are_counted_by_the_recorder_and_in_the_figures(tmp_path: Path) -> None:
     config, messages = synthetic(steps=60)
     each = {topics.TICK.name, topics.COMMAND.name, topics.RESULT.name}
     kept = [one for one in messages if not (one[0].name in each and 20 <= one[1].seq < 27)]
@@ -74,14 +76,14 @@ def test_what_never_arrived_is_counted_by_the_recorder_and_said_in_the_figures(t
         for topic, message, log_time in kept:
             writer.write(topic.name, codec.encode(message), log_time)
         assert writer.lost == {"controller/tick": 7, "controller/result": 8}
-        assert writer.counters["lost ticks"] == 8
+        assert writer.counters["lost_ticks"] == 8
     run = read_run(tmp_path / "run.mcap")
     assert lost_ticks(run) == [(RUN, 20, 7), (RUN, 40, 1)]
     assert summarise(run).lost_ticks == 8
     assert summarise(gather(config, messages)).lost_ticks == 0
 
 
-def test_what_is_sent_again_or_by_a_stranger_is_no_gap(tmp_path: Path) -> None:
+def test_repeated_and_strangers_messages_are_no_gap(tmp_path: Path) -> None:
     config, messages = synthetic(steps=60)
     with LogWriter(tmp_path / "run.mcap", config, get_plant(config.plant.model)) as writer:
         for topic, message, log_time in messages:
@@ -96,7 +98,7 @@ def test_what_is_sent_again_or_by_a_stranger_is_no_gap(tmp_path: Path) -> None:
         assert writer.lost == {}
 
 
-def test_holes() -> None:
+def test_gaps_in_a_log() -> None:
     assert holes([], 1, 0) == []
     assert holes([], 3, 5) == [(3, 3)]
     assert holes([4, 5, 6, 8], 1, 10) == [(1, 3), (7, 1), (9, 2)]

@@ -85,7 +85,7 @@ def test_J_is_the_integral_of_the_densities_at_every_rate() -> None:
     assert fine.deviation == pytest.approx(found.deviation) == pytest.approx(0.5 * (0.26 + 0.1025))
 
 
-def test_J_counts_a_missing_sample_and_not_an_unknown_input() -> None:
+def test_J_includes_a_missing_sample_and_excludes_an_unknown_input() -> None:
     given = motion([[0.5, 0.0], [0.25, 0.0], [0.0, 0.0]], [0.4, np.nan])
     assert figures(given, "rate=1").J == pytest.approx(0.25 + 0.16 + 0.0625)
     gap = msgspec.structs.replace(given, step=np.array([0, 1, 3]))
@@ -100,7 +100,7 @@ def test_overshoot_is_a_share_of_the_state_s_own_initial_deviation_on_the_other_
     assert found.overshoot == {"position": None, "speed": None}
 
 
-def test_settled_is_said_of_each_state_in_its_half_width_and_not_where_one_is_off_at_the_end() -> None:
+def test_settling_is_per_state_in_half_widths_and_missing_if_one_is_off_at_the_end() -> None:
     x = [[0.9, 0.3], [0.041, 0.019], [0.039, -0.021], [0.0, 0.0], [0.04, 0.02]]
     found = figures(motion(x, period=0.1), "rate=10")
     assert found.settled_by_state_s == {"position": 0.2, "speed": 0.3}
@@ -151,7 +151,7 @@ def test_the_inputs_of_a_period_act_in_turn() -> None:
     assert figures(given).excess_between_samples == pytest.approx((1.2 - 0.5) / 0.5, abs=1e-7)
 
 
-def test_behind_a_dead_time_the_inputs_from_before_act() -> None:
+def test_with_a_dead_time_earlier_inputs_act() -> None:
     # As above, a quarter of a turn later; what acts before that is not known.
     turns = (((TURN / 2, (0.3,)), (TURN / 2, (-0.3,))), ((TURN / 2, (0.0,)), (TURN / 2, (0.1,))))
     late = override(Config(), [f"rate={1 / TURN}", f"plant.truth.dead_time={TURN / 4}"])
@@ -166,7 +166,7 @@ def test_behind_a_dead_time_the_inputs_from_before_act() -> None:
     assert behind(given, 0.0) is given
 
 
-def test_where_the_truth_is_not_known_nothing_is_said() -> None:
+def test_an_unknown_truth_gives_no_figure() -> None:
     around = motion([[0.4, 0.0]] * 3, period=TURN)
     damped = dataclasses.replace(OSCILLATOR, rhs=lambda x, u: [x[1], u[0] - x[0] - 0.1 * x[1]])
     assert figures(around, truth=damped).excess_between_samples is None
@@ -174,7 +174,7 @@ def test_where_the_truth_is_not_known_nothing_is_said() -> None:
     assert figures(motion([[0.4, 0.0]])).excess_between_samples is None
 
 
-def test_a_truth_that_long_steps_do_not_follow_is_integrated_in_short_ones() -> None:
+def test_a_fast_truth_is_integrated_in_short_steps() -> None:
     fast = dataclasses.replace(OSCILLATOR, rhs=lambda x, u: [x[1], 300.0 * (0.3 - x[1])])
     short = 0.01 / 300.0
     given = motion([[0.0, 0.29], [0.6 - short, 0.3], [1.2 - short, 0.3]], period=2.0)

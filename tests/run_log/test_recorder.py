@@ -84,7 +84,7 @@ def recorded(plant: Bus, ear: BusListener, process: Process, config: Config) -> 
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
 
 
-def test_everything_said_is_in_the_log(config: Config, plant: Bus, ear: BusListener) -> None:
+def test_every_message_is_in_the_log(config: Config, plant: Bus, ear: BusListener) -> None:
     timings = [timing(i) for i in range(300)]
     garbage = [b"", b"\x00" * 100, codec.encode(state(1, float("nan")))]
     with recorder(config) as process:
@@ -151,7 +151,7 @@ def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: BusListe
     assert (first.continued, second.part) == ("run.part2.mcap", 2)
 
 
-def test_a_killed_recorder_leaves_what_was_said_before_its_last_flush(
+def test_a_killed_recorder_leaves_all_messages_before_its_last_flush(
     config: Config, plant: Bus, ear: BusListener
 ) -> None:
     """That it is all but the last half second, `make faults` measures."""
@@ -198,7 +198,7 @@ def talk_while_full(
         trouble = ear.until(noted("NOT LOGGED"))
         assert isinstance(trouble, m.Health)
         assert "cannot be written" in trouble.note
-        assert trouble.counters["write errors"] > 0
+        assert trouble.counters["write_errors"] > 0
         plant.publish(topics.PLANT_STATE, state(0))
         free(process._popen.pid)
         ear.until(noted("writing"))
@@ -251,9 +251,7 @@ def test_a_full_disk_is_waited_for(config: Config, plant: Bus, ear: BusListener,
     )
 
 
-def test_a_place_that_can_never_be_written(
-    config: Config, plant: Bus, ear: BusListener, tmp_path: Path
-) -> None:
+def test_a_place_that_is_never_writable(config: Config, plant: Bus, ear: BusListener, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with recorder(override(config, [f'log.path="{tmp_path / "file" / "run.mcap"}"'])) as process:
         ear.until(noted("NOT LOGGED"))

@@ -140,7 +140,7 @@ def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: 
     assert np.isnan(line.get_ydata()).sum() == 1
 
 
-def test_pictures_show_where_a_plan_leads_and_not_the_equilibrium_instead(
+def test_pictures_show_the_target_of_the_plan_instead_of_the_equilibrium(
     config: Config, messages: list[Logged]
 ) -> None:
     data = traces(gather(config, messages))
@@ -176,7 +176,7 @@ def test_summary_of_applied_input_and_settled_states(config: Config, messages: l
     assert summarise(gather(config, late)).settled_by_state_s == {"z": 0.0, "y": 0.9}
 
 
-def test_a_true_plant_that_cannot_be_is_named_and_no_traceback(
+def test_an_impossible_true_plant_is_named_without_a_traceback(
     config: Config, messages: list[Logged]
 ) -> None:
     run = gather(override(config, ["plant.truth.slop=1.4"]), messages)
@@ -194,9 +194,7 @@ def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged
     assert summarise(gather(config, slow)).late_ticks == 3
 
 
-def test_of_a_slow_plant_the_first_and_the_last_prediction_count(
-    config: Config, messages: list[Logged]
-) -> None:
+def test_the_first_and_last_predictions_of_a_slow_plant_count(config: Config, messages: list[Logged]) -> None:
     """At a period of 4 s, no second has a prediction in it."""
     spread = [
         (topic, msgspec.structs.replace(said, t=80.0 * said.t) if isinstance(said, Tick) else said, t)
@@ -220,7 +218,7 @@ def test_report_draws_from_the_log_alone(whole: Path, tmp_path: Path) -> None:
         assert file.read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_picture_that_cannot_be_written_is_told_and_the_others_are_drawn(
+def test_a_picture_that_cannot_be_written_is_reported_and_the_others_are_drawn(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plots, "overview", lambda *_of: Figure())

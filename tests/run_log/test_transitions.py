@@ -26,7 +26,7 @@ def episodes() -> Run:
     return simulate(override(Config(), SETTINGS), 12, episodes=2)
 
 
-def test_each_is_a_step_of_the_true_motion_and_none_leads_from_one_episode_to_the_next(episodes: Run) -> None:
+def test_each_transition_is_a_true_step_within_one_episode(episodes: Run) -> None:
     model = build_model(episodes.config)
     seen = observed(episodes, model)
     states = episodes.plant_states

@@ -140,7 +140,7 @@ def test_a_mistake_in_the_arguments(arguments: list[str], capsys: pytest.Capture
         (["recover", "none.mcap"], "none.mcap: cannot be read"),
     ],
 )
-def test_what_cannot_be_done_is_said_once(
+def test_an_impossible_request_is_reported_once(
     arguments: list[str],
     expected: str,
     tmp_path: Path,

@@ -75,7 +75,7 @@ def test_it_is_the_run_of_tandem_simulate_to_the_bit(simulated: Run) -> None:
     assert payloads(result.run) == payloads(simulated)
 
 
-def test_it_can_be_run_on_and_looked_at_in_between(simulated: Run) -> None:
+def test_a_loop_can_continue_after_its_result_was_read(simulated: Run) -> None:
     loop = Loop(**QUICK)
     loop.run(10)
     step = loop.step()
@@ -84,7 +84,7 @@ def test_it_can_be_run_on_and_looked_at_in_between(simulated: Run) -> None:
     assert payloads(loop.run(STEPS - 11).run) == payloads(simulated)
 
 
-def test_steps_and_arrays_say_the_same() -> None:
+def test_steps_and_arrays_agree() -> None:
     loop = Loop(PLANT, **QUICK)
     steps = [loop.step() for _ in range(STEPS)]
     result = loop.result
@@ -113,7 +113,7 @@ def test_a_plant_that_moves_elsewhere_gets_the_same_inputs_and_labels(simulated:
     assert ours == theirs
 
 
-def test_a_state_that_is_none_changes_nothing() -> None:
+def test_an_invalid_state_changes_nothing() -> None:
     loop, other = (Loop(oracle="linear", config="compressor") for _ in range(2))
     loop.control(PLANT.x0)
     for bad in ([1.0, 2.0], [np.nan, 0, 0, 0], 3.0):
@@ -125,7 +125,7 @@ def test_a_state_that_is_none_changes_nothing() -> None:
     np.testing.assert_array_equal(loop.control(PLANT.x0 + 0.01), other.control(PLANT.x0 + 0.01))
 
 
-def test_another_episode_begins_without_a_label_and_with_what_was_learned() -> None:
+def test_another_episode_begins_with_the_memory_and_without_a_label() -> None:
     loop = Loop(**QUICK)
     loop.run(10)
     learned = loop.result.run.output_weights[-1].K.numpy()
@@ -149,7 +149,7 @@ def test_objects_are_true_as_well(truth: object, simulated: Run) -> None:
     assert ours == theirs
 
 
-def test_a_log_says_that_a_truth_was_another_and_never_takes_a_namesake_for_the_plant(tmp_path: Path) -> None:
+def test_a_log_names_a_different_truth_and_does_not_use_a_plant_of_the_same_name(tmp_path: Path) -> None:
     result = Loop(truth=Simulator(), **QUICK).run(STEPS)
     assert result.run.config.plant.truth == "Loop:Simulator"
     assert true_plant_of(read_run(result.save(tmp_path / "run.mcap"))) is None
@@ -205,14 +205,14 @@ def test_matrices_and_a_simulator_are_enough(tmp_path: Path) -> None:
     assert found.ticks == 150
 
 
-def test_it_is_drawn_and_saved_as_any_run(tmp_path: Path) -> None:
+def test_a_loop_is_drawn_and_saved_as_any_run(tmp_path: Path) -> None:
     result = Loop(**QUICK).run(STEPS)
     result.plot().savefig(tmp_path / "run.png")
     assert replay(read_run(result.save(tmp_path / "run.mcap"))).equal
 
 
 @pytest.mark.parametrize("before", ["plant.sensors.noise=0.02", "plant.sensors.noise={y=0.02}", "seed=3"])
-def test_a_table_of_names_takes_the_place_of_what_was_there(before: str) -> None:
+def test_a_table_of_names_replaces_the_old_table(before: str) -> None:
     config = load(None, [before, "plant.sensors.dropouts=0.1", "controller.solver.compile=never"])
     sensors = Loop(
         oracle="linear", config=config, plant={"sensors": {"noise": {"z": 0.01}}}
@@ -238,13 +238,13 @@ def test_a_table_of_names_takes_the_place_of_what_was_there(before: str) -> None
         ({"truth": 3}, "truth: int is neither a plant nor an object with step(x, u, dt)"),
     ],
 )
-def test_a_mistake_is_said_as_in_a_configuration(given: dict[str, Any], said: str) -> None:
+def test_a_mistake_is_reported_as_in_a_configuration(given: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         Loop(**given)
     assert said in str(error.value)
 
 
-def test_what_is_not_asked_for_need_not_be_installed() -> None:
+def test_packages_of_unused_formats_need_not_be_installed() -> None:
     code = (
         "from tandem import Loop\n"
         "Loop(oracle='dnn', train=False, controller={'solver': {'compile': 'never'}, 'horizon': 5}).run(2).summary"

@@ -39,7 +39,7 @@ def test_a_table_is_a_sequence(tmp_path: Path) -> None:
         ("time,y\n0,high\n", "row 2: could not convert"),
     ],
 )
-def test_what_is_no_table_is_refused_with_its_row(tmp_path: Path, text: str, said: str) -> None:
+def test_an_invalid_table_is_refused_with_its_row(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(Refused, match=said):
         from_file(table(tmp_path, text))
 
@@ -63,14 +63,14 @@ def test_words_are_names_and_numbers() -> None:
         (["--file", "/nowhere.csv"], "/nowhere.csv: cannot be read"),
     ],
 )
-def test_what_cannot_be_asked_is_said_before_anybody_is_asked(
+def test_an_impossible_request_is_refused_before_any_message(
     arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["set-point", *arguments]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_the_answer_in_words() -> None:
+def test_the_controllers_answer_is_printed_in_words() -> None:
     result = m.TickResult(
         run_id="c-1", seq=7, x=[], u=[], mode="solver", status="", iterations=1, slack=0.0, slack_row="", h=None,
         h_hat=None, prediction_error=None, oracle_norms=[], hidden_version=-1, hidden_sha256="", tick_crc32=0,

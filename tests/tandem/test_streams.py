@@ -26,7 +26,7 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", ["config show", "--help", "experiment list", "config show --json"])
-def test_a_reader_may_leave(command: str) -> None:
+def test_a_reader_may_close_the_pipe(command: str) -> None:
     done = shell(f"{TANDEM} {command} | true")
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -34,7 +34,7 @@ def test_a_reader_may_leave(command: str) -> None:
 @pytest.mark.parametrize(
     "command", ["config show", "--help", "--version", "simulate --steps 3 --oracle linear --json"]
 )
-def test_what_could_not_be_written_is_said_and_counted(command: str) -> None:
+def test_a_failed_write_is_reported_and_counted(command: str) -> None:
     done = shell(f"{TANDEM} {command} > /dev/full")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == LOST

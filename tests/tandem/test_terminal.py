@@ -58,13 +58,13 @@ def nested() -> Table:
 
 
 @pytest.mark.parametrize("what", [NASTY, Text(NASTY), Panel(NASTY), nested()])
-def test_a_strangers_string_is_shown_as_text_wherever_it_stands(what: RenderableType) -> None:
+def test_a_strangers_string_is_shown_as_text_everywhere(what: RenderableType) -> None:
     out = shown(what)
     assert SHOWN in out
     assert "\x1b" not in out
 
 
-def test_what_is_longer_when_it_is_shown_still_fits_its_column() -> None:
+def test_an_escaped_text_fits_its_column() -> None:
     console = PlainConsole()
     with console.capture() as capture:
         console.print(Panel(Text("\x1b" * 50, no_wrap=True, overflow="ellipsis")), width=40)
@@ -76,7 +76,7 @@ def seen() -> Monitor:
     config = Config()
     monitor = Monitor(config, get_plant(config.plant.model), 20.0)
     said = m.Health(
-        run_id=NASTY, seq=0, process="plant", status="running", counters={f"bad {NASTY}": 1}, note=NASTY
+        run_id=NASTY, seq=0, process="plant", status="running", counters={f"bad_{NASTY}": 1}, note=NASTY
     )
     monitor.feed(Delivery(topics.HEALTH["plant"].key(config.name), codec.encode(said), 0))
     monitor.say(f"{NASTY}\n   3.0 s  all is well", 0.0)
@@ -89,7 +89,7 @@ def test_the_live_view_shows_a_health_note_and_an_event_as_text(seen: Monitor) -
     assert "\x1b" not in out
 
 
-def test_no_event_looks_like_another_line_of_ours(seen: Monitor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_event_imitates_another_line(seen: Monitor, capsys: pytest.CaptureFixture[str]) -> None:
     with Screen(PlainConsole(), seen.new_events) as screen:
         screen.show(seen.snapshot(0.0))
     lines = capsys.readouterr().out.splitlines()
@@ -135,7 +135,7 @@ def test_configuration_is_shown_as_toml_without_control_characters(
     assert tomllib.loads(out)["log"]["path"] == "a\x9b31m"
 
 
-def test_the_screen_does_not_wait_for_who_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_screen_does_not_wait_for_a_blocked_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     with open(reading, "rb"), open(writing, "w", encoding="utf-8", buffering=1) as pipe:
@@ -165,7 +165,7 @@ def test_the_screen_does_not_wait_for_who_does_not_read(monkeypatch: pytest.Monk
         (["run", "--log", "caf\x1b.mcap"], "control characters"),
     ],
 )
-def test_limits_say_so(
+def test_limits_are_reported(
     arguments: list[str],
     says: str,
     tmp_path: Path,
@@ -178,7 +178,7 @@ def test_limits_say_so(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_limits_let_their_ends_pass_and_nothing_else() -> None:
+def test_limits_include_their_ends() -> None:
     terminal.limited("--n", 1, 1, 3)
     terminal.limited("--n", 3, 1, 3)
     for value in (0, 4, math.nan, math.inf, -math.inf):
@@ -212,7 +212,7 @@ def test_a_second_ctrl_c_while_drawing_keeps_the_figures(
     assert not files.picture.exists()
 
 
-def test_nothing_is_said_of_a_machine_between_its_samples(
+def test_a_machine_has_no_figures_between_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = load(ROOT / "examples" / "tanks" / "tanks.toml", ["controller.oracle=linear"])
@@ -225,7 +225,7 @@ def test_nothing_is_said_of_a_machine_between_its_samples(
         assert (figures["excess_between_samples"] is None) == no_plant
 
 
-def test_a_picture_that_fails_costs_neither_table_nor_exit_code(
+def test_a_failed_picture_affects_neither_table_nor_exit_code(
     files: RunFiles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(*_: object, **__: object) -> None:
@@ -244,7 +244,7 @@ def test_a_picture_that_fails_costs_neither_table_nor_exit_code(
     assert read_run(files.log).truncated is False
 
 
-def test_a_run_that_was_stopped_while_it_started_says_just_that(
+def test_a_run_that_is_stopped_during_its_start_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     none = RunFiles.of(tmp_path / "none.mcap")

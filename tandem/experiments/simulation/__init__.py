@@ -1,1 +1,1 @@
-"""Closed-loop runs in lock-step, and what may go wrong in them."""
+"""Closed-loop runs in lock-step, with faults."""

@@ -1,4 +1,4 @@
-"""What goes wrong in a run: what the paper leaves out and a user meets."""
+"""Faults of a run that the paper leaves out and a user meets."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ RAMP_PIECES = 20
 
 
 class Drift(Section, frozen=True):
-    """The true plant's parameters move, linearly in time, and stay where they arrive; no model is told."""
+    """The true plant's parameters change linearly in time and stay at their final values; no model is told."""
 
     to: dict[str, float]
     """Final values by name, of the plant's `parameters`."""
     at: NonNegative
     """Seconds."""
     over: NonNegative = 0.0
-    """Seconds that it takes; 0: a step."""
+    """Duration of the change in seconds; 0: a step."""
 
     def plants(self, plant: Known | Plant | TrueMotion) -> list[tuple[float, Plant]]:
         """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
@@ -39,9 +39,9 @@ class Faults(Section, frozen=True):
     """None by default."""
 
     command_seconds: NonNegative = 0.0
-    """From a sample until the command that answers it acts, as live; less than a period."""
+    """Seconds from a sample until its command acts, as live; less than a period."""
     training_seconds: NonNegative = 0.0
-    """How long a training takes; none begins while one goes on."""
+    """Duration of a training in seconds; none begins during another one."""
     trainer_dies_at: NonNegative | None = None
-    """Seconds; what it had not sent by then is lost."""
+    """Seconds at which the trainer dies; weights that it had not sent by then are lost."""
     drift: Drift | None = None

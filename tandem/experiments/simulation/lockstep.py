@@ -46,14 +46,14 @@ CONTROLLER, PLANT, TRAINER = "controller-simulated", "plant-simulated", "trainer
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run, whole or until the plant was lost."""
+    """A run, complete or until the plant was lost."""
 
     run: Run
-    """What a recorder would have seen; times are virtual and start at 0."""
+    """The messages that a recorder would have logged; times are virtual and start at 0."""
     lost: str | None
-    """Why the true motion could not be followed to the end; None when it could."""
+    """Why the true motion ended early; None if it did not."""
     episodes: int
-    """How many of them were followed to their end."""
+    """Number of complete episodes."""
 
 
 def simulate(
@@ -63,7 +63,7 @@ def simulate(
     episodes: int = 1,
     set_points: m.Reference | None = None,
 ) -> Run:
-    """`follow`, without faults, of a plant that is not lost.
+    """`follow`, without faults, for a plant that is not lost.
 
     Raises:
         ConfigError: the configuration admits no controller.
@@ -101,7 +101,7 @@ def follow(
 
 
 def drive(loop: LockStep, steps: int, progress: Progress | None = None, episodes: int = 1) -> Outcome:
-    """`steps` periods, `episodes` times; the arguments are those of `follow`."""
+    """Run `steps` periods, `episodes` times; the arguments are those of `follow`."""
     lost, ended = None, 0
     try:
         for step in range(steps * episodes):
@@ -121,7 +121,7 @@ def drive(loop: LockStep, steps: int, progress: Progress | None = None, episodes
 
 
 class _Motion:
-    """How the plant moves, unless it is said where it is."""
+    """The motion of the plant, unless its states are given."""
 
     def __init__(self, true: TrueMotion):
         self._true = true
@@ -203,7 +203,7 @@ class LockStep:
         snapshot = self.core.memory.hidden_snapshot(-1)
         if snapshot is None or self.core.controller.oracle.description is None:
             return None
-        # torch is imported only where there is a network to train.
+        # torch is imported only if there is a network to train.
         from trainer_node.training import Trainer, use_one_thread
 
         use_one_thread()
@@ -228,7 +228,7 @@ class LockStep:
         return run
 
     def manual(self, u: np.ndarray) -> None:
-        """From the next sample on u, (m,), plant units, acts by hand: until `auto`, or until X would be left."""
+        """From the next sample on u, (m,), plant units, acts manually: until `auto`, or until X would be left."""
         self._override(self.person.manual(u), self.taken * self.config.period)
 
     def auto(self) -> None:
@@ -240,18 +240,18 @@ class LockStep:
         self._note(topics.OVERRIDE, word, self.taken)
 
     def start_again(self, lost: bool = False) -> None:
-        """Another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
+        """Begin another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
         self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
         self.person.start_again()
 
     def ask(self, reference: m.Reference) -> None:
-        """Where the plant shall go from the next period on."""
+        """Give a reference from the next period on."""
         self.person.ask(reference)
 
     def _end(self) -> list[tuple[Topic, m.Message, int]]:
-        """Where the last command has led the plant; of one that moves elsewhere that is not known."""
+        """The state after the last command; unknown for a plant that moves elsewhere."""
         if self.elsewhere:
             return []
         end = self.plant.look(self.taken * self.config.period)
@@ -318,7 +318,7 @@ class LockStep:
         return true, outputs
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
-        """The newest hidden weights that are here by now."""
+        """The newest hidden weights that have arrived."""
         weights = None
         while self.on_the_way and self.on_the_way[0][0] <= seq:
             weights = self.on_the_way.pop(0)[1]
@@ -348,7 +348,7 @@ class LockStep:
         return dies is not None and seq * self.config.period > dies
 
     def _measured(self, true: m.PlantState) -> m.PlantState | None:
-        """The sample as its controller gets it; None where it is lost."""
+        """The sample as its controller gets it; None if it is lost."""
         x = self.sensors.measure(np.array(true.x), true.t)
         return None if x is None else msgspec.structs.replace(true, **measurement(self.core.plant, x))
 

@@ -1,6 +1,6 @@
-"""What a person says in lock-step: where the plant shall go, and its input by hand.
+"""A person's messages in lock-step: references and manual inputs.
 
-Each word is another's, so that none is taken for a repetition.
+Each message has a new number, so that none counts as a repetition.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ COMMANDER = "commander-simulated"
 
 
 class Person:
-    """Says it at the right time.
+    """Sends each message at the right time.
 
     Args:
         period: of the loop, seconds.
@@ -30,18 +30,18 @@ class Person:
         self._set_points = self._asked = set_points
         self._references = self._intentions = 0
         self.by_hand: m.Override | None = None
-        """What is said while the input acts by hand."""
+        """The message while the input acts manually."""
 
     def start_again(self) -> None:
         """Another episode begins."""
         self._asked = self._set_points or self._asked
 
     def ask(self, reference: m.Reference) -> None:
-        """Where the plant shall go from the next period on."""
+        """Give a reference from the next period on."""
         self._asked = reference
 
     def reference(self) -> m.Reference | None:
-        """What is new since the last call; None: nothing."""
+        """The new message since the last call; None: there is none."""
         if self._asked is None:
             return None
         said = msgspec.structs.replace(self._asked, run_id=f"{COMMANDER}-{self._references}", seq=0)
@@ -49,7 +49,7 @@ class Person:
         return said
 
     def manual(self, u: np.ndarray) -> m.Override:
-        """Begins to drive by u, (m,), plant units."""
+        """Begin to drive with u, (m,), plant units."""
         lease = lease_of(self._period)
         self.by_hand = m.Override(run_id=self._name(), seq=0, mode="manual", u=u.tolist(), lease=lease)
         return self.by_hand

@@ -1,4 +1,4 @@
-"""Set-points by turns, again and again, and what a run costs above the true plant's rests there."""
+"""A periodic sequence of set-points, and the cost of a run above the true plant's equilibria there."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from protocol import messages as m
 from tandem.operating.set_points import trajectory
 
 Values = Mapping[str, Sequence[float]]
-"""By the name of a state, plant units: those that follow each other within a cycle, equally long."""
+"""Values by the name of a state, plant units, one after the other in a cycle, equally long."""
 CLOSE = 1e-8
-"""Of a half-width: what a rest may move by in a period, and miss its set-point by."""
+"""Half-widths: an equilibrium may move by this much in a period, and miss its set-point by it."""
 
 
 def require_fit(values: Values, plant: Description, where: str) -> None:
-    """Raises `ConfigError` for what is no wave of this plant; the text begins with `where`."""
+    """Raise `ConfigError` for an invalid wave of this plant; the text begins with `where`."""
     states = plant.states
     for name in values:
         if name not in states:
@@ -41,7 +41,7 @@ def require_fit(values: Values, plant: Description, where: str) -> None:
 
 
 def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
-    """`cycles` cycles of so many seconds, and one more: a plan at the end of the last one sees what it always saw."""
+    """`cycles` cycles of so many seconds, and one more, so that plans at the end of the last one have a preview."""
     parts = len(next(iter(values.values())))
     turns = np.arange((cycles + 1) * parts)
     times = np.repeat(seconds / parts * np.append(turns, turns[-1] + 1), 2)[1:-1]
@@ -54,7 +54,7 @@ def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
 def rests(
     values: Values, steps: int, true: TrueMotion, plant: Description, period: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the true plant rests at each set-point: (steps, d) and (steps, m) of a cycle's `steps` ticks, plant units.
+    """The true plant's equilibrium at each set-point: (steps, d) and (steps, m) of a cycle's ticks, plant units.
 
     values: as of `require_fit`: with as many outputs as inputs a rest is unique.
 

@@ -42,7 +42,7 @@ def write_log(path: Path, config: Config, messages: list[Logged]) -> Path:
                 writer.flush()
             if topic is topics.PLANT_STATE:
                 wind: dict[str, Any] = {"speed": 0.1 * message.seq, "from": "N", "ok": True}
-                # Fields of which the first rows know nothing.
+                # The first rows do not have these fields.
                 wind |= {"gust": {"speed, peak": 3}, "a.b": [1, 2.5]} if message.seq > 60 else {}
                 writer.write("user/wind", json.dumps(wind).encode(), log_time)
         writer.write(topics.PLANT_STATE.name, b"no message", log_time)
@@ -180,7 +180,7 @@ def test_rerun_has_series_events_and_a_layout(exported: Exported, out: Path, run
 
 
 def series(path: Path) -> dict[str, tuple[list[int], list[Any]]]:
-    """Of each entity, the times and values of its numbers or texts."""
+    """Return the times and values of the numbers or texts of each entity."""
     found: dict[str, tuple[list[int], list[Any]]] = {}
     for chunk in RrdReader(path).stream().to_chunks():
         rows = chunk.to_record_batch()
@@ -232,7 +232,7 @@ def test_fields_that_come_late_are_empty_before(exported: Exported, out: Path) -
     assert not list(out.rglob("*.old"))
 
 
-def test_what_has_no_row_is_counted(exported: Exported) -> None:
+def test_messages_without_a_row_are_counted(exported: Exported) -> None:
     assert exported.bad == {"plant/state: malformed": 1}
     assert exported.strangers == {"plant/unheard_of": 1}
     assert exported.damage == exported.notes == []

@@ -164,7 +164,7 @@ def rounded(run: Run, by: float) -> Run:
     return edited(run, topics.COMMAND, 7, change)
 
 
-def test_a_log_says_what_its_arithmetic_depended_on(run: Run) -> None:
+def test_a_log_has_the_facts_on_which_its_arithmetic_depends(run: Run) -> None:
     (info,) = run.run_infos
     assert info.versions.keys() >= {"machine", "processor", "kernels", "blas", "numpy", "casadi"}
     assert info.versions["blas"] != "unknown"
@@ -195,7 +195,7 @@ def test_a_log_says_what_its_arithmetic_depended_on(run: Run) -> None:
     ],
     ids=["other kernel", "no compiler", "too far", "says nothing of it", "this machine"],
 )
-def test_a_difference_by_rounding_is_called_that_and_explained(
+def test_a_difference_by_rounding_is_named_and_explained(
     run: Run, facts: dict[str, str | None], by: float, rounding: bool, elsewhere: bool | None, note: str
 ) -> None:
     found = replay(rounded(said(run, **facts), by))
@@ -204,7 +204,7 @@ def test_a_difference_by_rounding_is_called_that_and_explained(
     assert note in " ".join(found.notes)
 
 
-def test_a_log_of_another_machine_that_is_equal_all_the_same_says_so(run: Run) -> None:
+def test_an_equal_replay_of_a_log_from_another_machine_says_so(run: Run) -> None:
     found = replay(said(run, processor="another"))
     assert found.equal
     assert any("(here " in note and note.endswith("equal all the same") for note in found.notes)

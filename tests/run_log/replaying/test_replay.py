@@ -102,7 +102,7 @@ def test_several_controllers_in_one_log(run: Run, config: Config, monkeypatch: p
     assert replay(both, 60).run_ids == [RUN]
 
 
-def test_a_stranger_does_not_spoil_the_log(run: Run) -> None:
+def test_a_stranger_does_not_damage_the_log(run: Run) -> None:
     tick = msgspec.structs.replace(run.ticks[5], run_id="stranger", seq=700)
     run.streams[topics.TICK.name].append(Entry(0, codec.encode(tick), tick))
     found = replay(run)
@@ -111,7 +111,7 @@ def test_a_stranger_does_not_spoil_the_log(run: Run) -> None:
     assert any("stranger" in note for note in found.notes)
 
 
-def test_a_stranger_who_repeats_everything_under_his_own_name_is_named_and_left_out(run: Run) -> None:
+def test_a_stranger_that_repeats_every_message_under_its_own_name_is_named_and_left_out(run: Run) -> None:
     """On a plain endpoint anybody can publish: here all that the run said again, shifted, keyframes too."""
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME, topics.RUN_INFO["controller"]):
         for entry in run.entries(topic)[1::2]:

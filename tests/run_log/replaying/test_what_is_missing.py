@@ -24,7 +24,7 @@ from tests.run_log.replaying.edited import RUN, STEPS, edited, flip
 @pytest.mark.parametrize(
     ("first", "count", "again"), [(17, 1, 25), (17, 3, 25), (24, 1, 50), (0, 1, 25), (20, 40, 75)]
 )
-def test_replay_goes_on_behind_a_gap_and_says_so(run: Run, first: int, count: int, again: int) -> None:
+def test_replay_continues_after_a_gap_and_says_so(run: Run, first: int, count: int, again: int) -> None:
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME):
         run.streams[topic.name] = [
             e for e in run.entries(topic) if not first <= e.message.seq < first + count
@@ -57,7 +57,7 @@ def test_the_last_tick_of_a_whole_run_may_be_lost_too(run: Run) -> None:
     ("topic", "seq", "name"),
     [(topics.COMMAND, 0, "command"), (topics.RESULT, 60, "result"), (topics.KEYFRAME, 49, "keyframe")],
 )
-def test_what_the_log_lacks_beside_a_tick_is_named(run: Run, topic: Topic, seq: int, name: str) -> None:
+def test_missing_messages_of_a_tick_are_named(run: Run, topic: Topic, seq: int, name: str) -> None:
     found = replay(edited(run, topic, seq, lambda _: None))
     assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS, 1)
     assert any(f"not compared, the recorder lost them: {name} of tick {seq} " in note for note in found.notes)
@@ -86,7 +86,7 @@ def test_a_gap_before_the_start_does_not_matter(run: Run) -> None:
     assert replay(edited(run, topics.TICK, 17, lambda _: None), 40).ticks == STEPS - 25
 
 
-def test_a_log_that_begins_late_says_from_where_it_can_be_replayed(run: Run) -> None:
+def test_a_log_that_begins_late_names_its_first_replayable_tick(run: Run) -> None:
     """The recorder was started after the controller."""
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME):
         run.streams[topic.name] = [e for e in run.entries(topic) if e.message.seq >= 30]
@@ -119,7 +119,7 @@ def test_a_run_without_a_keyframe_does_not_keep_the_others_from_being_replayed(r
 # -- logs that end early ---------------------------------------------------------------------------------
 
 
-def test_a_cut_log_and_what_was_recovered_of_it_replay_up_to_the_cut(log: Path, tmp_path: Path) -> None:
+def test_a_cut_log_and_its_recovered_copy_replay_up_to_the_cut(log: Path, tmp_path: Path) -> None:
     data = log.read_bytes()
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     for share in (0.5, 0.63, 0.8):
@@ -135,7 +135,7 @@ def test_a_cut_log_and_what_was_recovered_of_it_replay_up_to_the_cut(log: Path, 
         assert again.ticks == found.ticks
 
 
-def test_a_controller_that_died_may_leave_half_a_tick(run: Run) -> None:
+def test_a_killed_controller_may_leave_an_incomplete_tick(run: Run) -> None:
     """Its last health is not "stopping"; then the last tick may lack what was still in the queue."""
     health = m.Health(run_id=RUN, seq=0, process="controller", status="running", counters={}, note="")
     died = edited(run, topics.RESULT, STEPS - 1, lambda _: None)

@@ -70,7 +70,7 @@ def by_hand(*arguments: str) -> Iterator[list[int]]:
 
 
 @pytest.mark.live
-def test_a_hand_on_the_switch_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_manual_control_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = live_config()
     file = tmp_path / "a.toml"
     file.write_text(to_toml(config))
@@ -103,7 +103,7 @@ def test_a_hand_on_the_switch_of_a_machine(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.live
-def test_a_hand_is_a_commander_s_and_ends_with_his_certificate(
+def test_manual_control_needs_a_commander_certificate_and_ends_with_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     keys = tmp_path / "jet1"
@@ -150,7 +150,7 @@ def word(mode: str, seq: int, run_id: str) -> m.Override:
     return m.Override(run_id=run_id, seq=seq, mode=mode, u=[U] if mode == "manual" else [])
 
 
-def test_what_ends_a_session_by_hand() -> None:
+def test_events_that_end_a_manual_session() -> None:
     assert begun().take(word("manual", 0, "other")) == "other took over"
     assert begun().take(word("auto", 0, "other")) == "other gave it back to the controller"
     assert begun().take(state(10)) == "the plant is not driven by hand any more"
@@ -159,7 +159,7 @@ def test_what_ends_a_session_by_hand() -> None:
         assert begun().take(none) == ""
 
 
-def test_what_was_by_hand_before_is_not_taken_for_one_s_own() -> None:
+def test_an_earlier_manual_session_is_not_taken_for_ones_own() -> None:
     follower = Follower("me", m.Override)
     follower.take(state(7, "manual"))
     follower.said()
@@ -169,7 +169,7 @@ def test_what_was_by_hand_before_is_not_taken_for_one_s_own() -> None:
     assert follower.begun
 
 
-def test_what_ends_a_pause() -> None:
+def test_events_that_end_a_pause() -> None:
     for message, why in (
         (word("auto", 0, "other"), "other gave it back to the controller"),
         (m.Reference(run_id="other", seq=3), "other said where to go"),
@@ -193,12 +193,12 @@ def test_inputs_are_named_and_the_others_stay() -> None:
         completed({"b": 3.0}, two, None)
 
 
-def test_what_the_gateway_clips_is_said() -> None:
+def test_inputs_that_the_gateway_clips_are_reported() -> None:
     assert clipped(np.array([2000.0]), PLANT) == f"; outside of U, u is clipped to {PLANT.u_max[0]:g}"
     assert clipped(PLANT.u_max, PLANT) == ""
 
 
-def test_a_line_says_what_acts_and_the_nearest_bound() -> None:
+def test_a_line_has_the_acting_input_and_the_nearest_bound() -> None:
     said = line(state(3, "manual"), PLANT, 2.0)
     assert "2.0 s  manual" in said
     assert "u 1.1547  |  margin" in said

@@ -91,7 +91,7 @@ def test_tanks_are_found_within_their_errors_and_better_than_the_model_they_ran_
     np.testing.assert_allclose(found["offset"], 5.0 * slope, atol=0.05)
 
 
-def test_the_table_fits_a_small_terminal_and_says_all(logs: list[str], capsys: Capture) -> None:
+def test_the_table_fits_a_small_terminal_completely(logs: list[str], capsys: Capture) -> None:
     assert main(["identify", *logs]) == 0
     out = capsys.readouterr().out
     tables = [line for line in out.splitlines() if line.startswith(("h1", "h2", "   "))]
@@ -185,7 +185,7 @@ def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> No
     )
 
 
-def test_what_cannot_be_given_together_is_refused(logs: list[str], tmp_path: Path, capsys: Capture) -> None:
+def test_contradicting_arguments_are_refused(logs: list[str], tmp_path: Path, capsys: Capture) -> None:
     save(ran(TANKS_FILE, ["rate=0.1"], 30), tmp_path / "slow.mcap")
     save(ran(None, [], 30), tmp_path / "other.mcap")
     assert "slow.mcap: sampled every 10 s, and" in refused(capsys, logs[0], str(tmp_path / "slow.mcap"))
@@ -201,7 +201,7 @@ def test_what_cannot_be_given_together_is_refused(logs: list[str], tmp_path: Pat
     assert "cannot be read" in refused(capsys, str(tmp_path / "none.mcap"))
 
 
-def test_names_of_a_strangers_come_back_from_the_file(tmp_path: Path) -> None:
+def test_names_from_another_person_are_restored_from_the_file(tmp_path: Path) -> None:
     states = ("höhe 😀", 'b" or c\\', "d'\"", "\u202ee\n")
     fields = {"A": -np.eye(4), "B": np.ones((4, 1)), "W": np.ones(4), "states": states, "scale": {"u1": 1.0}}
     fields["scale"] |= dict.fromkeys(states, 2.0)

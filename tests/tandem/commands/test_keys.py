@@ -33,7 +33,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_certificate_a_role_and_nothing_that_others_can_read(keys: Path):
+def test_each_role_has_a_certificate_that_only_its_owner_can_read(keys: Path):
     assert {path.name for path in keys.iterdir()} == {"authority", *rights.ROLES}
     for path in [keys, *keys.rglob("*")]:
         mode = stat.S_IMODE(path.stat().st_mode)
@@ -45,7 +45,7 @@ def test_a_certificate_a_role_and_nothing_that_others_can_read(keys: Path):
     ]
 
 
-def test_certificates_say_who_they_are_and_what_for(keys: Path):
+def test_certificates_have_their_role_and_purpose(keys: Path):
     authority = credentials.load_certificate(keys / "authority" / "certificate.pem")
     constraints = authority.extensions.get_extension_for_class(x509.BasicConstraints)
     assert constraints.critical
@@ -124,7 +124,7 @@ def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: p
         (["show", "nowhere"], "no such folder"),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_an_impossible_request_is_reported(
     arguments: list[str],
     says: str,
     tmp_path: Path,

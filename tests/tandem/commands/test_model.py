@@ -59,7 +59,7 @@ def said(capsys: Capture, *words: str) -> tuple[int, str]:
 # -- what is well ----------------------------------------------------------------------------
 
 
-def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> None:
+def test_a_plant_without_faults_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> None:
     mine(TANKS)
     slow = ("--set", "controller.horizon_seconds=120", "--set", "adaptation.start=zero")
     code, text = said(capsys, "mine", "--rate", "0.2", *slow)
@@ -74,7 +74,7 @@ def test_a_sound_plant_is_shown_with_its_numbers(mine: Any, capsys: Capture) -> 
         assert word not in text
 
 
-def test_rows_are_said_and_one_that_rest_does_not_keep_is_a_fault(mine: Any, capsys: Capture) -> None:
+def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     rows = {"stop": {"x1": 1.0, "x2": 0.5, "max": 0.7, "priority": 1}}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], rows=rows, **limits))
@@ -93,7 +93,7 @@ def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: 
     assert "poles, 1/s: 0, 0; by itself it does not come back" in said(capsys, "mine")[1]
 
 
-def test_a_state_of_which_no_sensor_tells_is_a_fault(mine: Any, capsys: Capture) -> None:
+def test_a_state_that_no_sensor_determines_is_a_fault(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
     code, found = checked(
@@ -120,7 +120,7 @@ def test_the_numbers_of_the_json_are_those_of_the_model(mine: Any, capsys: Captu
     assert found["h_bound"] is None
 
 
-def test_a_proved_bound_holds_what_was_found(mine: Any, capsys: Capture) -> None:
+def test_a_proved_bound_contains_the_sampled_h(mine: Any, capsys: Capture) -> None:
     mine(PENDULUM)
     _code, found = checked(capsys, "mine", *TEN, "--prove")
     assert (np.array(found["h_bound"]) >= np.array(found["h_sampled"]) * (1.0 - 1e-9)).all()
@@ -137,7 +137,7 @@ def test_a_proved_bound_holds_what_was_found(mine: Any, capsys: Capture) -> None
     assert "h cannot be bounded: integrator: the region has speed" in text
 
 
-def test_matrices_in_discrete_time_are_looked_at_at_their_own_rate(mine: Any, capsys: Capture) -> None:
+def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, capsys: Capture) -> None:
     known = PENDULUM.known()
     A, B = np.array([[1.0, 0.02], [0.08, 1.0]]), np.array([[0.0], [0.02]])
     mine(replace(known, A=A, B=B, period=0.02))
@@ -244,7 +244,7 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
 
 
 @pytest.mark.parametrize("case", NOTES)
-def test_what_is_worth_a_look_is_said_and_no_fault(case: str, mine: Any, capsys: Capture) -> None:
+def test_a_note_is_reported_and_is_no_fault(case: str, mine: Any, capsys: Capture) -> None:
     plant, words, subject, sentence = NOTES[case]
     mine(plant)
     code, found = checked(capsys, "mine", *words)

@@ -27,7 +27,7 @@ def checked(capsys: Capture, *words: str) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out)
 
 
-def test_a_new_plant_file_is_looked_at_runs_converges_and_replays(capsys: Capture) -> None:
+def test_a_new_plant_file_passes_its_check_runs_converges_and_replays(capsys: Capture) -> None:
     assert main(["model", "new", "my.py"]) == 0
     assert "tandem model check my.py:PLANT" in capsys.readouterr().out
     assert "tandem run --set plant.model=my.py:PLANT" in Path("my.py").read_text()
@@ -67,7 +67,7 @@ def test_a_new_plant_file_overwrites_nothing(tmp_path: Path, capsys: Capture) ->
     assert Path("my.py").read_text() == "kept"
 
 
-def test_a_strange_name_does_not_spoil_the_file(capsys: Capture) -> None:
+def test_a_name_with_special_characters_does_not_break_the_file(capsys: Capture) -> None:
     strange = 'my """\\N.py'
     assert main(["model", "new", strange]) == 0
     capsys.readouterr()

@@ -77,7 +77,7 @@ def test_replay_with_the_file_is_equal_byte_for_byte(made: Path, capsys: pytest.
     assert as_json(capsys, "replay", str(made / "run.mcap"))["equal"]
 
 
-def test_a_controller_that_knew_another_plant_than_the_recorder_is_named(made: Path):
+def test_a_controller_with_another_plant_than_the_recorder_is_named(made: Path):
     run = read_run(made / "run.mcap")
     assert replay(run).notes == []
     assert run.plant is not None
@@ -85,7 +85,7 @@ def test_a_controller_that_knew_another_plant_than_the_recorder_is_named(made: P
     assert any("knew another plant than the recorder" in note for note in replay(run).notes)
 
 
-def test_a_log_says_what_was_known_and_which_file_it_was(made: Path):
+def test_a_log_has_the_known_plant_and_the_hash_of_its_file(made: Path):
     run = read_run(made / "run.mcap")
     assert run.plant is not None
     assert (run.plant.name, run.plant.states) == ("tanks", ("upper", "lower"))
@@ -126,7 +126,7 @@ def test_the_file_that_is_named_gives_a_report_its_motion_between_samples(
     assert as_json(capsys, "report", "run.mcap", "--plant", "tanks.py:TANKS")["excess_between_samples"] == 0.0
 
 
-def test_another_file_than_the_logs_is_said(elsewhere: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_file_that_differs_from_the_logs_is_reported(elsewhere: Path, capsys: pytest.CaptureFixture[str]):
     file = write_tanks(elsewhere)
     file.write_text(file.read_text() + "# another\n")
     (note,) = as_json(capsys, "replay", "run.mcap", "--plant", "tanks.py:TANKS")["notes"]
@@ -139,9 +139,7 @@ def test_another_file_than_the_logs_is_said(elsewhere: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("command", ["replay", "report"])
-def test_mistakes_in_the_file_that_is_named(
-    command: str, elsewhere: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_mistakes_in_a_named_plant_file(command: str, elsewhere: Path, capsys: pytest.CaptureFixture[str]):
     assert main([command, "run.mcap", "--plant", "tanks.py:TANKS"]) == 2
     assert f"{elsewhere}/tanks.py: no such file" in said(capsys)
     (elsewhere / "tanks.py").write_text("TANKS = 1 / 0\n")
@@ -168,7 +166,9 @@ def shown(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-def test_what_is_shown_is_in_force_and_can_be_loaded_again(here: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_shown_configuration_is_in_force_and_can_be_loaded(
+    here: Path, capsys: pytest.CaptureFixture[str]
+):
     write_tanks(here)
     bounds = ("--set", "plant.bounds.pump=[0.05, 0.2]")
     text = shown(capsys, *OPTIONS, *bounds)

@@ -38,9 +38,7 @@ from tests.tandem.commands.pendulum_sets import OPTIONS, invariant
 pytestmark = pytest.mark.usefixtures("known_pendulum")
 
 
-def test_a_w_that_samples_do_not_leave_and_h_does_is_refused(
-    cached: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_w_that_h_leaves_only_between_samples_is_refused(cached: Path, capsys: pytest.CaptureFixture[str]):
     """A few states in a corner of X are enough, which none of 100 samples met."""
     sets = read_sets(cached / "sets.json")
     base = sets.certificate.pieces[0]
@@ -92,7 +90,7 @@ def test_another_model_is_refused_by_the_hash_that_differs(cached: Path, capsys:
         simulate(config, 2)
 
 
-def test_a_damaged_cache_is_as_good_as_none(tmp_path: Path):
+def test_a_damaged_cache_counts_as_empty(tmp_path: Path):
     saved = SavedArrays(tmp_path)
     saved["stage"] = {"g": np.arange(3.0)}
     assert list(saved) == ["stage"]
@@ -134,7 +132,7 @@ def spoil(cached: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
         ("owner", "belongs to"),
     ],
 )
-def test_sets_that_somebody_else_may_have_written_are_not_in_force(
+def test_sets_that_another_user_could_have_written_are_not_used(
     cached: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str, says: str
 ):
     assert find_sets(invariant(), pendulum()).sha256 == read_sets(cached / "sets.json").sha256
@@ -155,7 +153,7 @@ def _none(*_: object) -> None:
     raise SetError("begun anew")
 
 
-def test_what_is_believed_again_is_taken_again(cached: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_trusted_sensor_is_used_again(cached: Path, monkeypatch: pytest.MonkeyPatch):
     spoil(cached, "folder", monkeypatch)
     spoil(cached, "file", monkeypatch)
     for path in (cached / "cache").rglob("*"):
@@ -163,7 +161,7 @@ def test_what_is_believed_again_is_taken_again(cached: Path, monkeypatch: pytest
     assert find_sets(invariant(), pendulum()).found.contains_x0
 
 
-def test_sets_that_are_installed_are_in_force_where_the_cache_is_not_believed(
+def test_installed_sets_are_used_if_the_cache_is_not_trusted(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
     config, model = Config(), compressor()

@@ -47,7 +47,7 @@ def test_a_second_call_takes_the_sets_from_the_cache(cached: Path, capsys: pytes
     assert (cached / "again.json").read_bytes() == (cached / "sets.json").read_bytes()
 
 
-def test_ctrl_c_loses_nothing_and_says_how_to_go_on(
+def test_ctrl_c_loses_nothing_and_names_the_command_to_continue(
     cached: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     shutil.rmtree(cached / "cache")
@@ -86,7 +86,7 @@ def test_a_plant_without_sets_ends_with_3_and_says_what_would_help(
     assert not (cached / "none.json").exists()
 
 
-def test_a_given_w_that_the_plant_leaves_is_said(cached: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_given_w_that_the_plant_leaves_is_reported(cached: Path, capsys: pytest.CaptureFixture[str]):
     options = [*OPTIONS, "--set", "controller.W=[1e-4,1e-4]"]
     assert main(["sets", "compute", *options, "--kind", "given", "--out", "given.json"]) == 0
     assert "Warning: the plant's own equations leave that W" in capsys.readouterr().out
@@ -94,7 +94,7 @@ def test_a_given_w_that_the_plant_leaves_is_said(cached: Path, capsys: pytest.Ca
     assert "its W does not hold for the true plant: in piece C, from x =" in capsys.readouterr().err
 
 
-def test_numbers_alone_have_sets_of_a_given_w(
+def test_a_plant_of_numbers_has_sets_of_a_given_w(
     cached: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setitem(PLANTS, "pendulum", PENDULUM.known())
@@ -126,7 +126,9 @@ def test_a_whole_file_passes(cached: Path, capsys: pytest.CaptureFixture[str]):
     assert "not proved" in shown
 
 
-def test_without_sets_the_error_says_what_makes_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_sets_the_error_names_the_command_that_makes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(ConfigError, match="tandem sets compute"):
         simulate(invariant(), 2)
@@ -156,7 +158,7 @@ def test_a_log_without_its_sets_is_not_replayed_with_others(cached: Path):
         replay(ran)
 
 
-def test_outside_is_said_once_and_so_is_the_way_back(cached: Path):
+def test_leaving_the_sets_and_the_return_are_reported_once(cached: Path):
     ran = simulate(invariant(f"plant.x0={[0.8, 0.9]}", "controller.sets=sets.json"), 3)
     assert summarise(ran).outside_ticks == 3
     seen = Monitor(invariant(), PENDULUM, 1.0)

@@ -27,7 +27,7 @@ def loop() -> Loop:
     return loop
 
 
-def test_what_acts_is_said_learned_and_shown(loop: Loop) -> None:
+def test_the_acting_input_is_reported_learned_and_shown(loop: Loop) -> None:
     result = loop.result
     states = result.run.plant_states
     by_hand = [state for state in states if state.source == "manual"]
@@ -64,6 +64,6 @@ def test_a_plant_that_moves_elsewhere_is_given_the_input_by_hand() -> None:
 
 
 @pytest.mark.parametrize("u", [[1.0, 2.0], [float("nan")], {"v": 1.0}])
-def test_what_is_no_input_is_refused(loop: Loop, u: object) -> None:
+def test_an_invalid_input_is_refused(loop: Loop, u: object) -> None:
     with pytest.raises(ValueError, match="no input"):
         loop.manual(u)

@@ -196,7 +196,7 @@ def wild(tick: m.Tick, plant: Description, rng: np.random.Generator) -> m.Tick:
 
 
 @pytest.mark.parametrize("build", [compressor, quadrotor, unbounded, slow])
-def test_all_that_holds_for_each_holds_together(build: Callable[[], Built]) -> None:
+def test_requirements_of_single_features_hold_in_combination(build: Callable[[], Built]) -> None:
     loop, known = build()
     run, plant, period = driven(loop, 1), loop.plant, loop.config.period
     assert {"set", "hold", "configured"} == {tick.reference.kind for tick in run.ticks if tick.reference}

@@ -129,7 +129,7 @@ def test_two_declared_periods_cost_little_and_undeclared_ones_much() -> None:
     assert hidden > 1.15 * none
 
 
-def test_what_the_configuration_says_of_it() -> None:
+def test_settings_of_the_configuration_for_it() -> None:
     def known(config: Config) -> float:
         return plant_of(config, get_plant).dead_time
 
@@ -156,7 +156,7 @@ def test_what_the_configuration_says_of_it() -> None:
     assert guarantee(both, build_model(both)).startswith("guaranteed: nothing; first_step")
 
 
-def test_what_is_guaranteed_is_not_so_of_an_estimate() -> None:
+def test_guarantees_do_not_hold_for_an_estimate() -> None:
     exact, estimated = compressor(), compressor("estimator.kind=kalman")
     said = guarantee(exact, build_model(exact))
     assert "estimate" not in said

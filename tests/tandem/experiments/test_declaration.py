@@ -10,7 +10,8 @@ import pytest
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study.plan import Job, rows
-from tandem.experiments.study.runner import timing_job, wanted
+from tandem.experiments.study.runner import wanted
+from tandem.experiments.study.timing import timing_job
 from tests.helpers.paths import ROOT
 from tests.tandem.experiments.small import SHIPPED, SMALL, cases
 
@@ -47,7 +48,7 @@ def test_a_misspelt_key_is_named_with_file_and_nearest(
     assert expected in str(caught.value)
 
 
-def test_a_solver_is_timed_with_all_that_limits_it(small: Path) -> None:
+def test_a_solver_is_timed_with_rows_and_rate_limits(small: Path) -> None:
     limits = "rows = { a = { z = 1.0, y = -0.5, max = 0.3 } }, input_rate_max = { u = 2.0 }"
     small.write_text(SMALL.replace("[set]", f"[set]\nplant = {{ {limits}, sensors = {{ noise = 0.1 }} }}"))
     plant = timing_job(cases(small)[0], 0, 1.0).config.plant
@@ -110,7 +111,7 @@ vary."controller.horizon_seconds" = [2.0]
 """
 
 
-def test_the_nearest_level_that_says_something_counts(tmp_path: Path) -> None:
+def test_the_innermost_setting_has_precedence(tmp_path: Path) -> None:
     path = tmp_path / "levels.toml"
     path.write_text(LEVELS)
     linear, network, others, seconds = cases(path)

@@ -62,7 +62,7 @@ def test_no_label_spans_two_plants(run: Run) -> None:
     assert np.abs(h).max() < 0.1 * jump
 
 
-def test_all_that_was_learned_is_kept(run: Run) -> None:
+def test_the_memory_is_kept(run: Run) -> None:
     K = {w.seq: w.K.numpy() for w in run.output_weights}
     adopted = {r.seq for r in run.results if r.weights_outcome == "adopted"}
     for start in (STEPS, 2 * STEPS):
@@ -98,7 +98,7 @@ def test_a_plant_that_has_drifted_starts_again_as_it_is() -> None:
     assert np.abs(np.array(first[1].x) - second[1].x).max() > 1e-4
 
 
-def test_a_plant_that_is_lost_says_in_which_episode() -> None:
+def test_a_lost_plant_is_reported_with_its_episode() -> None:
     faults = Faults(drift=Drift(to={"z_c": -100.0}, at=1.0))
     outcome = follow(config("controller.oracle=linear"), 20, faults, episodes=3)
     assert outcome.lost is not None

@@ -58,7 +58,7 @@ def test_it_replays_byte_for_byte_from_the_beginning_and_from_the_middle(lossy: 
     assert middle.first_tick > 20
 
 
-def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
+def test_samples_have_the_variance_of_their_labels(lossy: Run) -> None:
     assert len(lossy.samples) > 40
     for sample in lossy.samples:
         assert len(sample.variance) == 4
@@ -70,7 +70,7 @@ def test_samples_say_how_uncertain_their_labels_are(lossy: Run) -> None:
     assert "oracle.evidence" not in exact.keyframes[0].arrays
 
 
-def test_a_result_says_what_of_the_network_counts_and_how_well_the_state_is_known(lossy: Run) -> None:
+def test_a_result_has_the_weight_of_the_network_and_the_deviation_of_the_state(lossy: Run) -> None:
     after = [result for result in lossy.results if result.seq >= 5]
     deviations = np.array([result.deviation for result in after])
     # Better than one sample, worse where there was none.
@@ -93,7 +93,7 @@ def test_a_result_says_what_of_the_network_counts_and_how_well_the_state_is_know
     assert summarise(exact).weight is None
 
 
-def test_the_memory_outlives_its_process_but_for_what_was_planned(lossy: Run) -> None:
+def test_the_memory_outlives_its_process_without_the_plan(lossy: Run) -> None:
     core = ControllerCore(config("adaptation.law=kalman"), "controller-a")
     core.memory.restore(lossy.keyframes[2])
     again = ControllerCore(config("adaptation.law=kalman"), "controller-b")
@@ -174,7 +174,7 @@ def test_a_stuck_and_a_dead_sensor_are_named_in_the_log_and_not_learned_from(mis
     assert all(np.isfinite(sample.variance).all() for sample in misled.samples)
 
 
-def test_it_replays_and_is_told_in_the_summary(misled: Run) -> None:
+def test_noise_replays_and_is_in_the_summary(misled: Run) -> None:
     assert replay(misled, from_tick=30).equal
     told = summarise(misled).sensor_faults
     assert [text[:14] for text in sorted(told)] == ["sensor rdot is", "sensor y is st"]

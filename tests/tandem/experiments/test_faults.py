@@ -113,7 +113,7 @@ def test_the_three_starts_of_K() -> None:
     assert 0.0 < size["pretrained"] < 0.5 * size["random"]
 
 
-def test_noise_is_in_what_is_measured_and_not_in_the_truth() -> None:
+def test_noise_is_in_the_measurements_and_not_in_the_truth() -> None:
     noisy = config("controller.oracle=linear", "plant.sensors.noise={z=0.002, y=0.002}")
     run = follow(noisy, 40).run
     measured = np.array([tick.state.x for tick in run.ticks if tick.state is not None])
@@ -125,7 +125,7 @@ def test_noise_is_in_what_is_measured_and_not_in_the_truth() -> None:
     assert replay(run).equal
 
 
-def test_a_command_that_takes_its_time_acts_later_and_is_known_to() -> None:
+def test_a_late_command_acts_later_and_the_controller_knows_it() -> None:
     run = follow(config("controller.oracle=linear"), 20, Faults(command_seconds=0.01)).run
     pieces = [[piece.seconds for piece in tick.state.pieces] for tick in run.ticks[2:] if tick.state]
     assert len(pieces) == 18
@@ -150,7 +150,7 @@ def test_a_dead_trainer_sends_nothing() -> None:
     assert max(arrived) <= 30
 
 
-def test_a_plant_that_drifts_moves_otherwise_from_then_on() -> None:
+def test_a_drifting_plant_moves_by_its_new_parameters() -> None:
     calm = states(follow(config("controller.oracle=linear"), 40).run)
     for over in (0.0, 0.5):
         faults = Faults(drift=Drift(to={"slope": 1.4}, at=1.0, over=over))
@@ -206,7 +206,7 @@ def test_a_truth_too_fast_for_perfect_is_refused_and_takes_no_memory(setting: st
         ControllerCore(config_too_fast, "controller")
 
 
-def test_who_learns_is_not_told_of_a_drift() -> None:
+def test_only_perfect_knows_of_a_drift() -> None:
     faults = Faults(drift=Drift(to={"slope": 1.4}, at=1.0))
     run = follow(config("controller.oracle=l2nw"), 25, faults).run
     assert prediction_errors(run)[20] > 1e-4

@@ -40,7 +40,7 @@ def results() -> dict[tuple[str, int, bool], Summary]:
 Results = dict[tuple[str, int, bool], Summary]
 
 
-def test_no_true_constraint_is_violated_by_any_of_the_three(results: Results) -> None:
+def test_no_oracle_violates_a_true_constraint(results: Results) -> None:
     for case, summary in results.items():
         if not case[2]:
             assert summary.constraint_violations == 0, case
@@ -99,7 +99,7 @@ def test_another_rate_settles_too() -> None:
     assert summary.settled_s is not None
 
 
-def test_progress_is_told_step_by_step() -> None:
+def test_progress_is_reported_step_by_step() -> None:
     told: list[int] = []
     simulate(load(None, ["controller.oracle=linear"]), 5, progress=told.append)
     assert told == [1, 2, 3, 4, 5]

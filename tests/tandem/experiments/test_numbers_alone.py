@@ -79,14 +79,14 @@ def test_matrices_that_are_their_own_truth_leave_no_h(model: str) -> None:
     assert np.abs(labels).max() < 1e-12
 
 
-def test_what_needs_equations_says_so() -> None:
+def test_features_that_need_equations_say_so() -> None:
     with pytest.raises(ConfigError, match=r"perfect.* needs the equations of the true plant"):
         simulate(configured("matrices", "controller.oracle=perfect"), 1)
     with pytest.raises(ConfigError, match=r"those of a period of 0.1 s"):
         simulate(configured("sampled", "rate=20"), 1)
 
 
-def test_a_wind_that_is_known_leaves_no_offset() -> None:
+def test_a_known_wind_leaves_no_offset() -> None:
     """The linear oracle learns nothing: where the model has the wind the plant comes to rest where it should."""
     weights = "controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"
     start = "plant.x0=[-0.5,0,0,0,0,0]"

@@ -86,7 +86,7 @@ def test_in_units_of_powers_of_ten_the_loop_is_the_same_up_to_rounding(oracle: s
 
 
 @pytest.mark.parametrize("oracle", ["linear", "dnn"])
-def test_a_state_that_gives_way_does_so_by_the_same_share_in_any_units(oracle: str) -> None:
+def test_a_violated_state_constraint_has_the_same_share_in_any_units(oracle: str) -> None:
     """From where X cannot be kept: the penalty decides, and the row with the largest share is named."""
     low = [0.1, 1.2, COMPRESSOR.x0[2], 0.0]
     plant = replace(COMPRESSOR, x0=np.array(low))

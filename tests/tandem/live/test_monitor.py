@@ -12,7 +12,7 @@ from tandem.live.monitor import Monitor, Snapshot
 from tests.tandem.live.heard import CONFIG, PLANT, START, command, delivery, health, result, state, tick
 
 
-def test_counts_what_happened(monitor: Monitor):
+def test_counts_results_by_kind(monitor: Monitor):
     now = monitor.snapshot(START + 2.5)
     assert (now.ticks, now.late, now.skipped, now.fallback, now.soft) == (50, 1, 2, 1, 1)
     assert (now.adopted, now.refused, now.weights_version) == (1, 1, 3)
@@ -29,7 +29,7 @@ def test_counts_what_happened(monitor: Monitor):
         assert expected in texts
 
 
-def test_a_process_that_says_nothing_any_more_is_silent(monitor: Monitor):
+def test_a_process_without_messages_is_shown_as_silent(monitor: Monitor):
     monitor.ended("trainer")
     monitor.forget("plant")
     rows = {row.name: row.status for row in monitor.snapshot(START + 10.0).processes}
@@ -60,7 +60,7 @@ def test_bad_messages_are_counted_and_not_shown(monitor: Monitor, bad: Delivery)
     assert after.bad_messages == before.bad_messages + 1
 
 
-def test_of_what_comes_together_every_tick_counts_and_only_the_newest_state_is_read() -> None:
+def test_of_simultaneous_messages_every_tick_counts_and_only_the_newest_state_is_read() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(0), START)])
     assert seen.first_command == pytest.approx(START)
@@ -81,7 +81,7 @@ def test_of_what_comes_together_every_tick_counts_and_only_the_newest_state_is_r
     assert seen.bad.total == 0
 
 
-def test_the_first_command_is_not_overlooked_among_others() -> None:
+def test_the_first_command_of_several_messages_is_found() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(k), START + 0.001 * k) for k in range(5)])
     assert seen.first_command == pytest.approx(START)
@@ -92,7 +92,7 @@ def plant_row(now: Snapshot) -> tuple[str, str]:
     return row.status, row.note
 
 
-def test_a_plant_that_says_only_its_states_runs_while_they_come() -> None:
+def test_a_plant_that_publishes_only_states_counts_as_running() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     assert plant_row(seen.snapshot(START)) == ("not heard of", "")
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
@@ -106,7 +106,7 @@ def test_a_plant_that_says_only_its_states_runs_while_they_come() -> None:
     assert plant_row(seen.snapshot(START + 6.0)) == ("running", "says only its states")
 
 
-def test_a_slow_plant_is_not_missed_between_two_of_its_samples() -> None:
+def test_a_slow_plant_is_not_silent_between_two_samples() -> None:
     seen = Monitor(override(CONFIG, ["rate=0.2"]), PLANT, 100.0)
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
     seen.miss_plant(START + 10.0)
@@ -115,7 +115,7 @@ def test_a_slow_plant_is_not_missed_between_two_of_its_samples() -> None:
     assert seen.new_events()
 
 
-def test_what_is_wrong_with_a_message_is_said_once() -> None:
+def test_a_bad_message_is_reported_once() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     fields = {"run_id": "p", "seq": 0, "t": 0.0, "x": [0.0] * 4, "applied": None, "command_seq": -1}
     for _ in range(3):
@@ -125,7 +125,7 @@ def test_what_is_wrong_with_a_message_is_said_once() -> None:
     assert seen.bad.total == 3
 
 
-def test_who_drives_by_hand_is_said_when_it_begins_and_when_it_ends() -> None:
+def test_begin_and_end_of_manual_control_are_reported() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     for k, source in enumerate(["command", "manual", "manual", "plan"]):
         driven = msgspec.structs.replace(state(k), source=source, applied=[1.5 + k])

@@ -19,11 +19,17 @@ from run_log.writing.parts import part_path
 from tandem.live.files import claimed
 from tandem.terminal import Refused
 from tests.helpers.launched import PATIENCE_S, RUN, launched, small
-from tests.helpers.live import wait_for
+from tests.helpers.live import free_endpoint, wait_for
 from tests.helpers.paths import write_namesakes
 from tests.helpers.plants.tanks import write_tanks
 
 pytestmark = pytest.mark.live
+
+
+def live() -> list[str]:
+    """Arguments for a run that browsers can look at."""
+    pytest.importorskip("websockets", reason="pip install 'tandem-control[live]'")
+    return ["--live", "--set", f"live.port={free_endpoint().rpartition(':')[2]}"]
 
 
 def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path: Path):
@@ -60,10 +66,17 @@ def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path:
 
 
 def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
-    with launched(tmp_path, "--oracle", "linear") as run:
-        run.hears("the first command")
-        run.signal(signal.SIGINT)
-        code, result = run.ends()
+    with socket.socket() as other:
+        # A live view that finds its port taken is no reason not to run.
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        there = ("--live", "--set", f"live.port={port}")
+        with launched(tmp_path, "--oracle", "linear", *there) as run:
+            run.hears(f"no live view: live.port {port} is taken")
+            run.hears("the first command")
+            run.signal(signal.SIGINT)
+            code, result = run.ends()
     assert code == 0, run.said
     assert result["ticks"] >= 1
     assert not read_run(tmp_path / "run.mcap").truncated
@@ -71,7 +84,7 @@ def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
 
 
 @pytest.mark.parametrize("output", ["| head -n 3 > heard.txt", "> /dev/full 2> /dev/full"])
-def test_who_does_not_read_ends_the_display_and_not_the_loop(tmp_path: Path, output: str):
+def test_a_closed_terminal_ends_the_display_and_not_the_loop(tmp_path: Path, output: str):
     log = tmp_path / "run.mcap"
     run = shlex.join([*RUN, "--seconds", "2", "--oracle", "linear", "--log", str(log)])
     command = f"{run} 2>&1 {output}; exit ${{PIPESTATUS[0]}}"
@@ -87,7 +100,7 @@ def test_who_does_not_read_ends_the_display_and_not_the_loop(tmp_path: Path, out
     assert (tmp_path / "run.png").exists()
 
 
-def test_of_the_current_folder_a_plant_file_is_loaded_and_nothing_else(tmp_path: Path):
+def test_only_a_plant_file_is_loaded_from_the_current_folder(tmp_path: Path):
     write_namesakes(tmp_path)
     file = write_tanks(tmp_path)
     with launched(tmp_path, *small(), "--set", "plant.model=tanks.py:TANKS") as run:
@@ -104,7 +117,7 @@ def test_of_the_current_folder_a_plant_file_is_loaded_and_nothing_else(tmp_path:
     assert replay(log).equal
 
 
-def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):
+def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
     with launched(tmp_path, "--oracle", "linear") as run:
         run.hears("the first command")
         for pid in run.pids():
@@ -119,10 +132,10 @@ def test_ctrl_c_twice_ends_everything_even_what_does_not_answer(tmp_path: Path):
 
 
 def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
-    with launched(tmp_path, *small()) as run:
+    with launched(tmp_path, *small(), *live()) as run:
         run.hears("the first command")
         started = run.pids()
-        assert len(started) == 5
+        assert len(started) == 6
         run.signal(signal.SIGKILL)
         wait_for(lambda: run.pids() == [], PATIENCE_S, every=0.05)
     assert read_run(tmp_path / "run.mcap").ticks
@@ -138,10 +151,12 @@ def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
     assert result["ticks"] >= 1
 
 
-def test_a_dead_recorder_is_said_loudly_and_the_loop_goes_on(tmp_path: Path):
+def test_a_dead_recorder_or_live_view_is_reported_and_the_loop_continues(tmp_path: Path):
     loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop goes on"
-    with launched(tmp_path, "--oracle", "linear") as run:
+    with launched(tmp_path, "--oracle", "linear", *live()) as run:
         run.hears("the first command")
+        run.kill("live")
+        run.hears("the live-view died (killed by SIGKILL); the run goes on without it")
         run.kill("record")
         run.hears(" ticks, ", times=3, after=loudly)
         run.signal(signal.SIGINT)
@@ -155,7 +170,7 @@ def test_a_dead_recorder_is_said_loudly_and_the_loop_goes_on(tmp_path: Path):
     assert "the recorder did not end well" in result["error"]
 
 
-def test_a_process_that_cannot_start_is_named_with_its_own_words(tmp_path: Path):
+def test_a_process_that_cannot_start_is_named_with_its_own_message(tmp_path: Path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -241,7 +256,7 @@ def test_a_pipe_or_a_link_with_the_name_of_a_runs_file_keeps_its_place(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_log_whose_name_is_no_text_is_written_and_drawn(tmp_path: Path):
+def test_a_log_with_a_name_that_is_not_utf_8_is_written_and_drawn(tmp_path: Path):
     name = os.fsdecode(b"caf\xe9.mcap")
     linear = ("--seconds", "1", "--oracle", "linear")
     with launched(tmp_path, *linear, "--log", name) as run:

@@ -34,7 +34,7 @@ def test_fits(monitor: Monitor, width: int, height: int):
         assert len(lines) <= height
 
 
-def test_shows_what_matters(monitor: Monitor):
+def test_the_view_shows_states_bounds_input_and_counters(monitor: Monitor):
     text = "\n".join(drawn(monitor.snapshot(START + 2.5), 100, 30))
     for expected in (
         "0.3000",
@@ -44,7 +44,7 @@ def test_shows_what_matters(monitor: Monitor):
         "1 fallback",
         "1 soft ticks",
         "1 adopted",
-        "bad plant/state: not finite 2",
+        "bad plant state not finite 2",
         "2.5 / 20 s",
         "●",
     ):
@@ -58,7 +58,7 @@ def test_a_value_outside_its_bounds_is_marked(z: float, mark: str):
     assert mark in "\n".join(drawn(seen.snapshot(START), 100, 30))
 
 
-def test_a_sensor_that_is_not_believed_is_said_once_and_shown(monitor: Monitor) -> None:
+def test_a_sensor_fault_is_reported_once_and_shown(monitor: Monitor) -> None:
     stuck = {"y": "stuck; what it measures is estimated from the others"}
     for k, faults in ((50, stuck), (51, stuck), (52, {})):
         answer = msgspec.structs.replace(result(k), sensor_faults=faults)
@@ -74,7 +74,7 @@ def test_a_sensor_that_is_not_believed_is_said_once_and_shown(monitor: Monitor) 
     ]
 
 
-def test_it_is_said_when_learning_adds_nothing_for_seconds_and_when_it_counts_again() -> None:
+def test_events_report_when_learning_adds_nothing_and_when_it_counts_again() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed(delivery(topics.COMMAND, command(0), START))
 
@@ -120,7 +120,7 @@ def test_noise_that_was_found_is_shown_of_the_states_that_are_measured() -> None
     assert "noise found z 0.0051 y 0.02" in " ".join("".join(drawn(now, 100, 30)).split())
 
 
-def test_one_line(monitor: Monitor):
+def test_the_plain_view_is_one_line(monitor: Monitor):
     text = view.line(monitor.snapshot(START + 2.5))
     assert "\n" not in text
     for expected in ("z 0.3000", "50 ticks, 1 late", "1 adopted, 1 refused"):
@@ -137,7 +137,7 @@ def test_bars_fall_with_the_error():
     assert len(view.spark([1.0] * 50, 10).plain) == 10
 
 
-def test_a_plant_that_falls_silent_is_missed_and_its_return_is_said() -> None:
+def test_a_silent_plant_and_its_return_are_reported() -> None:
     def said() -> list[str]:
         return [event.text for event in seen.new_events()]
 
