@@ -133,7 +133,7 @@ def test_numbers_without_a_valid_P_are_refused() -> None:
         for terminal, other in (("riccati", "lyapunov"), ("lyapunov", "riccati")):
             with (
                 warnings.catch_warnings(action="ignore"),
-                pytest.raises(ModelError, match=f"'{terminal}' at .* take '{other}'"),
+                pytest.raises(ModelError, match=f"'{terminal}' at .* use '{other}'"),
             ):
                 build_model(steep, 0.1, terminal=terminal)
 
