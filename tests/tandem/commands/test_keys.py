@@ -178,7 +178,7 @@ def test_keys_that_do_not_fit_are_named(keys: Path, tmp_path: Path):
     assert credentials.of_process(str(mine), "trainer", "jet1").name == "trainer.jet1"
     for role, plant in (("controller", "jet1"), ("trainer", "jet2")):
         with pytest.raises(
-            ConfigError, match=rf"certificate of trainer\.jet1, and this process is {role}\.{plant}"
+            ConfigError, match=rf"certificate of trainer\.jet1, but this process is {role}\.{plant}"
         ):
             credentials.of_process(str(mine), role, plant)
     with pytest.raises(ConfigError, match=r"bus\.tls\.keys is missing"):
