@@ -56,7 +56,7 @@ def document(title: str, properties: Json, required: Iterable[str]) -> Json:
 
 
 def object_schema(properties: Json, required: Iterable[str] = ()) -> Json:
-    """Of an object that has no other fields than these."""
+    """Return the JSON schema of an object that has only these fields."""
     return {
         "type": "object",
         "properties": properties,

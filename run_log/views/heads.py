@@ -11,14 +11,14 @@ from protocol.codec import UNREADABLE, Head, decode_as
 
 
 class StateHead(Head):
-    """Of a `PlantState`."""
+    """Head of a `PlantState`."""
 
     t: float
     source: str
 
 
 class TickHead(Head):
-    """Of a `Tick`."""
+    """Head of a `Tick`."""
 
     t: float
     lateness: float
@@ -29,7 +29,7 @@ class TickHead(Head):
 
 
 class ResultHead(Head):
-    """Of a `TickResult`."""
+    """Head of a `TickResult`."""
 
     mode: str
     status: str
@@ -44,7 +44,7 @@ class ResultHead(Head):
 
 
 class KeyframeHead(Head):
-    """Of a `Keyframe`."""
+    """Head of a `Keyframe`."""
 
     resumed: str = ""
 

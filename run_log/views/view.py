@@ -36,7 +36,7 @@ VECTORS = ("x", "oracle_norms", "weight", "constant_weight", "deviation", "noise
 NAMED_AFTER = dict.fromkeys((*VECTORS, "h", "h_hat", "column_norms"), "states") | dict.fromkeys(
     ("u", "applied"), "inputs"
 )
-"""Of each vector, the plant's attribute that has the names of its entries."""
+"""The plant's attribute with the names of the entries, by vector."""
 WITHOUT_UNIT = ("oracle_norms", "weight", "constant_weight", "column_norms")
 """Vectors whose entries are not in the units of the plant."""
 BY_STATE = ("sensor_faults", "reference", "values")
@@ -102,9 +102,9 @@ class Fields(NamedTuple):
     names: str
     """In this order, after run_id and seq."""
     made: Callable[[Any], Json] = lambda _message: {}
-    """The values of those that the message does not have, or has otherwise; None, or none at all, of what it lacks."""
+    """Values of fields that the message lacks or has in another form; None or absent if it has no value."""
     types: Mapping[str, Any] = {}
-    """Of those, where the message's own are not right."""
+    """Types of fields whose type in the message is not that of the view."""
 
 
 FIELDS_OF: dict[type[m.Message], Fields] = {

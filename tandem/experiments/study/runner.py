@@ -104,7 +104,7 @@ def run_all(
     for key, want in wants.items():
         record = read(folder / f"{key}.json", want.detail)
         if record is None:
-            raise RunnerError(f"{folder}: {key}.json was there and is gone or cannot be read; run again")
+            raise RunnerError(f"{folder}: {key}.json was deleted or damaged during the run; run again")
         records[key] = record
     return records
 

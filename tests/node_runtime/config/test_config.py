@@ -183,7 +183,7 @@ def test_toml_and_json_are_read_back_equal(tmp_path: Path):
         ),
         (
             'reference={outputs=["y"], values=[2.2]}',
-            "reference.values: y = 2.2 is outside of X, 1.1875 to 2.1875",
+            "reference.values: y = 2.2 is outside X, 1.1875 to 2.1875",
         ),
         ("plant.truth.mass=1.4", "no parameter 'mass'; it has beta, z_c, slope"),
         ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),

@@ -111,7 +111,7 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
 
 @pytest.mark.long
 def test_an_interrupted_experiment_continues(small: Path, tmp_path: Path) -> None:
-    # The other process reads the code anew; so must this one, where somebody edits while tests run.
+    # The other process reads the code again. This one must too, because files may be edited while tests run.
     code_version.cache_clear()
     small.write_text(SMALL.replace("steps = 30", "steps = 150"))
     out = tmp_path / "out"
@@ -132,7 +132,7 @@ def test_an_interrupted_experiment_continues(small: Path, tmp_path: Path) -> Non
     started.send_signal(signal.SIGINT)
     said, _ = started.communicate(timeout=120)
     assert started.returncode == 130, said
-    assert "goes on from there" in said
+    assert "continues from there" in said
     assert "Traceback" not in said
     kept = {path.name: path.stat().st_mtime_ns for path in runs.glob("*.json")}
     plans = [plan for plan in rows(cases(small)) if plan.case.group == "comparison"]
