@@ -2,12 +2,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+EXTRAS := trainer,log,live,export,experiment,cluster,examples,docs,dev
 # Passed on to tandem, e.g. make run ARGS="--seconds 60 --oracle l2nw"
 ARGS ?=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run simulate paper examples bench test test-long compose-test wheel-test remote-test
-.PHONY: faults fuzz soak docs docs-test lint format clean
+.PHONY: cluster-test faults fuzz soak docs docs-test lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -19,7 +20,7 @@ $(READY): pyproject.toml
 	    { echo "Tandem needs Python 3.11 or later; try: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv .venv
 # Python compiles a file when it is first imported, and only one in seven is.
-	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[trainer,log,export,experiment,examples,docs,dev]'
+	$(BIN)/pip install --no-compile --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
 	@touch $(READY)
 
 run: $(READY)  ## controller, trainer, plant and recorder, live, for 20 s
@@ -68,6 +69,9 @@ wheel-test: $(READY)  ## the wheel, built and installed in bare environments, in
 
 remote-test: $(READY)  ## docs/tutorials/remote.md, the trainer in another network namespace: 2 minutes; needs root
 	$(BIN)/pytest -x -s tests/remote/live_remote.py $(ARGS)
+
+cluster-test: $(READY)  ## sweeps on a Dask scheduler under faults, and their cost: 20 minutes; root for the full disk
+	$(BIN)/pytest -x -s tests/cluster/live_cluster.py $(ARGS)
 
 faults: $(READY)  ## faults on real processes, into docs/results/faults.md: hours; root; ARGS=--list names them
 	$(BIN)/python -m verification.faults --document docs/results/faults.md $(ARGS)

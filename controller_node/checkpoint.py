@@ -245,10 +245,10 @@ class CheckpointWriter:
             content = MAGIC + hashlib.sha256(content).digest() + content
             write_whole(self._path, content, mode=0o600, durable=True)
         except OSError as error:
-            self._counts["checkpoints failed"] += 1
+            self._counts["checkpoints_failed"] += 1
             self._warn(f"the checkpoint cannot be written ({error.strerror}); the loop continues without it")
             return
-        self._counts["checkpoints written"] += 1
+        self._counts["checkpoints_written"] += 1
         self._warn("")
 
     def _encode_samples(self) -> None:

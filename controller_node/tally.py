@@ -13,16 +13,16 @@ log = logging.getLogger(__name__)
 
 COUNTS = (
     "ticks",
-    "late ticks",
-    "skipped slots",
-    "states missing",
-    "states stale",
-    "weights adopted",
-    "weights refused",
-    "weights rolled back",
-    "references taken",
-    "checkpoints written",
-    "checkpoints failed",
+    "late_ticks",
+    "skipped_slots",
+    "states_missing",
+    "states_stale",
+    "weights_adopted",
+    "weights_refused",
+    "weights_rolled_back",
+    "references_taken",
+    "checkpoints_written",
+    "checkpoints_failed",
 )
 
 
@@ -48,19 +48,19 @@ class Tally:
         """Count one more tick; `overrun` means that its command came after the next slot's time."""
         counts = self.counts
         counts["ticks"] += 1
-        counts["late ticks"] += tick.late or overrun
-        counts["skipped slots"] += tick.skipped
-        counts["states missing"] += tick.state_verdict == "missing"
-        counts["states stale"] += tick.state_verdict == "stale"
-        counts["weights adopted"] += result.weights_outcome == "adopted"
+        counts["late_ticks"] += tick.late or overrun
+        counts["skipped_slots"] += tick.skipped
+        counts["states_missing"] += tick.state_verdict == "missing"
+        counts["states_stale"] += tick.state_verdict == "stale"
+        counts["weights_adopted"] += result.weights_outcome == "adopted"
         if result.weights_outcome == "refused":
-            counts["weights refused"] += 1
+            counts["weights_refused"] += 1
             self._bad.count(topics.HIDDEN_WEIGHTS.name, "refused", result.weights_verdict)
         if (verdict := result.reference_verdict).startswith("refused"):
             self._bad.count(topics.REFERENCE.name, "refused", f"{verdict} (of {result.reference_from})")
-        counts["references taken"] += verdict == "taken"
+        counts["references_taken"] += verdict == "taken"
         if rolled_back := result.weights_rolled_back:
-            counts["weights rolled back"] += 1
+            counts["weights_rolled_back"] += 1
             log.warning("tick %d: hidden weights %s", tick.seq, rolled_back)
         if result.sensor_faults or self._faults:
             self._report_faults(tick, result.sensor_faults)

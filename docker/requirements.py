@@ -19,8 +19,14 @@ def requirements(project: dict) -> dict[str, list[str]]:
     return {
         "controller": base,
         "recorder": base + extras["log"],
+        "worker": base + extras["log"] + extras["trainer"] + extras["cluster"] + own(extras["experiment"]),
         "trainer": [text for text in base if not text.startswith(NOT_IN_TRAINER)] + extras["trainer"],
     }
+
+
+def own(extra: list[str]) -> list[str]:
+    """What an extra names beside other extras of this project."""
+    return [text for text in extra if not text.startswith("tandem-control")]
 
 
 def main() -> None:

@@ -98,7 +98,7 @@ class Gateway:
         except (ValueError, TypeError, KeyError):
             reason = "malformed"
         if reason is not None:
-            self.refused[f"bad controller/command: {reason}"] += 1
+            self.refused[f"bad_controller_command_{reason}".replace(" ", "_")] += 1
             return
         self.plan, self.command_seq, self.arrived = command["plan"], command["seq"], arrived
         self.act(now)

@@ -6,6 +6,7 @@ import logging
 import threading
 
 from node_runtime.printable import printable
+from protocol.messages import counter_name
 
 log = logging.getLogger(__name__)
 
@@ -25,19 +26,20 @@ class RejectedMessages:
 
         `reason` is one of a few fixed texts. `detail` is only logged.
         """
-        key = f"bad {topic}: {reason}"
+        key = counter_name("bad", topic, reason)
         with self._lock:
             if key not in self._counts and len(self._counts) >= MAX_KINDS:
-                key = "bad, other"
+                key = "bad_other"
             seen = self._counts.get(key, 0)
             self._counts[key] = seen + 1
         if seen == 0:
             told = printable(detail[:300]) or "no detail"
-            log.warning("%s (%s); ignored, further ones are only counted", key, told)
+            text = f"bad {topic}: {reason}"
+            log.warning("%s (%s); ignored, further ones are only counted", text, told)
         return seen == 0
 
     def counters(self) -> dict[str, int]:
-        """Return the counters by keys such as "bad plant/state: not finite"."""
+        """Return the counters by names such as "bad_plant_state_not_finite"."""
         with self._lock:
             return dict(self._counts)
 

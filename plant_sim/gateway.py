@@ -173,7 +173,7 @@ class _Loop:
         self._commands: Inbox[Command] = Inbox(bus, topics.COMMAND, states=d, inputs=m, arrived=self._arrived)
         self._backups: Inbox[Backup] = Inbox(bus, topics.BACKUP, states=d, inputs=m, arrived=self._arrived)
         self._overrides: Inbox[Override] = Inbox(bus, topics.OVERRIDE, states=d, inputs=m)
-        names = ("samples", "samples skipped", "samples late", *(f"driven by {source}" for source in NOTES))
+        names = ("samples", "samples_skipped", "samples_late", *(f"driven_by_{source}" for source in NOTES))
         self._counts = dict.fromkeys(names, 0)
         self._source: InputSource = "hold"
         self._health: HealthPublisher | None = None
@@ -240,10 +240,10 @@ class _Loop:
             state = self._shield.sample(slot.time, x, self._machine.measured)
             self._bus.publish(topics.PLANT_STATE, state)
             counts["samples"] += 1
-            counts[f"driven by {state.source}"] += 1
+            counts[f"driven_by_{state.source}"] += 1
             self._source = state.source
-        counts["samples skipped"] += slot.skipped
-        counts["samples late"] += lateness > LATE * self._period
+        counts["samples_skipped"] += slot.skipped
+        counts["samples_late"] += lateness > LATE * self._period
         self._shield.renew(slot.time, x, self._machine)
 
     def _take_orders(self) -> None:

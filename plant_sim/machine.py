@@ -50,7 +50,7 @@ class Guarded:
         self._states, self._slow, self._simulated = states, SLOW * period, simulated
         self._under_way: tuple[Call, float] | None = None
         self._failures: dict[Call, tuple[str, float]] = {}
-        self.counts = dict.fromkeys(("reads failed", "reads slow", "writes failed", "writes slow"), 0)
+        self.counts = dict.fromkeys(("reads_failed", "reads_slow", "writes_failed", "writes_slow"), 0)
         self.due = 0.0
         """The time for which the last call was made, in seconds on the monotonic clock."""
         self.measured = 0.0
@@ -111,11 +111,11 @@ class Guarded:
         finally:
             self._under_way = None
         if clock.now() - began > self._slow:
-            self.counts[f"{name}s slow"] += 1
+            self.counts[f"{name}s_slow"] += 1
         return result
 
     def _failed(self, name: Call, text: str) -> None:
-        self.counts[f"{name}s failed"] += 1
+        self.counts[f"{name}s_failed"] += 1
         now = clock.now()
         first, last = self._failures.get(name, ("", -REMEMBERED_S))
         if now - last > REMEMBERED_S:

@@ -13,7 +13,9 @@ from protocol.topics import COMMANDER, Topic
 
 VIEWER = "viewer"
 """The role of `tandem health` and `tandem live`: it reads everything and publishes nothing."""
-ROLES = (*topics.PROCESSES, VIEWER, COMMANDER)
+USER = topics.USER
+"""The role of a publisher of own topics: it publishes below `user/` and nowhere else, and reads nothing."""
+ROLES = (*topics.PROCESSES, VIEWER, COMMANDER, USER)
 READS_ALL = ("recorder", VIEWER, COMMANDER)
 QUERIES = (topics.OUTBOX_QUERY, topics.HIDDEN_QUERY)
 
@@ -40,7 +42,8 @@ class Rights:
 
     def publish_keys(self, plant: str) -> list[str]:
         """Every key that it may publish at."""
-        return _keys(self.publishes, plant)
+        own = [topics.user_keys(plant)] if self.role == USER else []
+        return [*_keys(self.publishes, plant), *own]
 
     def read_keys(self, plant: str) -> list[str]:
         """Key expressions that it may subscribe to; what it hears is covered by them."""
@@ -69,7 +72,7 @@ def rights_of(role: str) -> Rights:
 
 def role_of(process: str) -> str:
     """The role in which a process of this name speaks: its own, or the viewer's."""
-    return process if process in (*topics.PROCESSES, COMMANDER) else VIEWER
+    return process if process in (*topics.PROCESSES, COMMANDER, USER) else VIEWER
 
 
 def common_name(role: str, plant: str) -> str:

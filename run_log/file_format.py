@@ -12,19 +12,28 @@ from run_log.errors import LogError
 
 PROFILE = "tandem"
 """The MCAP profile: what tells our logs from other MCAP files."""
-VERSIONS = {1: "0.1.0", 2: "0.2.0"}
+VERSIONS = {1: "0.1.0", 2: "0.2.0", 3: "0.2.0"}
 """By format: the version of Tandem that brought it. A new line is due when an older reader would be misled."""
 FORMAT = max(VERSIONS)
 """Number of the format that is written: it determines channels, attachments and metadata."""
-READABLE = (FORMAT,)
-"""Formats that this version reads."""
+READABLE = (2, 3)
+"""Formats that this version reads. In format 2 a raw channel has a message's bytes without a wrapping."""
 LIBRARY = f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}"
 """What the header, a file's first record, says of who wrote it: the format's number is in it."""
 
 RAW = "raw/"
-"""Channels of a topic's bytes as they travelled; those for people are `run_log.views`."""
+"""Channels of a topic's bytes as they travelled (`run_log.raw_message`); those for people are `run_log.views`."""
+UNIX_CLOCK = "Unix time of the machine that recorded"
+VIRTUAL_CLOCK = "virtual time of the simulation, from its beginning"
+TIMES = {
+    "log_time": "arrival at the recorder",
+    "publish_time": "sending, where a message has a time of its own; else as log_time",
+}
+"""What the two times of a message mean; both are on the log's one clock."""
 IDENTITY = "tandem"
-"""Metadata that says what a log is of."""
+"""Metadata that says what a log is of, and its clock."""
+UNITS, VERSIONS_USED, SEEDS, CONFIGURATION = "units", "versions", "seeds", "configuration"
+"""Metadata with what the attachments have as well, for viewers that show metadata."""
 CONTINUED = "continued"
 """Metadata of a log that goes on in another file."""
 RECOVERED = "recovered"
@@ -55,4 +64,4 @@ def check_header(path: Path, header: Header) -> None:
             else "it needs the version of Tandem that wrote it, or a later one"
         )
         ours = ", ".join(map(str, READABLE))
-        raise LogError(f"{path}: has the log format {number}, and this version reads format {ours}; {way}")
+        raise LogError(f"{path}: has the log format {number}, and this version reads formats {ours}; {way}")

@@ -59,6 +59,8 @@ class Run:
     """Logged payloads that are no valid messages, by topic and reason."""
     strangers: dict[str, int] = field(default_factory=dict)
     """Messages on unknown keys, by key."""
+    user: dict[str, list[tuple[int, bytes]]] = field(default_factory=dict)
+    """Messages on topics of users, by key: (log_time in ns, bytes). A controller never depends on them."""
     truncated: bool = False
     recovered: bool = False
     part: int = 1

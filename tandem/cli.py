@@ -28,7 +28,7 @@ from tandem.commands.keys import KeysCommand
 from tandem.commands.model import ModelCommand
 from tandem.commands.operating.by_hand import Auto, Manual, Pause
 from tandem.commands.operating.set_point import SetPoint
-from tandem.commands.processes import Controller, Plant, Record, Router, Trainer
+from tandem.commands.processes import Controller, Live, Plant, Record, Router, Trainer
 from tandem.commands.recover import Recover
 from tandem.commands.replay import Replay
 from tandem.commands.report import Report
@@ -49,6 +49,7 @@ AnyCommand = (
     | Annotated[Trainer, subcommand("trainer")]
     | Annotated[Plant, subcommand("plant")]
     | Annotated[Record, subcommand("record")]
+    | Annotated[Live, subcommand("live")]
     | Annotated[Health, subcommand("health")]
     | Annotated[Manual, subcommand("manual")]
     | Annotated[Pause, subcommand("pause")]

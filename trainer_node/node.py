@@ -55,12 +55,12 @@ COUNTERS = (
     "trainings",
     "published",
     "adopted",
-    "not adopted",
-    "rolled back",
-    "others' sets",
-    "gaps filled",
+    "not_adopted",
+    "rolled_back",
+    "others_sets",
+    "gaps_filled",
     "joined",
-    "samples of other runs",
+    "samples_of_other_runs",
 )
 """Counters of a node, in addition to those of its `Trainer`."""
 WAITING = "waiting for a controller with a network"
@@ -228,23 +228,23 @@ class TrainerNode:
         if held > ours or judged not in self._explained:
             text = "the controller was sent hidden weights version %d by another trainer; it holds version %d"
             log.warning(text, judged[0] if judged not in self._explained else held, held)
-            self._count("others' sets")
+            self._count("others_sets")
             # A version that the controller would refuse must not be used.
             self._trainer.leap(judged[0])
         elif sent is None or (judged == sent and held >= ours):
-            self._count("rolled back")
+            self._count("rolled_back")
             log.info(
                 "the controller rolled back hidden weights version %d; continuing from its present ones", ours
             )
             self._join_at = 0.0
         elif judged == sent:
-            self._count("not adopted")
+            self._count("not_adopted")
             log.info(
                 "the controller refused hidden weights version %d; continuing from version %d", ours, held
             )
             self._join_at = 0.0
         elif clock.now() - (self._sent_at or 0.0) > self._patience:
-            self._count("not adopted")
+            self._count("not_adopted")
             log.warning(
                 "there was no decision on hidden weights version %d; continuing from version %d", ours, held
             )
@@ -284,7 +284,7 @@ class TrainerNode:
         """Add live samples. If samples before them may be missing, the outbox will be queried."""
         if self._trainer is None or batch.run_id != self._run:
             # These samples are not lost: after the first K of that run, its outbox is queried for all samples.
-            self._count("samples of other runs")
+            self._count("samples_of_other_runs")
             return
         last = self._trainer.buffer.last(self._run)
         # Ticks without a sample leave gaps too, for which the outbox has no more samples.
@@ -309,7 +309,7 @@ class TrainerNode:
             # A restarted controller also keeps samples of its earlier runs.
             new += self._add(SAMPLES_ANSWER, batch)
         if new:
-            self._count("gaps filled")
+            self._count("gaps_filled")
         if self._trainer.buffer.last(self._run) <= since:
             # Without an answer and without later samples, nothing is known to be missing.
             self._gap = None
@@ -346,7 +346,7 @@ class TrainerNode:
 
     def rest(self, now: float, took: float) -> None:
         """Delay the next training after a round that began at `now` and took `took` seconds."""
-        self._counts["last training, ms"] = round(took * 1e3)
+        self._counts["last_training_ms"] = round(took * 1e3)
         self._train_at = now + max(TRAIN_EVERY, took / SHARE)
 
     def finish(self, draw: Draw, descent: Descent) -> None:

@@ -18,7 +18,7 @@ from msgspec import UNSET
 
 from network_model.description import NetworkDescription, hash_layers, why_unacceptable
 from node_runtime.config.sections import TrainerConfig
-from protocol.messages import Array, HiddenWeights, OutputWeights, Sample
+from protocol.messages import Array, HiddenWeights, OutputWeights, Sample, counter_name
 from trainer_node.descent import Descent, Problem, descend
 from trainer_node.network import Network, build_loss
 from trainer_node.pace import GAIN, Pace, Worth
@@ -154,8 +154,8 @@ class Trainer:
                 # Find the invalid ones by adding one sample at a time.
                 return sum(self.add(run_id, [sample]) for sample in batch)
             new, batch = 0, []
-            self.counters["bad samples"] += 1
-        self.counters["samples met before"] += len(batch) - new
+            self.counters["bad_samples"] += 1
+        self.counters["samples_met_before"] += len(batch) - new
         self.counters["samples"] += new
         self._fresh += new
         return new
@@ -227,7 +227,7 @@ class Trainer:
             for_run: the controller run of `output`.
 
         Returns:
-            The new hidden layers, or None if the old ones are kept; `counters["kept: <reason>"]` has the reason.
+            The new hidden layers, or None if the old ones are kept; `counters["kept_<reason>"]` has the reason.
         """
         draw = self.begin(output, for_run)
         if draw is None:
@@ -243,7 +243,7 @@ class Trainer:
         self.counters["trainings"] += 1
         K = output.K.numpy()
         if (why := self._unusable(K, output.hidden_sha256)) is not None:
-            self.counters[f"kept: {why}"] += 1
+            self.counters[counter_name("kept", why)] += 1
             return None
         xu, h = self.buffer.sample(self.config.batch, self._draws)
         self._network.load(self._bases[output.hidden_sha256])
@@ -264,7 +264,7 @@ class Trainer:
         if self.worth is not None:
             self._pace.trained(self._waited, descent.before, self.worth)
         if why is not None:
-            self.counters[f"kept: {why}"] += 1
+            self.counters[counter_name("kept", why)] += 1
             return None
         self._bases.move_to_end(output.hidden_sha256)
         self._take(trained)

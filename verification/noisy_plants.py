@@ -11,6 +11,7 @@ Finished runs stay in the folder, and the same command continues from there.
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from node_runtime.config.loading import load
 from node_runtime.config.shipped import config_file
 from tandem.experiments.simulation.faults import Faults
 from tandem.experiments.study.plan import Job
-from tandem.experiments.study.runner import Want, run_all
+from tandem.experiments.study.runner import Processes, Want, run_all
 from tandem.experiments.study.work import Record
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -180,7 +181,11 @@ def main(
     """
     cases = [Case(*names) for names in ((p, n, o) for p in plants for n in levels for o in oracles)]
     runs = {case: [job(case, seed, episodes, list(set)) for seed in range(seeds)] for case in cases}
-    records = run_all({one.key: Want(one, False, ()) for jobs_ in runs.values() for one in jobs_}, out, jobs)
+    wants = {one.key: Want(one, False, ()) for jobs_ in runs.values() for one in jobs_}
+    with closing(Processes(jobs)) as processes:
+        records, failures = run_all(wants, out, processes)
+    for failure in failures.values():
+        raise SystemExit(f"a run failed: {failure.text}")
     rows = {case: row([records[one.key] for one in ones]) for case, ones in runs.items()}
     (out / "rows.json").write_bytes(msgspec.json.encode([[*case, *one] for case, one in rows.items()]))
     return 0 if show(rows, Console()) else 1

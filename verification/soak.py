@@ -33,6 +33,7 @@ from benchmarks.live import process_usage, stalls
 from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
+from run_log import raw_message
 from run_log.errors import LogError
 from run_log.reading.mcap_scan import Scan
 from run_log.reading.reader import read_run
@@ -217,11 +218,16 @@ def _timed(parts: list[Path]) -> Iterator[m.Message]:
     names = {f"raw/{topic.name}": topic for topic in (topics.TICK, topics.TIMING)}
     for part in parts:
         channels: dict[int, topics.Topic] = {}
+        encodings: dict[int, str] = {}
         for record in Scan(part):
             if isinstance(record, Channel) and record.topic in names:
                 channels[record.id] = names[record.topic]
+                encodings[record.id] = record.message_encoding
             if isinstance(record, Message) and record.channel_id in channels:
-                yield codec.decode(channels[record.channel_id], record.data)
+                yield codec.decode(
+                    channels[record.channel_id],
+                    raw_message.payload_of(encodings[record.channel_id], record.data),
+                )
 
 
 def replayed(parts: list[Path]) -> list[str]:

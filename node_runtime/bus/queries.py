@@ -17,6 +17,7 @@ from node_runtime.bus.mailbox import Delivery, Mailbox
 from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
 from protocol import topics
+from protocol.messages import counter_name
 from protocol.topics import LARGEST_MESSAGE, LARGEST_QUESTION
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ class Queries:
                         for part in self._fragmenter.split(payload):
                             query.reply(topics.below(self._plant, name), part)
                 except zenoh.ZError:
-                    self._count("answers not sent")
+                    self._count("answers_not_sent")
 
     def ask(self, name: str, parameters: dict[str, str], timeout_s: float) -> list[bytes]:
         """See `Bus.ask`."""
@@ -131,7 +132,7 @@ class Queries:
                 priority=zenoh.Priority.DATA,
             )
         except zenoh.ZError as error:
-            if self._count(f"not asked {name}") == 1:
+            if self._count(counter_name("not asked", name)) == 1:
                 log.warning("%s could not be asked: %s", name, error)
             return []
         deadline = clock.now() + timeout_s + 0.2

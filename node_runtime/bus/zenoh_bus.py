@@ -25,7 +25,7 @@ from node_runtime.config.sections import Config
 from node_runtime.realtime import clock
 from node_runtime.rejected import RejectedMessages
 from protocol import codec, topics
-from protocol.messages import Message
+from protocol.messages import Message, counter_name
 from protocol.topics import LARGEST_MESSAGE, Topic
 
 log = logging.getLogger(__name__)
@@ -112,7 +112,7 @@ class Bus:
         """Send one message: control at once, bulk by the bulk thread. Never wait for a reader."""
         payload = codec.encode(message)
         if len(payload) > topic.max_bytes:
-            self._count(f"not sent, oversized {topic.name}")
+            self._count(counter_name("not sent oversized", topic.name))
             return
         if topic.lane == "control":
             self._put(topic, payload)
@@ -147,10 +147,10 @@ class Bus:
         try:
             self._publisher(topic).put(payload)
         except zenoh.ZError as error:
-            if not self._closed and self._count(f"not sent, error {topic.name}") == 1:
+            if not self._closed and self._count(counter_name("not sent error", topic.name)) == 1:
                 log.warning("%s could not be sent: %s", topic.name, error)
             return
-        self._count(f"sent {topic.lane}")
+        self._count(f"sent_{topic.lane}")
 
     def _publisher(self, topic: Topic) -> zenoh.Publisher:
         publisher = self._publishers.get(topic.name)
@@ -248,10 +248,11 @@ class Bus:
         with self._lock:
             counts = dict(self._counts)
         if self._outgoing.overflow:
-            counts["bulk overflow"] = self._outgoing.overflow
+            counts["bulk_overflow"] = self._outgoing.overflow
         for box in list(self._boxes):
             if box.overflow:
-                counts[f"overflow {box.name}"] = counts.get(f"overflow {box.name}", 0) + box.overflow
+                name = counter_name("overflow", box.name)
+                counts[name] = counts.get(name, 0) + box.overflow
         return counts | self.bad.counters()
 
     def _count(self, name: str) -> int:

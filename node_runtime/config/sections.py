@@ -414,6 +414,13 @@ class LogConfig(Section, frozen=True):
     """How many of a run's files stay, the one being written included. Older ones are removed. 0: all."""
 
 
+class LiveConfig(Section, frozen=True):
+    """The view in a browser (`tandem live`)."""
+
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 8765
+    """Port on 127.0.0.1 of the page and of the Foxglove WebSocket."""
+
+
 class RealtimeConfig(Section, frozen=True):
     """Scheduling of the processes, where it is permitted."""
 
@@ -446,6 +453,7 @@ class Config(Section, frozen=True):
     trainer: TrainerConfig = TrainerConfig()
     bus: BusConfig = BusConfig()
     log: LogConfig = LogConfig()
+    live: LiveConfig = LiveConfig()
     realtime: RealtimeConfig = RealtimeConfig()
 
     @property

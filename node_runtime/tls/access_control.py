@@ -93,6 +93,7 @@ def size_limits(plant: str) -> list[dict[str, Any]]:
     limits: dict[int, list[str]] = {}
     for topic in topics.ALL:
         limits.setdefault(topic.max_bytes, []).extend(topic.keys(plant))
+    limits.setdefault(topics.USER_MAX_BYTES, []).append(topics.user_keys(plant))
     filters = [_limit(f"up to {size}", ["put"], keys, size) for size, keys in limits.items()]
     all_keys = [topics.everything(plant)]
     filters.append(_limit("questions", ["query"], all_keys, topics.LARGEST_QUESTION))

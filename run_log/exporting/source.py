@@ -14,6 +14,7 @@ from node_runtime.config.sections import Config
 from protocol import codec, topics
 from run_log.errors import LogError
 from run_log.file_format import CONFIG, RAW, check_header
+from run_log.raw_message import NotRaw, payload_of
 from run_log.reading.mcap_scan import Scan
 from run_log.reading.reader import interpret, take_metadata
 from run_log.run import Entry, Run
@@ -79,6 +80,7 @@ class Source:
 
     def _messages(self, part: Run) -> Iterator[Logged]:
         scan, names = Scan(part.path, keep_going=True), dict[int, str]()
+        encodings: dict[int, str] = {}
         nameless = 0
         for record in scan:
             match record:
@@ -88,10 +90,17 @@ class Source:
                     take_metadata(part, record)
                 case Channel():
                     names[record.id] = record.topic
+                    encodings[record.id] = record.message_encoding
                 case Message() if record.channel_id not in names:
                     nameless += 1
                 case Message() if names[record.channel_id].startswith(RAW):
-                    one = Logged(names[record.channel_id].removeprefix(RAW), record.log_time, record.data)
+                    name = names[record.channel_id].removeprefix(RAW)
+                    try:
+                        payload = payload_of(encodings[record.channel_id], record.data)
+                    except NotRaw as error:
+                        self.damage.append(f"{part.path}: {name}: {error}")
+                        continue
+                    one = Logged(name, record.log_time, payload)
                     if self._is_new(one):
                         yield one
         self.damage += [f"{part.path}: damaged {what}" for what in scan.damage]
@@ -137,7 +146,7 @@ class Source:
 def _opening(path: Path) -> Run:
     """What stands before the first message. Where its configuration is lost, that of the first process is taken."""
     run = Run(path, Config())
-    header, names = False, dict[int, str]()
+    header, names, encodings = False, dict[int, str](), dict[int, str]()
     for record in Scan(path, keep_going=True):
         match record:
             case Header():
@@ -149,16 +158,18 @@ def _opening(path: Path) -> Run:
                 take_metadata(run, record)
             case Channel():
                 names[record.id] = record.topic
+                encodings[record.id] = record.message_encoding
             case Message() if CONFIG in run.attachments:
                 break
             case Message():
                 name = names.get(record.channel_id, "").removeprefix(RAW)
                 if name in RUN_INFO:
                     try:
-                        info = codec.decode(topics.BY_NAME[name], record.data)
-                    except codec.BadMessage:
+                        payload = payload_of(encodings[record.channel_id], record.data)
+                        info = codec.decode(topics.BY_NAME[name], payload)
+                    except (NotRaw, codec.BadMessage):
                         continue
-                    run.streams[name] = [Entry(record.log_time, record.data, info)]
+                    run.streams[name] = [Entry(record.log_time, payload, info)]
                     break
     if not header:
         raise LogError(f"{path}: contains no message; there is nothing to export")

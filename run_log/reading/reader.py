@@ -11,6 +11,7 @@ from node_runtime.config.loading import from_json
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from protocol import codec, topics
+from run_log import raw_message
 from run_log.errors import LogError
 from run_log.file_format import CONFIG, CONTINUED, IDENTITY, PLANT, RAW, RECOVERED, check_header
 from run_log.plant_record import PlantRecordError, decode
@@ -30,7 +31,8 @@ def read_run(path: str | Path) -> Run:
     path = Path(path)
     scan = Scan(path)
     run = Run(path, Config())
-    names: dict[int, str] = {}
+    names: dict[int, tuple[str, str]] = {}
+    """By channel: the topic, and the encoding of its messages."""
     header: Header | None = None
     for record in scan:
         match record:
@@ -41,12 +43,10 @@ def read_run(path: str | Path) -> Run:
                 run.attachments[record.name] = record.data
             case Metadata():
                 take_metadata(run, record)
-            case Channel():
-                names[record.id] = record.topic
-            case Message():
-                name = names.get(record.channel_id, "")
-                if name.startswith(RAW):
-                    _take(run, name.removeprefix(RAW), record)
+            case Channel() if record.topic.startswith(RAW):
+                names[record.id] = record.topic.removeprefix(RAW), record.message_encoding
+            case Message() if record.channel_id in names:
+                _take(run, *names[record.channel_id], record)
     if header is None:
         raise LogError(f"{path}: contains no message; there is nothing to recover")
     if scan.cut_at is not None:
@@ -85,18 +85,29 @@ def take_metadata(run: Run, record: Metadata) -> None:
         run.part = int(part)
 
 
-def _take(run: Run, name: str, record: Message) -> None:
+def _take(run: Run, name: str, encoding: str, record: Message) -> None:
+    try:
+        payload = raw_message.payload_of(encoding, record.data)
+    except raw_message.NotRaw:
+        _count_bad(run, f"{name}: not wrapped")
+        return
+    if topics.is_user(name):
+        run.user.setdefault(name, []).append((record.log_time, payload))
+        return
     topic = topics.BY_NAME.get(name)
     if topic is None:
         run.strangers[name] = run.strangers.get(name, 0) + 1
         return
     try:
-        message = codec.decode(topic, record.data)
+        message = codec.decode(topic, payload)
     except codec.BadMessage as error:
-        key = f"{error.topic}: {error.reason}"
-        run.bad[key] = run.bad.get(key, 0) + 1
+        _count_bad(run, f"{error.topic}: {error.reason}")
         return
-    run.streams.setdefault(name, []).append(Entry(record.log_time, record.data, message))
+    run.streams.setdefault(name, []).append(Entry(record.log_time, payload, message))
+
+
+def _count_bad(run: Run, key: str) -> None:
+    run.bad[key] = run.bad.get(key, 0) + 1
 
 
 def _config(path: Path, run: Run) -> Config:

@@ -6,13 +6,17 @@ import math
 from collections import OrderedDict
 from typing import Any
 
-from node_runtime.bus.inbox import AgeEstimate, Follower
+from node_runtime.bus.inbox import Follower
 from protocol import topics
 
 COUNTED = (topics.TICK.name, topics.RESULT.name)
 """Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
 MOST_RUNS = 100
 """That are remembered on each topic."""
+DRIFT = 1e-4
+"""Seconds per second, by which two clocks may drift apart: more than any quartz."""
+LEAP_S = 1.0
+"""A sender whose clock leaps ahead by more is not followed: all later messages would seem old."""
 OLDEST_S = 60.0
 """A message that seems older than that has a sender whose clock was set."""
 
@@ -53,7 +57,8 @@ class SendTimes:
     """
 
     def __init__(self) -> None:
-        self._ages: OrderedDict[tuple[str, str], AgeEstimate] = OrderedDict()
+        self._clocks: OrderedDict[tuple[str, str], tuple[float, float]] = OrderedDict()
+        """By topic and run: the smallest difference so far, and when it was last brought up to date; seconds."""
 
     def of(self, name: str, head: Any, time_ns: int) -> int:
         """Return the time in ns, never after `time_ns`, that of the arrival; `time_ns` where the message has none."""
@@ -63,18 +68,19 @@ class SendTimes:
             sent = head.t + head.lateness
         else:
             return time_ns
-        key, arrived = (name, head.run_id), time_ns * 1e-9
-        ages = self._ages.get(key)
-        if ages is None:
-            ages = self._ages[key] = AgeEstimate()
-            if len(self._ages) > MOST_RUNS:
-                self._ages.popitem(last=False)
-        if not math.isfinite(sent) or not ages.plausible(sent, arrived):
+        arrived = time_ns * 1e-9
+        key, difference = (name, head.run_id), arrived - sent
+        if not math.isfinite(difference):
             return time_ns
-        ages.observe(sent, arrived)
-        age = ages.age(sent, arrived)
-        if age > OLDEST_S:
-            ages.reset()
-            ages.observe(sent, arrived)
+        least, at = self._clocks.get(key, (difference, arrived))
+        # Two clocks drift apart, and not every message is a quick one from then on.
+        least += DRIFT * max(0.0, arrived - at)
+        if difference < least - LEAP_S:
             return time_ns
-        return max(0, time_ns - round(age * 1e9))
+        late = difference - least
+        if late < 0.0 or late > OLDEST_S:
+            least, late = difference, 0.0
+        self._clocks[key] = least, max(arrived, at)
+        if len(self._clocks) > MOST_RUNS:
+            self._clocks.popitem(last=False)
+        return max(0, time_ns - round(late * 1e9))

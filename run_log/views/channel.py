@@ -56,7 +56,7 @@ def document(title: str, properties: Json, required: Iterable[str]) -> Json:
 
 
 def object_schema(properties: Json, required: Iterable[str] = ()) -> Json:
-    """Return the JSON schema of an object that has only these fields."""
+    """Return the schema of an object that has no other fields than these."""
     return {
         "type": "object",
         "properties": properties,
@@ -87,6 +87,10 @@ class Growing:
         self._description = description
         self._names: dict[str, None] = {}
         self._grown = 0
+
+    def __bool__(self) -> bool:
+        """Whether a field is declared."""
+        return bool(self._names)
 
     @property
     def schema(self) -> Json:

@@ -74,6 +74,14 @@ class _Kind:
     """The last one that was withheld."""
 
 
+def _calm_result(result: Any) -> tuple[object, ...] | None:
+    """All that could be an event in a result; None where it has an event of its own. Quick, for every tick is asked."""
+    if result.weights_verdict != "none" or result.reference_verdict != "none" or result.weights_rolled_back:
+        return None
+    outside = result.set_margin is not None and result.set_margin < 0.0
+    return result.mode, result.status, result.sensor_faults, result.target_status, outside
+
+
 class Events:
     """Follows the messages of a run, and says what has changed."""
 
@@ -82,6 +90,8 @@ class Events:
         self._was: dict[str, Any] = {}
         """By kind, what was the case last."""
         self._kinds: dict[str, _Kind] = {}
+        self._calm: tuple[object, ...] | None = None
+        """The last result, where it had nothing to tell by itself."""
         self._waiting = False
         self._now = 0
 
@@ -91,10 +101,19 @@ class Events:
         shown = self._overdue() if self._waiting else []
         found: Iterator[Shown | None] | None = None
         if name == topics.RESULT.name:
+            calm = _calm_result(message)
+            if calm is not None and calm == self._calm:
+                return shown
+            self._calm = calm
             found = self._of_result(message)
         elif name == topics.TICK.name:
+            usual = message.state_verdict == self._was.get("state", "fresh")
+            if usual and not (message.late or message.skipped or message.truth):
+                return shown
             found = self._of_tick(message)
         elif name == topics.PLANT_STATE.name:
+            if message.source == self._was.get("source"):
+                return shown
             found = self._of_state(message)
         elif isinstance(message, m.Health):
             found = self._of_health(message)
@@ -132,11 +151,9 @@ class Events:
         if tick.skipped:
             slots = "1 slot was" if tick.skipped == 1 else f"{tick.skipped} slots were"
             yield self._say("skipped", Level.WARNING, "controller", f"{slots} skipped before {who}")
-        if (before := self._change("state", tick.state_verdict, "fresh")) is not None:
+        if self._change("state", tick.state_verdict, "fresh") is not None:
             level = Level.INFO if tick.state_verdict == "fresh" else Level.WARNING
-            yield self._say(
-                "state", level, "controller", f"{who}: the sample is {tick.state_verdict} ({before} before)"
-            )
+            yield self._say("state", level, "controller", f"{who}: the sample is {tick.state_verdict}")
         if tick.truth:
             new = ", ".join(f"{name} = {value:g}" for name, value in tick.truth.items())
             yield self._say(
@@ -242,7 +259,7 @@ class Events:
         )
 
     def _overdue(self) -> list[Shown]:
-        """Return the newest withheld event of every kind that may appear again."""
+        """Return the newest withheld event of every kind that is due again."""
         shown = []
         for kind, counted in self._kinds.items():
             if counted.newest is not None and self._now - counted.at >= APART_NS:

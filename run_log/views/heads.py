@@ -11,14 +11,14 @@ from protocol.codec import UNREADABLE, Head, decode_as
 
 
 class StateHead(Head):
-    """Head of a `PlantState`."""
+    """The head of a `PlantState`."""
 
     t: float
     source: str
 
 
 class TickHead(Head):
-    """Head of a `Tick`."""
+    """The head of a `Tick`."""
 
     t: float
     lateness: float
@@ -29,7 +29,7 @@ class TickHead(Head):
 
 
 class ResultHead(Head):
-    """Head of a `TickResult`."""
+    """The head of a `TickResult`."""
 
     mode: str
     status: str
@@ -44,7 +44,7 @@ class ResultHead(Head):
 
 
 class KeyframeHead(Head):
-    """Head of a `Keyframe`."""
+    """The head of a `Keyframe`."""
 
     resumed: str = ""
 

@@ -36,11 +36,11 @@ VECTORS = ("x", "oracle_norms", "weight", "constant_weight", "deviation", "noise
 NAMED_AFTER = dict.fromkeys((*VECTORS, "h", "h_hat", "column_norms"), "states") | dict.fromkeys(
     ("u", "applied"), "inputs"
 )
-"""The plant's attribute with the names of the entries, by vector."""
+"""The plant's attribute that has the names of a vector's entries, by vector."""
 WITHOUT_UNIT = ("oracle_norms", "weight", "constant_weight", "column_norms")
 """Vectors whose entries are not in the units of the plant."""
 BY_STATE = ("sensor_faults", "reference", "values")
-"""Of some of the states, by name."""
+"""Fields with values of some of the states, by name."""
 LACKING = (*VECTORS, "sensor_faults", "reference", "weights_rolled_back", "reference_from")
 """What a result has not, where it is empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
@@ -104,7 +104,7 @@ class Fields(NamedTuple):
     made: Callable[[Any], Json] = lambda _message: {}
     """Values of fields that the message lacks or has in another form; None or absent if it has no value."""
     types: Mapping[str, Any] = {}
-    """Types of fields whose type in the message is not that of the view."""
+    """Types of these values, where the message's own are not right."""
 
 
 FIELDS_OF: dict[type[m.Message], Fields] = {
@@ -219,15 +219,18 @@ class View:
         grown = False
         for name, growing in self._growing.items():
             grown |= growing.grow(values[name])
-            values[name] = growing.declared(values[name])
+            values[name] = growing.declared(values[name]) or None
         if grown:
             self.channel = self._channel()
 
     def _channel(self) -> Channel:
         # What may be absent stands last in a schema.
         optional = [name for name, kind in self._kinds.items() if isinstance(kind, inspect.UnionType)]
-        required = [name for name in self._kinds if name not in optional]
-        schemas = {name: self._schema(name, self._kinds[name]) for name in (*required, *optional)}
+        required = [name for name in self._kinds if name not in optional and name not in self._growing]
+        # An object is no part of the schema until one of its fields is known.
+        growing = [name for name, one in self._growing.items() if one]
+        names = (*required, *growing, *optional)
+        schemas = {name: self._schema(name, self._kinds[name]) for name in names}
         schema = document(f"{self.topic.type.__name__} (view)", schemas, required)
         return Channel(self.topic.name, schema)
 

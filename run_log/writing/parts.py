@@ -103,7 +103,7 @@ class PartedLog:
     def counters(self) -> dict[str, int]:
         """Counters of all parts together, each message once."""
         writer = self._writer
-        own = {**writer.counters, "write errors": writer.sink.errors, "file bytes": writer.sink.written}
+        own = {**writer.counters, "write_errors": writer.sink.errors, "file_bytes": writer.sink.written}
         return _sum(self._before, own)
 
     @property

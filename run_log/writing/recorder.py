@@ -123,13 +123,13 @@ def _finish(writer: PartedLog) -> int:
         log.error(
             "%s: %d ticks did not reach the recorder and are missing",
             writer.path,
-            writer.counters["lost ticks"],
+            writer.counters["lost_ticks"],
         )
     try:
         writer.close()
     except LogError as error:
         log.error("%s", error)
-    if writer.counters["file bytes"] == 0:
+    if writer.counters["file_bytes"] == 0:
         return EXIT_NOTHING_WRITTEN
     log.info("%s: %d messages", writer.path, writer.counters["messages"])
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from protocol import topics
+from run_log.file_format import VIRTUAL_CLOCK
 from run_log.run import Run, plant_of
 from run_log.writing.writer import LogWriter
 
@@ -19,6 +20,6 @@ def save(run: Run, path: str | Path) -> None:
     entries = [(entry, topic) for topic in topics.ALL for entry in run.entries(topic)]
     entries.sort(key=lambda pair: pair[0].log_time)
     start = entries[0][0].log_time if entries else 0
-    with LogWriter(path, run.config, plant_of(run), run.files, start_ns=start) as writer:
+    with LogWriter(path, run.config, plant_of(run), run.files, start_ns=start, clock=VIRTUAL_CLOCK) as writer:
         for entry, topic in entries:
             writer.write(topic.name, entry.payload, entry.log_time)

@@ -1,8 +1,9 @@
 """Writes the log of a run: MCAP, readable up to the last flush whatever happens to the process.
 
-- `raw/<topic>`: the exact bytes that travelled (msgpack), for replay. No schema in the channel: the
-  attachment schemas.json has them all, and a generic msgpack reader needs none.
-- `view/<topic>`: the same message as plottable JSON with a JSON schema (`run_log.views`).
+- `raw/<topic>`: the exact bytes that travelled (msgpack), for replay, in a protobuf message of one field
+  (`run_log.raw_message`). The attachment schemas.json has the schemas of what is inside.
+- `view/<topic>`, `view/bounds`, `view/targets`, `view/events`: plottable JSON with JSON schemas (`run_log.views`).
+- metadata: what the log is of, its clock, units, versions, seeds and configuration.
 - attachments: config.json, config.toml, plant.json (what is known of the plant, as numbers), versions.json, seeds.json,
   units.json, schemas.json.
 """
@@ -10,23 +11,41 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from lbmpc.plants import Known, Plant
 from node_runtime import provenance
-from node_runtime.config.loading import to_json, to_toml
+from node_runtime.config.loading import to_json, to_toml, to_tree
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import readable
 from protocol import codec, topics
+from run_log import raw_message
 from run_log.errors import LogError
-from run_log.file_format import CONFIG, CONTINUED, FORMAT, IDENTITY, LIBRARY, PLANT, PROFILE, RAW
+from run_log.file_format import (
+    CONFIG,
+    CONFIGURATION,
+    CONTINUED,
+    FORMAT,
+    IDENTITY,
+    LIBRARY,
+    PLANT,
+    PROFILE,
+    RAW,
+    SEEDS,
+    TIMES,
+    UNITS,
+    UNIX_CLOCK,
+    VERSIONS_USED,
+)
 from run_log.plant_record import encode
 from run_log.views.channel import Channel
 from run_log.views.views import Views
 from run_log.writing.durable_file import Sink, mcap_writer
+from run_log.writing.user_budget import UserBudget
 
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 MAX_STRANGERS = 100
@@ -45,6 +64,7 @@ class LogWriter:
         versions: what ran; None: the packages installed here.
         patient: see `Sink`.
         part: which one of its run's it is, from 1 (`run_log.writing.parts`).
+        clock: what the times of the messages are, for people.
 
     Raises:
         LogExistsError: something is at `path` already.
@@ -62,21 +82,33 @@ class LogWriter:
         versions: dict[str, str] | None = None,
         patient: bool = False,
         part: int = 1,
+        clock: str = UNIX_CLOCK,
     ):
-        self.counters = {"messages": 0, "bytes": 0, "without view": 0, "dropped": 0, "lost ticks": 0}
+        self.counters = {
+            "messages": 0,
+            "bytes": 0,
+            "without_view": 0,
+            "dropped": 0,
+            "user_dropped": 0,
+            "lost_ticks": 0,
+        }
         self.bad: dict[str, int] = {}
         """Known topics' payloads that are in the log as they came, but have no view: by reason."""
         self.last_bad: str | None = None
         self.sink = Sink(path, patient=patient)
         self._views = Views(config, plant)
+        self._budget = UserBudget()
         self._raw: dict[str, int] = {}
+        self._raw_schema: int | None = None
         self._shown: dict[Channel, int] = {}
         self._strangers = 0
         self._mcap = mcap_writer(self.sink, config.log.chunk_bytes)
         self._mcap.start(profile=PROFILE, library=LIBRARY)
-        identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
-        self._mcap.add_metadata(IDENTITY, identity)
         versions = versions if versions is not None else provenance.versions()
+        identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
+        self._mcap.add_metadata(IDENTITY, {**identity, "clock": clock, **TIMES})
+        for name, values in _metadata(config, plant, versions).items():
+            self._mcap.add_metadata(name, values)
         for name, kind, text in _attachments(config, plant, files or {}, versions):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
@@ -95,6 +127,9 @@ class LogWriter:
         if len(payload) > MAX_MESSAGE or self.sink.pending > self.sink.limit:
             self.counters["dropped"] += 1
             return
+        if topics.is_user(name) and not self._budget.admit(name, len(payload), log_time):
+            self.counters["user_dropped"] += 1
+            return
         channel = self._raw.get(name) or self._register_raw(name)
         if channel is None:
             self.counters["dropped"] += 1
@@ -103,11 +138,11 @@ class LogWriter:
         if seen.bad is not None:
             self._count_bad(seen.bad)
         sequence = seen.seq & 0xFFFFFFFF
-        self._mcap.add_message(channel, log_time, payload, seen.sent_ns, sequence)
+        self._mcap.add_message(channel, log_time, raw_message.wrap(payload), seen.sent_ns, sequence)
         for shown, text in seen.shown:
             self._mcap.add_message(self._view_channel(shown), log_time, text, seen.sent_ns, sequence)
         if self._views.lost:
-            self.counters["lost ticks"] = max(self._views.lost.values())
+            self.counters["lost_ticks"] = max(self._views.lost.values())
         self.counters["messages"] += 1
         self.counters["bytes"] += len(payload)
 
@@ -138,15 +173,19 @@ class LogWriter:
 
     def _register_raw(self, name: str) -> int | None:
         topic = topics.BY_NAME.get(name)
-        if topic is None:
+        if topic is None and not topics.is_user(name):
             if self._strangers >= MAX_STRANGERS:
                 return None
             self._strangers += 1
-        # Nobody vouches for a stranger's encoding.
-        encoding, kind = (
-            ("msgpack", topic.type.__name__) if topic else ("application/octet-stream", "unknown")
+        if self._raw_schema is None:
+            self._raw_schema = self._mcap.register_schema(
+                raw_message.SCHEMA_NAME, raw_message.ENCODING, raw_message.schema()
+            )
+        # The encoding of an unknown topic is not known.
+        inside = {"type": topic.type.__name__, "payload": "msgpack"} if topic else {"type": "unknown"}
+        self._raw[name] = self._mcap.register_channel(
+            RAW + name, raw_message.ENCODING, self._raw_schema, inside
         )
-        self._raw[name] = self._mcap.register_channel(RAW + name, encoding, 0, {"type": kind})
         return self._raw[name]
 
     def _view_channel(self, channel: Channel) -> int:
@@ -156,10 +195,28 @@ class LogWriter:
         return self._shown[channel]
 
     def _count_bad(self, error: codec.BadMessage) -> None:
-        key = f"bad {error.topic}: {error.reason}"
+        key = f"{error.topic}: {error.reason}"
         self.bad[key] = self.bad.get(key, 0) + 1
-        self.counters["without view"] += 1
+        self.counters["without_view"] += 1
         self.last_bad = str(error)
+
+
+def _metadata(config: Config, plant: Known | Plant, versions: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    return {
+        UNITS: dict(plant.units),
+        VERSIONS_USED: dict(versions),
+        SEEDS: {"seed": str(config.seed)},
+        CONFIGURATION: dict(_flat(to_tree(config))),
+    }
+
+
+def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Every key of a configuration with its sections before it, and its value as JSON; a text as it is."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield before + key, value if isinstance(value, str) else json.dumps(value)
 
 
 def _attachments(

@@ -24,7 +24,18 @@ if TYPE_CHECKING:
     from node_runtime.config.sections import Config
 
 FROM_CONFIG = "(default: the configuration's)"
-OPTIONAL_PACKAGES = ("torch", "mcap", "zstandard", "matplotlib", "jinja2", "pyarrow", "rerun")
+OPTIONAL_PACKAGES = (
+    "torch",
+    "mcap",
+    "msgpack",
+    "zstandard",
+    "matplotlib",
+    "jinja2",
+    "pyarrow",
+    "rerun",
+    "websockets",
+    "distributed",
+)
 """Packages of the extras. If one is missing, the command ends with a message."""
 NO_SETS, INTERRUPTED = 3, 130
 """Exit codes."""

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from tandem import terminal
 from tandem.commands.base import Command
 from tandem.terminal import Refused
+
+if TYPE_CHECKING:
+    from node_runtime.config.sections import Config
+    from tandem.experiments.study.results import FailedRun
+    from tandem.experiments.study.runner import Workplace
+
+MOST_TOLD = 10
+"""Failed runs on the terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +38,10 @@ class Experiment(Command):
     """Only a few seeds, states and values: a check that everything works, in minutes."""
     jobs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
     """Number of simultaneous runs; the figures do not depend on it."""
+    cluster: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")] = (
+        None
+    )
+    """Make the runs on the workers of a Dask scheduler, tcp://127.0.0.1:8786 or tls://HOST:8786."""
     only: Annotated[str | None, arg(metavar="GROUP", help_behavior_hint="(default: all)")] = None
     """Only one group of the experiment."""
 
@@ -69,14 +82,12 @@ class Experiment(Command):
         from tandem.experiments.study.declaration import load
         from tandem.experiments.study.runner import RunnerError
 
-        if self.jobs is not None:
-            terminal.limited("--jobs", self.jobs, 1, 1024)
+        open_workplace = self._workplace()
         path = _find(self.what)
         declared = load(path)
         plant = build_plant(experiment.settings(declared, str(path)))
         name = self.what if self.what in _shipped_files() else path.name
         command = f"tandem experiment {name} --out DIR" + (" --quick" if self.quick else "")
-        processes = self.jobs or len(os.sched_getaffinity(0))
         began = time.monotonic()
         with terminal.progress_bar(self.console) as bar:
             tasks = {}
@@ -88,7 +99,7 @@ class Experiment(Command):
 
             try:
                 made = experiment.run(
-                    *(declared, str(path), plant, out, processes, command),
+                    *(declared, str(path), plant, out, open_workplace, command),
                     quick=self.quick,
                     only=self.only,
                     progress=progress,
@@ -103,6 +114,7 @@ class Experiment(Command):
                 raise
         seconds = time.monotonic() - began
         self.say(f"{len(made.rows)} runs in {seconds:.0f} s")
+        self._tell(made.failed)
         self.say(*(f"wrote {file}" for file in (made.report, made.summary)))
         self.emit(
             {
@@ -111,9 +123,47 @@ class Experiment(Command):
                 "logs": made.logs,
                 "seconds": seconds,
                 "rows": msgspec.to_builtins(made.rows),
+                "failed": msgspec.to_builtins(made.failed),
             }
         )
-        return 0
+        return 1 if made.failed else 0
+
+    def _workplace(self) -> Callable[[Iterable[Config]], Workplace]:
+        """What makes the place where the runs are made."""
+        from tandem.experiments.study.runner import Processes
+
+        if self.cluster is None:
+            if self.jobs is not None:
+                terminal.limited("--jobs", self.jobs, 1, 1024)
+            count = self.jobs or len(os.sched_getaffinity(0))
+            return lambda configs: Processes(count)
+        if self.jobs is not None:
+            raise Refused(
+                "--jobs is about this machine; of a cluster each worker says how many threads it has"
+            )
+        try:
+            from tandem.experiments.cluster.workplace import Cluster
+        except ModuleNotFoundError as error:
+            how = "pip install 'tandem-control[experiment,cluster]'"
+            raise Refused(f"--cluster needs {error.name}: {how}") from error
+        from tandem.experiments.cluster.address import checked
+        from tandem.experiments.cluster.bundle import gather
+
+        address = checked(self.cluster)
+        return lambda configs: Cluster(address, gather(configs), lambda text: self.say(text, style="dim"))
+
+    def _tell(self, failed: list[FailedRun]) -> None:
+        """What went wrong, a line for each of the first runs."""
+        for run in failed[:MOST_TOLD]:
+            what = f"case {run.case!r}{' (with the true h)' if run.floor else ''}, seed {run.seed}"
+            where = f" on worker {run.failure.where}" if run.failure.where else ""
+            self.say(f"failed: {what}{where}: {run.failure.text}", style="red")
+        if failed:
+            self.say(
+                f"{len(failed)} runs failed; summary.json has the reason of each, with its traceback. The same command "
+                "makes them again",
+                style="red",
+            )
 
 
 def _shipped_files() -> dict[str, Path]:

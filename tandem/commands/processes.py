@@ -1,4 +1,4 @@
-"""`tandem router`, `controller`, `trainer`, `plant` and `record`: one process each, until it is told to stop."""
+"""`tandem router`, `controller`, `trainer`, `plant`, `record`, `live`: one process each, until it is told to stop."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from tyro.conf import arg
 
 from node_runtime.printable import printable
 from tandem.commands.base import FROM_CONFIG, Configured, require
+from tandem.terminal import Refused
 
 if TYPE_CHECKING:
+    from lbmpc.plants import Description
     from node_runtime.config.sections import Config
 
 
@@ -105,3 +107,38 @@ class Record(Process):
         require("zstandard")
 
         return self._process("recorder", main, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Live(Process):
+    """Show a running system in a browser: a page at http://localhost:8765, and a socket for Foxglove and Lichtblick."""
+
+    EXTRAS = "live"
+    KEYS = (("port", "live.port"),)
+
+    port: Annotated[int | None, arg(metavar="PORT", help_behavior_hint=FROM_CONFIG)] = None
+    """Where the page is served, on this machine alone."""
+    layout: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Write the layout for Foxglove and Lichtblick to this file, and end."""
+
+    def run(self) -> int:
+        config, plant = self.resolve_with_plant()
+        if self.layout is not None:
+            return self._write_layout(plant, self.layout)
+        from tandem.web.main import main
+
+        return self._process("live", main, config)
+
+    def _write_layout(self, plant: Description, path: Path) -> int:
+        import msgspec
+
+        from node_runtime.whole_file import write_whole
+        from tandem.web.layout import layout
+
+        try:
+            write_whole(path, msgspec.json.format(msgspec.json.encode(layout(plant))))
+        except OSError as error:
+            raise Refused(f"{path}: cannot be written: {error.strerror}") from error
+        self.say(f"layout for Foxglove and Lichtblick in {path}")
+        self.emit({"layout": str(path)})
+        return 0

@@ -6,6 +6,7 @@ import math
 import os
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,6 +55,9 @@ class Run(Configured):
     """Measurement noise of every state: its standard deviation as a share of the half-width, for example 0.01."""
     log: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: run.mcap)")] = None
     """The log; an existing file of that name is moved aside. The picture is placed beside it."""
+    live: bool = False
+    """Show the run in a browser too, at http://localhost:8765 (live.port): a page of its own, and a socket for Foxglove
+    and Lichtblick."""
     no_trainer: bool = False
     """Start no trainer here: it runs on another machine ("Put the trainer on another machine" in the
     documentation), or there is none."""
@@ -80,6 +84,7 @@ class Run(Configured):
         from tandem.live.monitor import Monitor
         from tandem.live.supervisor import Impatient, StartError, trains, wishes
 
+        live = self._live(config)
         require("zstandard", "matplotlib", *(["torch"] if trains(config) and not self.no_trainer else []))
         register_architecture(config)
         plant = build_plant(config)
@@ -97,7 +102,7 @@ class Run(Configured):
             files.config.write_text(to_toml(resolved), encoding="utf-8")
             monitor = Monitor(resolved, plant, seconds)
             try:
-                trouble, logged = self._supervise(resolved, files, monitor, wish)
+                trouble, logged = self._supervise(resolved, files, monitor, wish, live)
             except StartError as error:
                 terminal.complain(f"{error}\nAll output is in {files.folder}.", self.json)
                 return 2 if error.exit_code == 2 else 1
@@ -121,13 +126,31 @@ class Run(Configured):
         terminal.limited("--seconds", self.seconds, 0.0, LONGEST_S)
         return self.seconds
 
+    def _live(self, config: Config) -> bool:
+        """Return whether to serve the run to browsers, and print where, or why not.
+
+        Raises:
+            Refused: a package is missing.
+        """
+        if not self.live:
+            return False
+        if find_spec("websockets") is None:
+            raise terminal.Refused("--live needs websockets: pip install 'tandem-control[live]'")
+        from tandem.web.address import address, is_free, taken
+
+        if not is_free(config):
+            self.say(f"no live view: {taken(config)}", style="yellow")
+            return False
+        self.say(f"live     http://{address(config)}, for Foxglove and Lichtblick ws://{address(config)}")
+        return True
+
     def _elsewhere(self) -> list[str]:
         """Names of the processes that are not started here."""
         absent = {"plant": self.no_plant, "trainer": self.no_trainer}
         return [name for name, is_absent in absent.items() if is_absent]
 
     def _supervise(
-        self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish
+        self, config: Config, files: RunFiles, monitor: Monitor, wish: Wish, live: bool
     ) -> tuple[str | None, bool]:
         """Return why the run failed, or None; and whether its log is complete."""
         from node_runtime.realtime.scheduling import READER_PRIORITY, GarbageCollection, punctual
@@ -144,7 +167,7 @@ class Run(Configured):
                 garbage.idle()
 
             supervisor = Supervisor(
-                config, files.config, files.folder, monitor, wish, show, self._elsewhere()
+                config, files.config, files.folder, monitor, wish, show, self._elsewhere(), live
             )
             trouble = supervisor.run()
             return trouble, not supervisor.recorder_died

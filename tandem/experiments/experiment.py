@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ from tandem.experiments.reporting.page import page
 from tandem.experiments.study import results
 from tandem.experiments.study.declaration import STEPS, Declaration, config_of, resolve
 from tandem.experiments.study.plan import code_version, rows
-from tandem.experiments.study.runner import file_name, run_all, time_all, wanted
+from tandem.experiments.study.runner import Workplace, file_name, run_all, wanted
+from tandem.experiments.study.timing import time_all
 
 DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
@@ -33,6 +35,7 @@ class Finished(NamedTuple):
     summary: Path
     logs: int
     rows: list[results.Row]
+    failed: list[results.FailedRun]
 
 
 def run(
@@ -40,7 +43,7 @@ def run(
     where: str,
     plant: Description,
     out: Path,
-    processes: int,
+    open_workplace: Callable[[Iterable[Config]], Workplace],
     command: str,
     quick: bool = False,
     only: str | None = None,
@@ -54,7 +57,7 @@ def run(
         where: its file, for messages.
         plant: what is controlled.
         out: a folder; the runs it holds already are taken over where settings and code are the same.
-        processes: at the same time.
+        open_workplace: where the runs are made, from their configurations.
         command: what the report says it was made with.
         quick: fewer seeds, states and values.
         only: one group instead of all.
@@ -63,7 +66,7 @@ def run(
 
     Raises:
         ConfigError: the experiment or a configuration in it cannot be used.
-        RunnerError: a process was killed.
+        RunnerError: there is no place left to make runs, or every run failed.
         OSError: `out` cannot be written to.
         KeyboardInterrupt: what was finished is kept.
     """
@@ -79,7 +82,16 @@ def run(
     logs.mkdir(parents=True, exist_ok=True)
     plans = list(rows(cases))
     wants = wanted(plans, detailed, logs)
-    records = run_all(wants, out / "runs", processes, lambda done, total: progress("running", done, total))
+    with closing(open_workplace(plan.job.config for plan in plans)) as workplace:
+        records, failures = run_all(
+            wants,
+            out / "runs",
+            workplace,
+            lambda done, total: progress("running", done, total),
+            declared.limits,
+        )
+    failed = results.failed(plans, failures)
+    cases = results.with_results(cases, plans, records, failed)
     shown = {group.name for group in declared.group if group.picture == "trajectories"}
     timings = time_all(
         cases,
@@ -87,12 +99,13 @@ def run(
         (declared.steps or STEPS) * base.period * (SHORT if quick else 1.0),
         out / "timings",
         lambda done, total: progress("timing the solver", done, total),
+        declared.limits,
     )
     found = results.collect(plans, records, timings, plant)
     code = code_version()
-    made = page(declared, found, plant, base, command, code, quick)
+    made = page(declared, found, plant, base, command, code, quick, len(failed))
     every = [row for result in found for row in result.rows]
-    told = results.summary(declared, every, plant, command, code, processes, quick)
+    told = results.summary(declared, every, failed, timings, plant, command, code, quick)
     report, summary = out / "report.html", out / "summary.json"
     write_whole(report, made.html.encode())
     drawn = out / "pictures"
@@ -100,7 +113,7 @@ def run(
     for name, png in made.pictures.items():
         write_whole(drawn / f"{file_name(name)}.png", png)
     write_whole(summary, msgspec.json.format(msgspec.json.encode(told), indent=1))
-    return Finished(report, summary, sum(len(want.logs) for want in wants.values()), every)
+    return Finished(report, summary, sum(len(wants[key].logs) for key in records), every, failed)
 
 
 def settings(declared: Declaration, where: str) -> Config:

@@ -83,7 +83,8 @@ class Monitor:
         topic = topics.topic_of(delivery.key)
         now = delivery.received_ns * 1e-9
         if topic is None:
-            self.bad.count("unknown topic", "foreign", delivery.key)
+            if not topics.is_user(delivery.key.removeprefix(topics.below(self.config.name, ""))):
+                self.bad.count("unknown topic", "foreign", delivery.key)
             return
         if topic in UNSEEN:
             return
@@ -236,9 +237,9 @@ class Monitor:
         self._health[health.process] = health, now
         self._ended.discard(health.process)
         for name, count in health.counters.items():
-            if name.startswith("bad "):
+            if name.startswith(m.BAD):
                 if (health.process, name) not in self._bad_elsewhere:
-                    self.say(f"{health.process}: {name}; ignored", now, "bad")
+                    self.say(f"{health.process}: {name.replace('_', ' ')}; ignored", now, "bad")
                 self._bad_elsewhere[health.process, name] = count
 
     def say(self, text: str, now: float, weight: Weight = "note") -> None:

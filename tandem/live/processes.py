@@ -20,7 +20,7 @@ class Process:
     """One row of the table."""
 
     name: str
-    """As in `protocol.topics.PROCESSES`."""
+    """As in `protocol.topics.PROCESSES`, or "live-view"."""
     command: str
     """The tandem command that it runs."""
     when_it_dies: Literal["end the run", "go on", "restart"]
@@ -28,6 +28,8 @@ class Process:
     """How long it may take until it says that it is ready."""
     slow_because: str = ""
     """What a person who waits should know."""
+    optional: bool = False
+    """Nothing waits for it, and the run continues without it."""
 
 
 # In the order of starting. The controller comes last: learning starts with its first tick.
@@ -38,10 +40,17 @@ TABLE = (
     Process("plant", "plant", "end the run", 30.0),
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
+LIVE = Process("live-view", "live", "go on", 0.0, optional=True)
+"""Started beside the table by `tandem run --live`. It publishes nothing, so it cannot say that it is ready."""
 # In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
 # unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
 # them.
-STOP_S = ({"controller": 4.0, "plant": 4.0}, {"trainer": 6.0}, {"recorder": 15.0}, {"router": 4.0})
+STOP_S = (
+    {"controller": 4.0, "plant": 4.0},
+    {"trainer": 6.0},
+    {"recorder": 15.0, "live-view": 4.0},
+    {"router": 4.0},
+)
 
 
 def command_line(command: str, config: Path) -> list[str]:

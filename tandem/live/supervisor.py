@@ -17,7 +17,7 @@ from node_runtime.config.sections import Config
 from node_runtime.lifecycle import new_run_id
 from protocol import topics
 from tandem.live.monitor import Monitor
-from tandem.live.processes import STOP_S, TABLE, Child
+from tandem.live.processes import LIVE, STOP_S, TABLE, Child
 from tandem.live.snapshot import Snapshot
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -88,6 +88,7 @@ class Supervisor:
         wish: when to stop.
         show: is called about five times a second with what there is to see.
         elsewhere: those of the table that are not started here.
+        live: also serve the run to browsers.
     """
 
     def __init__(
@@ -99,10 +100,11 @@ class Supervisor:
         wish: Wish,
         show: Show,
         elsewhere: Collection[str] = (),
+        live: bool = False,
     ):
         self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
         absent = {*elsewhere, *(() if trains(config) else ("trainer",))}
-        table = [process for process in TABLE if process.name not in absent]
+        table = [process for process in (*TABLE, *([LIVE] if live else [])) if process.name not in absent]
         # The log's name may be any bytes, which a TOML file cannot say.
         options = {"recorder": ("--log", config.log.path)}
         self.children = {
@@ -115,7 +117,13 @@ class Supervisor:
         self._end: Snapshot | None = None
         self._restart_at: dict[str, float] = {}
         self._deaths: dict[str, int] = {}
-        self.recorder_died = False
+        self._gone: set[str] = set()
+        """Those that have died and are not missed."""
+
+    @property
+    def recorder_died(self) -> bool:
+        """Whether the log is not whole."""
+        return "recorder" in self._gone
 
     def run(self) -> str | None:
         """Start, watch, stop. Raises `StartError`, and `Impatient` after everything was killed."""
@@ -142,7 +150,8 @@ class Supervisor:
         for name in early:
             self._start(name)
         for name in early:
-            self._await_ready(name)
+            if not self.children[name].process.optional:
+                self._await_ready(name)
         self._start("controller")
         self._await_ready("controller")
 
@@ -187,7 +196,7 @@ class Supervisor:
                 explain_at = math.inf
                 self.monitor.phase = f"the {name}: {child.process.slow_because}"
                 self.monitor.say(self.monitor.phase, time.monotonic())
-            self._fail_if_dead(*self.children.values())
+            self._fail_if_dead(*(child for child in self.children.values() if not child.process.optional))
             if time.monotonic() > deadline:
                 said = self.monitor.status(name)
                 raise self._not_ready(
@@ -254,10 +263,10 @@ class Supervisor:
         if child.process.when_it_dies == "end the run":
             return f"{died}\n{child.last_words()}"
         if child.process.when_it_dies == "go on":
-            if not self.recorder_died:
-                self.recorder_died = True
+            if child.name not in self._gone:
+                self._gone.add(child.name)
                 self.monitor.ended(child.name)
-                self.monitor.say(f"NOT LOGGED from here on: {died}; the loop continues", now, "bad")
+                self.monitor.say(self._without(child, died), now, "bad")
             return None
         if child.name not in self._restart_at:
             if now - child.started_at > LONG_LIFE_S:
@@ -272,6 +281,12 @@ class Supervisor:
             del self._restart_at[child.name]
             self._start(child.name)
         return None
+
+    def _without(self, child: Child, died: str) -> str:
+        """What a person should know about a process that the run goes on without."""
+        if child.name == "recorder":
+            return f"NOT LOGGED from here on: {died}; the loop continues"
+        return f"{died}; the run continues without it\n{child.last_words()}"
 
     def _listen(self, wait_s: float = 0.02) -> None:
         """Take what arrives within a little time, together, and show it now and then."""
@@ -306,7 +321,7 @@ class Supervisor:
                 else:
                     continue
                 self.monitor.say(f"the {name} {how}", time.monotonic(), "bad")
-                self.recorder_died |= name == "recorder"
+                self._gone.add(name)
         # With what was still on its way: the last tick, and anything that went wrong in stopping.
         frozen = ("states", "inputs", "source", "processes", "phase")
         whole = self.monitor.snapshot(ended)

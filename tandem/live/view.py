@@ -18,8 +18,8 @@ FIGURES = 9
 BARS = "▁▂▃▄▅▆▇█"
 # Shown before the others, and in this order.
 COUNTERS = ("ticks", "messages", "samples", "trainings", "published")
-TROUBLE = ("bad", "overflow", "not sent", "write errors", "dropped")
-DULL = ("sent control", "sent bulk")
+TROUBLE = ("bad_", "bulk_overflow", "overflow_", "not_sent_", "write_errors", "dropped", "user_dropped")
+DULL = ("sent_control", "sent_bulk")
 
 STATUS_STYLE = {
     "running": "green",
@@ -294,12 +294,16 @@ def _processes(rows: Sequence[ProcessRow]) -> Table:
     for row in rows:
         calm = row.status in ("running", "ready")
         trouble, usual = _counters(row.counters)
-        words = [Text(f"{name} {row.counters[name]}", "bold yellow") for name in trouble]
+        words = [Text(f"{_words(name)} {row.counters[name]}", "bold yellow") for name in trouble]
         words += [Text(row.note, "default" if calm else "yellow")] if row.note else []
-        words += [Text(f"{name} {row.counters[name]}", "dim") for name in usual]
+        words += [Text(f"{_words(name)} {row.counters[name]}", "dim") for name in usual]
         status = Text(row.status, STATUS_STYLE.get(row.status, "default"))
         table.add_row(row.name, status, Text(", ").join(words))
     return table
+
+
+def _words(counter: str) -> str:
+    return counter.replace("_", " ")
 
 
 def _counters(counters: dict[str, int]) -> tuple[list[str], list[str]]:

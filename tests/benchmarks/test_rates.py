@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.document_block import conditions
 from benchmarks.live import rates
 from benchmarks.live.rates import COLUMNS, MARKS, Rates
 
@@ -32,3 +33,12 @@ def test_the_table_goes_between_the_marks(
     assert "old" not in text
     assert text.count(f"| {' | '.join(row)} |") == 4
     assert text.partition(MARKS.begin)[2].partition(MARKS.end)[0].strip() == capsys.readouterr().out.strip()
+
+
+def test_the_command_is_a_block_and_the_machine_a_wrapped_paragraph() -> None:
+    note = "A training has 300 steps. " * 9
+    fence, command, end, empty, *paragraph = conditions("python -m benchmarks.live.rates", note.strip())
+    assert (fence, command, end, empty) == ("```", "python -m benchmarks.live.rates", "```", "")
+    assert " ".join(paragraph).endswith(note.strip())
+    assert len(paragraph) > 1
+    assert max(len(line) for line in paragraph) <= 120

@@ -68,7 +68,7 @@ ME = AnyController(BELONGS)
 
 
 def counts() -> dict[str, int]:
-    return {"checkpoints written": 0, "checkpoints failed": 0}
+    return {"checkpoints_written": 0, "checkpoints_failed": 0}
 
 
 def memory(seq: int = 7) -> Snapshot:
@@ -105,9 +105,9 @@ def test_only_the_newest_samples_are_saved(tmp_path: Path) -> None:
             outbox.add(sample(seq))
             if seq % 10 == 9:
                 wait_for(lambda: writer.wanted)
-                done = counted["checkpoints written"]
+                done = counted["checkpoints_written"]
                 writer.offer(memory(seq))
-                wait_for(lambda done=done: counted["checkpoints written"] > done)
+                wait_for(lambda done=done: counted["checkpoints_written"] > done)
     saved = [codec.decode_as(m.Samples, payload) for payload in read(tmp_path / "memory", BELONGS).samples]
     assert [each.seq for one in saved for each in one.samples] == list(range(30, 60))
     assert {one.run_id for one in saved} == {"controller-b"}
@@ -181,7 +181,7 @@ def test_a_full_disk_is_logged_once_counted_and_leaves_the_old_file(
         for failures in range(3):
             wait_for(lambda: writer.wanted)
             writer.offer(memory(failures))
-            wait_for(lambda failures=failures: counted["checkpoints failed"] > failures)
+            wait_for(lambda failures=failures: counted["checkpoints_failed"] > failures)
         assert path.read_bytes() == before
         assert caplog.text.count("No space left on device") == 1
         full.clear()
@@ -338,7 +338,7 @@ def test_a_killed_controller_is_restarted_with_its_memory(tmp_path: Path) -> Non
     assert [one.run_id for one in asked] == sorted((one.run_id for one in asked), key=killed.__ne__)
     assert {one.run_id for one in asked} == {killed, new[0].run_id}
     assert last.run_id == new[0].run_id
-    assert last.counters["checkpoints failed"] == 0
+    assert last.counters["checkpoints_failed"] == 0
 
 
 @pytest.mark.live
@@ -390,7 +390,7 @@ def test_a_pipe_or_a_link_as_checkpoint_does_not_block_and_is_kept(
     counts_ = counts()
     with CheckpointWriter(path, BELONGS, Outbox("controller-1"), 100, counts_) as writer:
         writer.offer(memory())
-    assert counts_["checkpoints failed"] == 1
+    assert counts_["checkpoints_failed"] == 1
     assert path.lstat().st_mode == kind
     assert (tmp_path / "elsewhere").read_bytes() == b"not a checkpoint"
     assert caplog.text.count("only regular files are read, replaced or moved") == 2

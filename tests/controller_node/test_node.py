@@ -197,10 +197,10 @@ def test_weights_are_adopted_refused_or_dropped(run: Run) -> None:
     assert len(verdicts) == 2
     assert verdicts[0].startswith("refused: ")
     assert verdicts[1] == "adopted"
-    assert run.counters["weights adopted"] == 1
-    assert run.counters["weights refused"] == 1
-    assert run.counters["bad trainer/hidden_weights: for another run"] == 1
-    assert run.counters["bad trainer/hidden_weights: refused"] == 1
+    assert run.counters["weights_adopted"] == 1
+    assert run.counters["weights_refused"] == 1
+    assert run.counters["bad_trainer_hidden_weights_for_another_run"] == 1
+    assert run.counters["bad_trainer_hidden_weights_refused"] == 1
     assert run.said.count("for another run") == 1
     assert run.snapshot.hidden_version == 3
 
@@ -214,11 +214,11 @@ def test_references_are_answered_and_a_flood_is_reduced_to_one_per_tick(run: Run
     assert run.of(topics.RESULT)[-1].reference == pytest.approx({"y": 1.7})
     lost = [
         run.counters.get(name, 0)
-        for name in ("overflow operator/reference", "bad operator/reference: superseded")
+        for name in ("overflow_operator_reference", "bad_operator_reference_superseded")
     ]
     assert sum(lost) > FLOOD // 2
-    assert run.counters["bad operator/reference: refused"] == len([v for v in verdicts if v != "taken"])
-    assert run.counters["references taken"] == verdicts.count("taken")
+    assert run.counters["bad_operator_reference_refused"] == len([v for v in verdicts if v != "taken"])
+    assert run.counters["references_taken"] == verdicts.count("taken")
 
 
 @pytest.mark.live

@@ -121,9 +121,9 @@ def test_only_valid_states_are_used_and_an_outage_is_bridged() -> None:
             assert command.mode != "solver"
     counters = ear.of(topics.HEALTH["controller"])[-1].counters
     for reason in ("malformed", "not finite", "wrong size", "out of order", "foreign"):
-        assert counters[f"bad plant/state: {reason}"] >= 15, reason
+        assert counters[m.counter_name("bad plant/state", reason)] >= 15, reason
         assert process.said.count(f"bad plant/state: {reason}") == 1
-    assert counters["states missing"] >= 15
+    assert counters["states_missing"] >= 15
 
 
 @pytest.mark.live

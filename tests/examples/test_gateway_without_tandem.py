@@ -66,8 +66,8 @@ class Foreign:
         self._until(t)
         before = self.gateway.refused.copy()
         self.gateway.receive(payload, t, t)
-        (refused,) = (self.gateway.refused - before) or ("bad controller/command: ok",)
-        return refused.removeprefix("bad controller/command: ")
+        (refused,) = (self.gateway.refused - before) or ("bad_controller_command_ok",)
+        return refused.removeprefix("bad_controller_command_").replace("_", " ")
 
     def sample(self, t: float) -> m.PlantState:
         self._until(t)

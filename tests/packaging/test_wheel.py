@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from controller_node.certified_sets import read_sets
 from node_runtime.config.shipped import shipped
-from tests.helpers.paths import CONFIGS
+from tests.helpers.paths import CONFIGS, ROOT
 from tests.packaging.wheel import INSTALLED, build_wheel, copy_sources, unpacked_sdist
 
 
@@ -55,7 +56,8 @@ def test_the_wheel_declares_its_extras(wheel: Path):
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
         said = archive.read(name).decode().splitlines()
     extras = {line.partition(": ")[2] for line in said if line.startswith("Provides-Extra: ")}
-    assert extras == {"trainer", "log", "experiment", "examples", "dev"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert extras == set(project["optional-dependencies"])
 
 
 def test_shipped_files_are_found_through_the_link():

@@ -158,7 +158,7 @@ def test_a_machine_follows_only_valid_commands_and_is_safe_without() -> None:
                 "not finite",
                 "wrong size",
             )
-            keys = [f"bad controller/command: {reason}" for reason in reasons]
+            keys = [m.counter_name("bad controller/command", reason) for reason in reasons]
             health = ear.until(
                 lambda message: (
                     isinstance(message, m.Health) and all(message.counters.get(key) for key in keys)
@@ -208,7 +208,7 @@ def test_failing_functions_are_reported_in_health_without_invented_data() -> Non
             assert isinstance(health, m.Health)
             assert "read failed: OSError: no such device" in health.note
             machine.fails, machine.x = "", [1.0, float("nan"), 0.0, 0.0]
-            ear.until(lambda message: isinstance(message, m.Health) and message.counters["reads failed"] > 20)
+            ear.until(lambda message: isinstance(message, m.Health) and message.counters["reads_failed"] > 20)
             machine.x = PLANT.x_e
             after = next_state()
             assert after.seq - before.seq > 20

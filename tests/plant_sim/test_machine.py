@@ -64,7 +64,7 @@ def test_invalid_measurements_are_rejected(
     one = guarded(read)
     for _ in range(3):
         assert one.read(0.0) is None
-    assert one.counts["reads failed"] == 3
+    assert one.counts["reads_failed"] == 3
     assert said in one.trouble()
     # It is logged once, however often it fails.
     assert len(caplog.records) == 1
@@ -83,7 +83,7 @@ def test_with_an_estimator_some_states_may_have_no_number() -> None:
 def test_a_failed_write_makes_the_input_unknown() -> None:
     one = guarded(write=raising(TimeoutError("bus")))
     assert one.write(np.zeros(1), 0.0) is None
-    assert one.counts["writes failed"] == 1
+    assert one.counts["writes_failed"] == 1
     assert one.trouble() == "write failed: TimeoutError: bus"
 
 
@@ -123,7 +123,7 @@ def test_a_call_takes_effect_when_made_or_in_simulation_when_due() -> None:
 def test_a_slow_call_is_counted() -> None:
     one = guarded(write=lambda u: clock.sleep_until(clock.now() + 0.02), period=0.01)
     one.write(np.zeros(1), 0.0)
-    assert (one.counts["writes slow"], one.counts["reads slow"]) == (1, 0)
+    assert (one.counts["writes_slow"], one.counts["reads_slow"]) == (1, 0)
 
 
 def test_a_call_that_hangs_is_visible_to_other_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,5 +147,5 @@ def test_a_deliberately_lost_sample_is_not_a_failure() -> None:
     for simulated in (True, False):
         one = Guarded(lost, lambda _u: None, 2, 0.05, simulated)
         assert one.read(0.0) is None
-        assert one.counts["reads failed"] == 0
+        assert one.counts["reads_failed"] == 0
         assert one.trouble() == ""

@@ -36,7 +36,7 @@ def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
                 bus.publish(topics.COMMAND, answer)
                 foreign.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
             ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
-            foreign = "bad controller/command: foreign"
+            foreign = "bad_controller_command_foreign"
             ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
             process.signal(signal.SIGINT)
             ear.until(health_of("plant", status="stopping"))

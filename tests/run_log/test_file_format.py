@@ -39,8 +39,8 @@ def test_a_log_says_its_format_and_recovery_keeps_it(tmp_path: Path) -> None:
     config = override(Config(), ["log.chunk_bytes=8192"])
     whole = write(tmp_path / "run.mcap", config, synthetic(config, 30)[1])
     library, number = stated(whole)
-    assert library.startswith("tandem log 2; mcap-python/")
-    assert number == "2"
+    assert library.startswith("tandem log 3; mcap-python/")
+    assert number == "3"
     cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
     cut.write_bytes(whole.read_bytes()[:-1000])
     recover(cut, saved)
@@ -50,7 +50,7 @@ def test_a_log_says_its_format_and_recovery_keeps_it(tmp_path: Path) -> None:
 
 def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> None:
     path = log_of(tmp_path / "x.mcap", f"tandem log {FORMAT + 1}; mcap-python/9.9")
-    said = rf"x\.mcap: has the log format {FORMAT + 1}, and this version reads format {FORMAT}; it needs the version"
+    said = rf"x\.mcap: has the log format {FORMAT + 1}, and this version reads formats 2, 3; it needs the version"
     with pytest.raises(LogError, match=said):
         read_run(path)
     with pytest.raises(LogError, match=said):
@@ -60,7 +60,7 @@ def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> N
 
 def test_a_log_of_an_older_format_names_the_version_that_reads_it(tmp_path: Path) -> None:
     path = log_of(tmp_path / "old.mcap", "tandem log 1; mcap-python/1.6.0")
-    said = r"old\.mcap: has the log format 1, and this version reads format 2; Tandem 0\.1\.0 reads it"
+    said = r"old\.mcap: has the log format 1, and this version reads formats 2, 3; Tandem 0\.1\.0 reads it"
     with pytest.raises(LogError, match=said):
         read_run(path)
     with pytest.raises(LogError, match=said):

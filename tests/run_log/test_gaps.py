@@ -76,7 +76,7 @@ def test_lost_messages_are_counted_by_the_recorder_and_in_the_figures(tmp_path: 
         for topic, message, log_time in kept:
             writer.write(topic.name, codec.encode(message), log_time)
         assert writer.lost == {"controller/tick": 7, "controller/result": 8}
-        assert writer.counters["lost ticks"] == 8
+        assert writer.counters["lost_ticks"] == 8
     run = read_run(tmp_path / "run.mcap")
     assert lost_ticks(run) == [(RUN, 20, 7), (RUN, 40, 1)]
     assert summarise(run).lost_ticks == 8

@@ -22,6 +22,7 @@ from node_runtime.config.sections import Config
 from protocol import codec, topics
 from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
+from run_log.raw_message import unwrap
 from run_log.reading.reader import read_run
 from run_log.run import gather
 from run_log.writing.durable_file import Sink
@@ -69,9 +70,14 @@ def test_a_foreign_reader_reads_every_message(whole: Path, messages: list[Logged
         assert {a.name for a in reader.iter_attachments()} >= {"config.json", "config.toml", "versions.json"}
         for schema, channel, message in reader.iter_messages():
             if channel.topic.startswith("raw/"):
-                fields = msgpack.unpackb(message.data)
-                assert fields["run_id"]
-                assert channel.message_encoding == "msgpack"
+                assert schema is not None
+                assert (channel.message_encoding, schema.encoding, schema.name) == (
+                    "protobuf",
+                    "protobuf",
+                    "tandem_log.Raw",
+                )
+                assert channel.metadata["payload"] == "msgpack"
+                assert msgpack.unpackb(unwrap(message.data))["run_id"]
                 raw += 1
             else:
                 assert schema is not None
@@ -120,16 +126,16 @@ def test_garbage_is_logged_unchanged(tmp_path: Path, config: Config) -> None:
         writer.write("some/stranger", b"hello", 9)
         for i in range(300):
             writer.write(f"stranger/{i}", b"hello", 10)
-        assert writer.counters["without view"] == len(bad) + 1
+        assert writer.counters["without_view"] == len(bad) + 1
         assert writer.counters["dropped"] == 201
-        assert writer.bad["bad plant/state: not finite"] == 1
+        assert writer.bad["plant/state: not finite"] == 1
     run = read_run(path)
     assert run.bad == {"plant/state: malformed": 5, "plant/state: not finite": 1}
     assert [s.x for s in run.plant_states] == [[1.0, 2.0], [0.0] * 4]
     assert run.strangers["some/stranger"] == 1
     with path.open("rb") as stream:
         found = [(c.topic, x.data) for _, c, x in make_reader(stream).iter_messages()]
-    raw = [data for topic, data in found if topic == "raw/plant/state"]
+    raw = [unwrap(data) for topic, data in found if topic == "raw/plant/state"]
     assert raw == [*bad, short, codec.encode(state)]
     assert [topic for topic, _ in found].count("view/plant/state") == 1
 

@@ -198,7 +198,7 @@ def talk_while_full(
         trouble = ear.until(noted("NOT LOGGED"))
         assert isinstance(trouble, m.Health)
         assert "cannot be written" in trouble.note
-        assert trouble.counters["write errors"] > 0
+        assert trouble.counters["write_errors"] > 0
         plant.publish(topics.PLANT_STATE, state(0))
         free(process._popen.pid)
         ear.until(noted("writing"))

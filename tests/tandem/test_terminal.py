@@ -76,7 +76,7 @@ def seen() -> Monitor:
     config = Config()
     monitor = Monitor(config, get_plant(config.plant.model), 20.0)
     said = m.Health(
-        run_id=NASTY, seq=0, process="plant", status="running", counters={f"bad {NASTY}": 1}, note=NASTY
+        run_id=NASTY, seq=0, process="plant", status="running", counters={f"bad_{NASTY}": 1}, note=NASTY
     )
     monitor.feed(Delivery(topics.HEALTH["plant"].key(config.name), codec.encode(said), 0))
     monitor.say(f"{NASTY}\n   3.0 s  all is well", 0.0)

@@ -23,7 +23,7 @@ def test_a_controller_that_refuses_is_queried_for_its_weights(
     monkeypatch.setattr(trainer_module, "ADOPTION_PATIENCE", 2 * PATIENCE)
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         controller.adopts = False
-        controller.until(lambda h: h.counters["not adopted"] >= 1, tick=True)
+        controller.until(lambda h: h.counters["not_adopted"] >= 1, tick=True)
         base = hash_layers(controller.hidden)
         controller.adopts = True
         controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
@@ -38,7 +38,7 @@ def test_after_a_refusal_training_continues_from_the_weights_in_use(
     with Controller(config, "controller-1") as controller, RunningTrainer(config):
         for refused in range(1, 4):
             controller.adopts = False
-            controller.until(lambda h, n=refused: h.counters["not adopted"] >= n, tick=True)
+            controller.until(lambda h, n=refused: h.counters["not_adopted"] >= n, tick=True)
             controller.adopts = True
             done = len(controller.adopted)
             health = controller.until(lambda _, n=done: len(controller.adopted) > n, tick=True)
@@ -47,7 +47,7 @@ def test_after_a_refusal_training_continues_from_the_weights_in_use(
         assert [weights.base_sha256 for weights in controller.adopted] == bases[:-1]
         # No version was skipped, and no other trainer was assumed.
         assert controller.heard <= health.counters["published"] + 1
-        assert health.counters["others' sets"] == 0
+        assert health.counters["others_sets"] == 0
 
 
 @pytest.mark.parametrize("joined_before", [True, False], ids=["its own", "from before it joined"])
@@ -66,8 +66,8 @@ def test_after_a_rollback_training_continues_with_the_next_version(
         controller.until(lambda _: controller.version > newest, tick=True)
         assert controller.adopted[-1].seq == newest + 1
         assert controller.adopted[-1].base_sha256 == back
-        health = controller.until(lambda h: h.counters["rolled back"] >= 1)
-        assert (health.counters["others' sets"], health.counters["not adopted"]) == (0, 0)
+        health = controller.until(lambda h: h.counters["rolled_back"] >= 1)
+        assert (health.counters["others_sets"], health.counters["not_adopted"]) == (0, 0)
 
 
 @pytest.mark.parametrize(

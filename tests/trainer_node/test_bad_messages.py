@@ -49,11 +49,11 @@ def test_bad_messages_are_counted_and_stop_nothing(config: Config) -> None:
         health = controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
         foreign.close()
         for key in (
-            "bad controller/samples: malformed",
-            "bad controller/output_weights: malformed",
-            "bad controller/samples: not finite",
-            "bad controller/samples: wrong size",
-            "bad controller/samples: foreign",
+            "bad_controller_samples_malformed",
+            "bad_controller_output_weights_malformed",
+            "bad_controller_samples_not_finite",
+            "bad_controller_samples_wrong_size",
+            "bad_controller_samples_foreign",
         ):
             assert health.counters.get(key, 0) >= 1, (key, health.counters)
         controller.until(holds(controller.seq))
@@ -64,10 +64,10 @@ def test_an_invalid_snapshot_is_not_used(config: Config) -> None:
     with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
         right = controller.hidden
         controller.hidden = [np.full_like(layer, np.inf) for layer in right]
-        bad = "bad controller/hidden: not finite"
+        bad = "bad_controller_hidden_not_finite"
         controller.until(lambda h: h.counters.get(bad, 0) >= 1)
         controller.hidden = right[::-1] * 2
-        bad = "bad controller/hidden: unusable"
+        bad = "bad_controller_hidden_unusable"
         before = controller.until(lambda h: h.counters.get(bad, 0) >= 1).counters[bad]
         controller.hidden, controller.claimed = right, "0" * 64
         controller.until(lambda h: h.counters[bad] >= before + 2)
@@ -85,7 +85,7 @@ def test_a_huge_network_allocates_no_memory(config: Config) -> None:
         controller.description = huge
         tracemalloc.start()
         try:
-            controller.until(lambda h: h.counters.get("bad controller/hidden: unusable", 0) >= 1)
+            controller.until(lambda h: h.counters.get("bad_controller_hidden_unusable", 0) >= 1)
             assert tracemalloc.get_traced_memory()[1] < 2**28
         finally:
             tracemalloc.stop()

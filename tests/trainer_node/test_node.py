@@ -55,7 +55,7 @@ def test_a_restarted_trainer_continues_with_rising_versions(config: Config) -> N
             assert controller.adopted[-1].run_id == "trainer-2"
             assert controller.adopted[-1].seq > reached
             health = controller.until(holds(controller.seq + 1), ignored="trainer-1")
-            assert health.counters["not adopted"] == 0
+            assert health.counters["not_adopted"] == 0
             assert trainer.labels() == list(range(controller.seq + 1))
 
 
@@ -68,7 +68,7 @@ def test_lost_samples_are_fetched_and_missed_ticks_are_queried_once(config: Conf
         controller.tick(10, lost=True)
         controller.tick(10)
         health = controller.until(holds(30))
-        assert health.counters["gaps filled"] >= 1
+        assert health.counters["gaps_filled"] >= 1
         assert trainer.labels() == list(range(30))
         assert len(controller.questions) == asked + 1
         # Skipped ticks look the same. The answer to their query settles them, and there is at most one query a second.

@@ -41,7 +41,7 @@ def test_noise_is_not_fitted_but_a_larger_h_is() -> None:
     still[1:] = 0.05 * np.random.default_rng(1).normal(size=K[1:].shape)
     trainer, found = trained_on(noisy(80, 1.0, share=0.0), still)
     assert found is None
-    assert trainer.counters["kept: loss not lower"] == 1
+    assert trainer.counters["kept_loss_not_lower"] == 1
     # The same numbers without a variance are fitted.
     exact = [msgspec.structs.replace(sample, variance=[]) for sample in noisy(80, 1.0, share=0.0)]
     _, fitted = trained_on(exact, still)
@@ -91,7 +91,7 @@ def test_the_newest_valid_sample_decides_whether_labels_are_noisy() -> None:
     trainer.add("controller-1", samples(0, 40))
     (bad,) = noisy(1, 1.0)
     trainer.add("controller-1", [msgspec.structs.replace(bad, seq=90, h=[float("nan")] * 4)])
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
     assert not holds_out()
     trainer.add("controller-1", [msgspec.structs.replace(bad, seq=91)])
     assert holds_out()
@@ -104,7 +104,7 @@ def test_an_invalid_variance_makes_a_bad_sample(variance: list[float]) -> None:
     trainer = make(number=30)
     (bad,) = samples(50, 1)
     assert trainer.add("controller-1", [msgspec.structs.replace(bad, variance=variance)]) == 0
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
 
 
 def test_a_set_contains_its_newest_training_sample_with_noisy_labels() -> None:

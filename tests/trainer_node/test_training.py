@@ -105,7 +105,7 @@ def test_a_training_is_due_after_enough_new_samples() -> None:
     trained(trainer)
     assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(30, 20))
-    assert trainer.counters["samples met before"] == 20
+    assert trainer.counters["samples_met_before"] == 20
     trainer.add("controller-1", samples(50, 19))
     assert not trainer.due(output(trainer))
     trainer.add("controller-1", samples(69, 1))
@@ -122,7 +122,7 @@ def test_invalid_samples_do_not_reach_the_buffer() -> None:
         msgspec.structs.replace(good, h=[0.0]),
     ]
     assert trainer.add("controller-1", [*bad, good]) == 1
-    assert trainer.counters["bad samples"] == 4
+    assert trainer.counters["bad_samples"] == 4
     assert len(trainer.buffer) == 31
     assert np.isfinite(trained(trainer).loss_after)
 
@@ -141,9 +141,9 @@ def flipped(self: DenseLoss, right: Callable[[DenseLoss], torch.Tensor] = DenseL
 @pytest.mark.parametrize(
     ("gradient", "reason"),
     [
-        (broken_loss(float("nan")), "kept: not finite"),
-        (flipped, "kept: loss not lower"),
-        (broken_loss(0.0), "kept: loss not lower"),
+        (broken_loss(float("nan")), "kept_not_finite"),
+        (flipped, "kept_loss_not_lower"),
+        (broken_loss(0.0), "kept_loss_not_lower"),
     ],
 )
 def test_a_failed_training_keeps_the_old_layers(
@@ -162,10 +162,10 @@ def test_a_failed_training_keeps_the_old_layers(
 @pytest.mark.parametrize(
     ("weights", "reason"),
     [
-        (np.full_like(K, np.nan), "kept: K is not finite"),
-        (np.full_like(K, 1e300), "kept: K is too large"),
-        (K[:, :3], "kept: K has the wrong shape"),
-        (K[:-1], "kept: K has the wrong shape"),
+        (np.full_like(K, np.nan), "kept_k_is_not_finite"),
+        (np.full_like(K, 1e300), "kept_k_is_too_large"),
+        (K[:, :3], "kept_k_has_the_wrong_shape"),
+        (K[:-1], "kept_k_has_the_wrong_shape"),
     ],
 )
 def test_unusable_output_weights_are_reported(weights: np.ndarray, reason: str) -> None:
@@ -180,7 +180,7 @@ def test_layers_that_the_controller_would_refuse_are_not_published() -> None:
     trainer = Trainer(tight, CONFIG, 5, "trainer-1", HIDDEN)
     trainer.add("controller-1", samples(0, 300))
     assert trainer.train(output(trainer), "controller-1") is None
-    assert trainer.counters["kept: norm bound"] == 1
+    assert trainer.counters["kept_norm_bound"] == 1
 
 
 def test_a_training_continues_from_the_layers_of_K() -> None:
@@ -195,7 +195,7 @@ def test_a_training_continues_from_the_layers_of_K() -> None:
     # The drawn samples differ, and so do the layers, but both trainings began at nearly the same loss.
     assert again.loss_before == pytest.approx(second.loss_before, rel=0.3)
     assert trainer.train(output(trainer, sha256="0" * 64), "controller-1") is None
-    assert trainer.counters["kept: K belongs to unknown hidden weights"] == 1
+    assert trainer.counters["kept_k_belongs_to_unknown_hidden_weights"] == 1
 
 
 def test_a_training_continues_from_a_snapshot_with_its_samples() -> None:

@@ -39,9 +39,9 @@ from verification.faults.facts import Replayed
         (holds.none_obeyed, {"foreign_states": 1}),
         (
             holds.all_counted,
-            {"extra": {"sent plant/state": 2}, "counted": {"controller bad plant/state: x": 1}},
+            {"extra": {"sent plant/state": 2}, "counted": {"controller bad_plant_state_x": 1}},
         ),
-        (holds.all_counted, {"counted": {"plant bad controller/command: foreign": 1}}),
+        (holds.all_counted, {"counted": {"plant bad_controller_command_foreign": 1}}),
         (
             holds.weights_refused,
             {
@@ -82,10 +82,10 @@ def test_every_check_passes_on_a_good_run() -> None:
             "said: the router refused us": 4,
         },
         counted={
-            "controller bad plant/state: malformed": 2,
-            "controller overflow plant/state": 1,
-            "controller bad trainer/hidden_weights: refused": 2,
-            "router bad TLS link: refused, it has no certificate": 4,
+            "controller bad_plant_state_malformed": 2,
+            "controller overflow_plant_state": 1,
+            "controller bad_trainer_hidden_weights_refused": 2,
+            "router bad_tls_link_refused_it_has_no_certificate": 4,
         },
         said=["recorder: NOT LOGGED: full"],
     )

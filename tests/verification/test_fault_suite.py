@@ -131,7 +131,7 @@ def ignored(rig: Rig, topic: str) -> int:
     """Return how many messages of a topic the controller reports as refused."""
     health = newest(rig, topics.HEALTH["controller"], 0.0)
     assert isinstance(health, m.Health)
-    names = (f"bad {topic}:", f"overflow {topic}")
+    names = (m.counter_name("bad", topic), m.counter_name("overflow", topic))
     return sum(count for name, count in health.counters.items() if name.startswith(names))
 
 

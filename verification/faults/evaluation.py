@@ -294,7 +294,7 @@ def _counted(witness: Witness) -> dict[str, int]:
     found: Counter[str] = Counter()
     for health in last.values():
         for name, count in health.counters.items():
-            if name.startswith(("bad", "overflow", "not sent", "bulk overflow")):
+            if name.startswith(("bad_", "overflow_", "not_sent_", "bulk_overflow")):
                 found[f"{health.process} {name}"] += count
     return dict(found)
 

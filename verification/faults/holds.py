@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 
+from protocol.messages import counter_name
 from verification.faults.facts import Facts
 
 Held = Callable[[Facts, Facts], str | None]
@@ -114,18 +115,15 @@ def all_counted(run: Facts, calm: Facts) -> str | None:
     for topic, process in OBEYED.items():
         sent = int(run.extra.get(f"sent {topic}", 0))
         found = {name: count for name, count in run.counted.items() if name.startswith(f"{process} ")}
-        reasons = {
-            name.partition(": ")[2]: n
-            for name, n in found.items()
-            if name.startswith(f"{process} bad {topic}:")
-        }
+        before = f"{process} {counter_name('bad', topic)}_"
+        reasons = {name.removeprefix(before): n for name, n in found.items() if name.startswith(before)}
         bad = sum(reasons.values())
         # Messages of the run's own trainer may be refused too. The controller's first
         # command may come before it has received a state.
-        own = ("refused", "for another run", "superseded", "answers no sample")
+        own = ("refused", "for_another_run", "superseded", "answers_no_sample")
         surely = bad - sum(reasons.get(reason, 0) for reason in own)
         # A full mailbox drops its oldest message, from any sender.
-        dropped = found.get(f"{process} overflow {topic}", 0)
+        dropped = found.get(f"{process} {counter_name('overflow', topic)}", 0)
         if not surely <= sent <= bad + dropped:
             return f"{sent} sent to {topic}, {bad} counted by the {process}, {dropped} dropped"
     return None
@@ -139,7 +137,7 @@ def refused_on_both_sides(run: Facts, calm: Facts) -> str | None:
     if not any(name.startswith("said: ") for name in run.extra):
         return "the stranger was not told why"
     if not any(
-        name.startswith(("router bad TLS link: refused", "router bad from trainer")) for name in run.counted
+        name.startswith(("router bad_tls_link_refused", "router bad_from_trainer")) for name in run.counted
     ):
         return "the router did not say why"
     return None

@@ -1,107 +1,175 @@
-"""What the figures say, in words that follow from them."""
+"""Verdicts and sentences of the report, derived from the rows of the results."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tandem.experiments.reporting.pictures import by_family, family_label, margins
+from tandem.experiments.reporting.families import by_family, family_label, places
 from tandem.experiments.study.results import CaseResult, spread
 
+ENOUGH = 5
+"""Fewest pairs of runs for a verdict. With fewer, a sign test at 5 % cannot find a difference."""
+ENOUGH_SOLVES = 500
+"""Fewest timed solves for a verdict on a p99: five of them are slower than it."""
 CLEAR = 0.9
-"""A difference counts when so many of the paired runs have its sign,"""
+"""A difference is clear when this share of the pairs has its sign."""
 COST = 0.01
-"""and the medians of J differ by this share of the reference's,"""
+"""Smallest difference of the median J that counts, as a share of the reference's."""
 OVERSHOOT = 0.02
-"""or those of the overshoot by this share of the initial deviation."""
-ENOUGH = 3
-"""Fewer pairs say nothing."""
+"""Smallest difference of the median overshoot that counts, as a share of the initial deviation."""
 BELOW = 0.001
-"""A regret that is negative by less than this is none."""
+"""A negative regret smaller than this counts as zero."""
+NBSP = "\N{NO-BREAK SPACE}"
+COMPARED = {"linear", "l2nw", "dnn"}
+"""Oracles that the claims of the paper compare."""
+
+Verdict = Literal["held", "not held", "not enough runs"]
 
 
 class Claim(NamedTuple):
-    """Something the paper says, and whether the figures agree."""
+    """A claim of the paper, its verdict, and the figures behind it."""
 
-    claim: str
-    holds: bool
+    statement: str
+    verdict: Verdict
     measured: str
 
 
+class Comparison(NamedTuple):
+    """A case compared with the reference of its group."""
+
+    label: str
+    verdict: Literal["differs", "no clear difference", "not enough runs"]
+    pairs: int
+    """Pairs of runs from the same start with the same seed."""
+    seen: list[str]
+    """The differences of the medians."""
+
+
 def claims(results: list[CaseResult]) -> list[Claim]:
-    """The paper's, where the group has linear, l2nw and dnn."""
+    """Check the claims of the paper on a group that has linear, l2nw and dnn; empty for any other group.
+
+    A claim is about every seed. It is `held` if it is true in every pair of runs and there are at least `ENOUGH`
+    pairs, `not held` if it is false in one pair, and `not enough runs` otherwise. A claim about solve times needs
+    `ENOUGH_SOLVES` solves of each oracle.
+    """
     by = {result.oracle: result for result in reversed(results)}
-    if not {"linear", "l2nw", "dnn"} <= by.keys():
+    if not by.keys() >= COMPARED:
         return []
     linear, l2nw, dnn = by["linear"], by["l2nw"], by["dnn"]
     found = []
-    if all(row.regret is not None for result in (linear, l2nw, dnn) for row in result.rows):
-        own, others = dnn.median("regret"), (linear.median("regret"), l2nw.median("regret"))
+    if not np.isnan(dnn.values("regret")).all():
         found += [
-            Claim(
-                "Learning is worth it: median regret of the network at most a third of linear MPC's",
-                own <= min(others[0] / 3, others[0]),
-                f"{own:.1%} against {others[0]:.1%}",
+            _pairwise(
+                "The regret of the network is at most a third of that of linear MPC",
+                dnn,
+                linear,
+                "regret",
+                lambda own, other: np.isfinite(own) & (own <= np.minimum(other / 3, other)),
             ),
-            Claim("and below L2NW's", own < others[1], f"{own:.1%} against {others[1]:.1%}"),
+            _pairwise("The regret of the network is less than that of L2NW", dnn, l2nw, "regret"),
         ]
-    kernel, network = paired(l2nw, dnn, "overshoot")
-    slow, fast = paired(linear, dnn, "settled_s")
-    found += [
-        Claim(
-            "Less overshoot than L2NW, for every seed",
-            bool((network < kernel).all()),
-            f"{dnn.median('overshoot'):.1%} in the median, {dnn.worst('overshoot'):.1%} at worst, against "
-            f"{l2nw.values('overshoot').min():.1%}",
+    return [
+        *found,
+        _pairwise("The network overshoots less than L2NW", dnn, l2nw, "overshoot"),
+        _pairwise("The network settles sooner than linear MPC", dnn, linear, "settled_s"),
+        _constraints(linear, l2nw, dnn),
+        *_times(linear, l2nw, dnn),
+    ]
+
+
+def verdict(true: int, of: int, enough: int = ENOUGH) -> Verdict:
+    """Return the verdict on a claim that is true in `true` of `of` pairs of runs."""
+    if true < of:
+        return "not held"
+    return "held" if of >= enough else "not enough runs"
+
+
+def _pairwise(
+    statement: str,
+    dnn: CaseResult,
+    base: CaseResult,
+    name: str,
+    is_true: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.less,
+) -> Claim:
+    own, other = paired(dnn, base, name)
+    true = int(is_true(own, other).sum())
+    if not len(own):
+        return Claim(statement, verdict(0, 0), "no pair of runs has this figure")
+    measured = (
+        f"true in {true} of {counted(len(own), 'pair')} of runs; network {_figure(name, float(np.median(own)))} in "
+        f"the median, {_figure(name, float(own.max()))} at worst; {base.label} "
+        f"{_figure(name, float(np.median(other)))} in the median"
+    )
+    return Claim(statement, verdict(true, len(own)), measured)
+
+
+def _constraints(*compared: CaseResult) -> Claim:
+    broken = sum(not record.kept for result in compared for record in result.records)
+    seeds = len(compared[-1].rows)
+    measured = "; ".join(f"{result.label} in {kept(result)} runs" for result in compared)
+    return Claim(
+        "Linear MPC, L2NW and the network keep all true constraints at all samples",
+        "not held" if broken else verdict(seeds, seeds),
+        measured,
+    )
+
+
+def _times(linear: CaseResult, l2nw: CaseResult, dnn: CaseResult) -> list[Claim]:
+    if linear.timing is None or l2nw.timing is None or dnn.timing is None:
+        return []
+    timed = {result.label: result.timing for result in (linear, l2nw, dnn) if result.timing is not None}
+    spreads = {name: spread(timing) for name, timing in timed.items()}
+    solves = min(sum(len(run) for run in timing.runs) for timing in timed.values())
+    period = dnn.case.config.period * 1e3
+    own, kernel = spreads[dnn.label], spreads[l2nw.label]
+
+    def claim(statement: str, true: bool, measured: str) -> Claim:
+        said: Verdict = "not enough runs" if solves < ENOUGH_SOLVES else "held" if true else "not held"
+        return Claim(statement, said, f"{measured}; {counted(solves, 'solve')} of each")
+
+    return [
+        claim(
+            "The median solve time of the network is less than that of L2NW",
+            own.p50 < kernel.p50,
+            "; ".join(f"{name} {one.p50:.2g}{NBSP}ms" for name, one in spreads.items()),
         ),
-        Claim(
-            "Faster than linear MPC, for every seed",
-            bool((fast < slow).all()),
-            f"settled after {_seconds(dnn.median('settled_s'))} in the median, {_seconds(dnn.worst('settled_s'))} at "
-            f"worst, against {_seconds(linear.median('settled_s'))}",
+        claim(
+            "The p99 of the solve time of the network is less than that of L2NW",
+            own.p99 < kernel.p99,
+            "; ".join(f"{name} {one.p99:.2g}{NBSP}ms" for name, one in spreads.items()),
         ),
-        Claim(
-            "All true constraints kept at samples by all three",
-            min(linear.kept, l2nw.kept, dnn.kept) == 1.0,
-            ", ".join(f"{r.label} {r.kept:.0%} of {len(r.rows)} runs" for r in (linear, l2nw, dnn)),
+        claim(
+            "The p99 of every solve time is less than the period",
+            max(one.p99 for one in spreads.values()) < period,
+            f"largest p99 {max(one.p99 for one in spreads.values()):.2g}{NBSP}ms; period {period:g}{NBSP}ms",
         ),
     ]
-    if linear.timing and l2nw.timing and dnn.timing:
-        times = {result.label: spread(result.timing) for result in (linear, l2nw, dnn) if result.timing}
-        period = dnn.case.config.period * 1e3
-        said = "; ".join(f"{name} {t.p50:.2g} / {t.p99:.2g} ms" for name, t in times.items())
-        found.append(
-            Claim(
-                "A solve of the network takes less time than one of L2NW and fits in the period",
-                times[dnn.label].p50 < times[l2nw.label].p50 and times[dnn.label].p99 < period,
-                f"p50 / p99 of {said}; the period is {period:g} ms",
-            )
-        )
-    return found
 
 
-def compare(results: list[CaseResult], reference: str | None) -> list[str]:
-    """One sentence for each case against the reference, then which matter and which do not."""
-    known = [result for result in results if result.case.name == reference]
-    if not known:
+def compare(results: list[CaseResult], reference: str | None) -> list[Comparison]:
+    """Compare each case with the reference; empty where the reference is not among the results."""
+    base = next((result for result in results if result.case.name == reference), None)
+    if base is None:
         return []
-    base = known[0]
-    if min(len(result.rows) for result in results) < ENOUGH and len(base.rows) < ENOUGH:
-        return [f"Fewer than {ENOUGH} runs of a case do not show what matters."]
-    found = [(result.label, _differences(result, base)) for result in results if result is not base]
-    matter = [label for label, differences in found if differences]
-    same = [label for label, differences in found if not differences]
-    said = [f"Matters, against {base.label}: {', '.join(matter)}."] if matter else []
-    said += [f"No clear difference from {base.label}: {', '.join(same)}."] if same else []
-    return said + [f"{label}: {'; '.join(differences)}." for label, differences in found if differences]
+    return [_comparison(result, base) for result in results if result is not base]
+
+
+def _comparison(result: CaseResult, base: CaseResult) -> Comparison:
+    pairs, seen = len(paired(result, base, "J")[0]), _differences(result, base)
+    # Where neither case draws at random, a run is exact and needs no repetition.
+    if pairs < ENOUGH and (result.case.draws or base.case.draws):
+        return Comparison(result.label, "not enough runs", pairs, seen)
+    return Comparison(result.label, "differs" if seen else "no clear difference", pairs, seen)
 
 
 def _differences(result: CaseResult, base: CaseResult) -> list[str]:
     said = []
     if abs(result.kept - base.kept) * min(len(result.rows), len(base.rows)) >= 1.5:
-        said.append(f"keeps all constraints at samples in {_kept(result)}, against {_kept(base)}")
+        said.append(f"keeps all constraints in {kept(result)} runs, against {kept(base)}")
     for name, enough in (("J", COST * abs(base.median("J"))), ("overshoot", OVERSHOOT)):
         own, other = paired(result, base, name)
         if not len(own):
@@ -112,45 +180,63 @@ def _differences(result: CaseResult, base: CaseResult) -> list[str]:
         more = middle > others
         agree = int((own > other if more else own < other).sum())
         if agree >= CLEAR * len(own):
-            pairs = f"all {agree}" if agree == len(own) else f"{agree} of {len(own)}"
+            where = "" if agree == len(own) else f" (in {agree} of {len(own)} pairs)"
             said.append(
-                f"{'more' if more else 'less'} {name}, {_figure(name, middle)} against {_figure(name, others)} "
-                f"in the median in {pairs} pairs of runs"
+                f"{'more' if more else 'less'} {name}, {_figure(name, middle)} against {_figure(name, others)}{where}"
             )
     return said
 
 
 def below_perfect(results: list[CaseResult]) -> list[str]:
-    """Where something is better than the true h."""
-    said = []
-    for result in results:
-        regret = result.values("regret")
-        below = regret[regret < -BELOW]
-        if below.size and result.oracle != "perfect":
-            said.append(f"{result.label} in {below.size} of {regret.size} runs, by up to {-below.min():.1%}")
-    if not said:
+    """Say in how many runs J is below that of the true h."""
+    below = {
+        result.label: values[values < -BELOW]
+        for result in results
+        if result.oracle != "perfect"
+        for values in (result.values("regret"),)
+        if (values < -BELOW).any()
+    }
+    if not below:
         return []
+    runs = sum(len(values) for values in below.values())
+    most = min(below, key=lambda label: below[label].min())
     return [
-        f"J below that of the true h: {'; '.join(said)}. A finite horizon and tightening make that possible."
+        f"J is below that of the true h in {counted(runs, 'run')} of {counted(len(below), 'case')}, by up to "
+        f"{_figure('regret', -below[most].min())} ({most}). This is possible because the horizon is finite and the "
+        "constraints are tightened."
     ]
 
 
-def _figure(name: str, value: float) -> str:
-    if np.isinf(value):
-        return "lost"
-    return f"{value:.1%}" if name == "overshoot" else f"{value:.3g}"
+def survival(results: list[CaseResult]) -> list[str]:
+    """For each family, the most runs kept and at which value, and how many at the last value."""
+    said = []
+    for members in by_family(results).values():
+        at, shares = places(members), [member.kept for member in members]
+        best = max(i for i, share in enumerate(shares) if share == max(shares))
+        text = f"{family_label(members[0])}: at most {kept(members[best])} runs kept"
+        if shares[best] > 0.0:
+            text += f", at {at[best]}"
+        if best != len(at) - 1:
+            text += f"; {kept(members[-1])} at {at[-1]}"
+        said.append(f"{text}.")
+    return said
 
 
-def _seconds(value: float) -> str:
-    return "never" if np.isinf(value) else f"{value:.3g} s"
+def counted(number: int, noun: str) -> str:
+    """ "1 run", "2 runs"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _kept(result: CaseResult) -> str:
-    return f"{sum(record.kept for record in result.records)} of {len(result.records)} runs"
+def kept(result: CaseResult) -> str:
+    """How many runs keep all constraints at samples, as "3 of 4"."""
+    return f"{sum(record.kept for record in result.records)} of {len(result.records)}"
 
 
 def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The figure of both for every seed and x0 where both have it; a case that draws nothing stands for all seeds."""
+    """Return one figure of both cases for every pair of runs with the same seed and x0, without NaN; each (pairs,).
+
+    A case that draws nothing at random has one run, which is paired with every seed of the other case.
+    """
     same_seed = result.case.draws == base.case.draws
 
     def by_start(one: CaseResult) -> dict[tuple[float, ...], list[float]]:
@@ -166,17 +252,9 @@ def paired(result: CaseResult, base: CaseResult, name: str) -> tuple[np.ndarray,
     return one, other
 
 
-def survival(results: list[CaseResult]) -> list[str]:
-    """How many runs each family keeps at best, up to which margin, and what is left at the largest."""
-    said = []
-    for members in by_family(results).values():
-        places, kept = margins(members), [member.kept for member in members]
-        best = max(kept)
-        held = max(place for place, share in zip(places, kept, strict=True) if share == best)
-        text = f"{family_label(members[0])}: at best {best:.0%} of its runs"
-        if best > 0.0:
-            text += f", up to a margin of {held:g}"
-        if held != places[-1]:
-            text += f"; {kept[-1]:.0%} at {places[-1]:g}"
-        said.append(f"{text}.")
-    return said
+def _figure(name: str, value: float) -> str:
+    if np.isinf(value):
+        return "not settled" if name == "settled_s" else "lost"
+    if name == "settled_s":
+        return f"{value:.3g}{NBSP}s"
+    return f"{value:.3g}" if name == "J" else f"{100 * value:.1f}{NBSP}%"

@@ -1,22 +1,22 @@
-"""How pictures look: told apart by line, marker and lightness as well as by colour (Okabe and Ito's)."""
+"""Style of the pictures: cases differ in line, marker and lightness as well as in colour (Okabe and Ito)."""
 
 from __future__ import annotations
 
 import base64
 import io
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lbmpc.plants import Description
-from run_log.reporting.canvas import words
+from node_runtime.printable import printable
 from run_log.reporting.plots import BLACK, BLUE, GREEN, GREY, SKY, VERMILION
 from tandem.experiments.study.results import CaseResult
 
-WIDTH = 5.4
-"""Inches: narrow, so that letters can still be read on a phone."""
+WIDTH = 4.4
+"""Inches. A phone shows this width almost without scaling, so that labels keep their size."""
 DOTS = 150
 """Per inch."""
 FONT: Any = {"font.size": 9, "axes.titlesize": 9.5, "svg.hashsalt": "tandem", "svg.fonttype": "path"}
@@ -40,7 +40,7 @@ MORE: tuple[Look, ...] = (
 
 
 def looks(results: list[CaseResult]) -> list[Look]:
-    """One for each case: the first of an oracle has the oracle's own."""
+    """Return a look for each case. The first case of an oracle has the look of that oracle."""
     taken: set[str] = set()
     spare = iter(MORE * (1 + len(results) // len(MORE)))
     given = []
@@ -50,16 +50,8 @@ def looks(results: list[CaseResult]) -> list[Look]:
     return given
 
 
-class Picture(NamedTuple):
-    """One figure of the report."""
-
-    figure: Figure
-    caption: str
-    alt: str
-
-
 def figure(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure of `rows` by `columns` axes, each `height` inches high; the axes row by row."""
+    """Return a figure of `rows` by `columns` axes, each `height` inches high, and the axes row by row."""
     with rc_context(FONT):
         made = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
         axes = made.subplots(rows, columns, squeeze=False, sharex=True, sharey=columns > 1)
@@ -71,24 +63,24 @@ def figure(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list
 
 
 def legend_above(ax: Axes, height: float = 1.0, columns: int = 2, space: float = 0.2) -> None:
-    """Above the axes, so that it hides nothing."""
+    """Put the legend above the axes, where it hides nothing."""
     place: Any = {"loc": "lower left", "bbox_to_anchor": (0, height), "borderaxespad": space}
     ax.legend(**place, ncols=columns, frameon=False, fontsize=8.5)
 
 
 def full_name(plant: Description, index: int) -> str:
-    """Of a state, in words where the plant has them; for a picture."""
-    return words(plant.names.get(plant.states[index], plant.states[index]))
+    """Return the name of a state in words, where the plant has them."""
+    return printable(plant.names.get(plant.states[index], plant.states[index]))
 
 
 def named(plant: Description, index: int) -> str:
-    """A state for an axis: its full name, and its unit where it has one."""
+    """Return the label of a state's axis: its full name and its unit."""
     unit = plant.units.get(plant.states[index], "")
-    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else words(unit)})"
+    return f"{full_name(plant, index)} ({'dimensionless' if unit in ('', '1') else printable(unit)})"
 
 
 def png(made: Figure) -> bytes:
-    """The figure for a document that takes no SVG."""
+    """Return the figure as PNG."""
     buffer = io.BytesIO()
     with rc_context(FONT):
         made.savefig(buffer, format="png", dpi=DOTS, metadata={"Software": None})
@@ -96,8 +88,8 @@ def png(made: Figure) -> bytes:
 
 
 def data_uri(made: Figure) -> str:
-    """The figure as SVG inside a link that needs no network. The same figure gives the same text."""
+    """Return the figure as SVG in a data URI. The same figure gives the same text."""
     buffer = io.BytesIO()
     with rc_context(FONT):
-        made.savefig(buffer, format="svg", metadata={"Date": None})
+        made.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -16,6 +16,7 @@ from node_runtime.config.shipped import config_file
 from node_runtime.config.strict import ConfigError, did_you_mean, load_tree, strict
 from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.study.isolated import Limits
 
 Picture = Literal["episodes", "trajectories", "states", "survival", "lemma", "recovery", "rows"]
 ORACLE = "controller.oracle"
@@ -94,7 +95,7 @@ class Quick(Section, frozen=True):
     seeds: Count = 2
     x0s: Count = 3
     values: Count = 3
-    """Of each `vary`, first, last and some between; of the oracles all."""
+    """Values of each `vary`: first, last and some between; of the oracles all."""
     episodes: Count = 2
 
 
@@ -106,6 +107,7 @@ class Declaration(Runs, frozen=True, kw_only=True):
     about: str = ""
     x0s: dict[str, Starts] = msgspec.field(default_factory=dict)
     quick: Quick = Quick()
+    limits: Limits = Limits()
     group: list[Group]
     case: list[Case]
 

@@ -30,6 +30,8 @@ CODE = (
     "tandem/experiments/simulation/person.py",
     "tandem/experiments/simulation/wave.py",
 )
+PACKAGES = (*provenance.SCIENCE, "torch")
+"""What a result depends on beside the code."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,7 +45,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def key(self) -> str:
-        """Of everything that its result depends on: settings and code, somebody's own files too."""
+        """Hash of everything that the result depends on: settings, code, and the user's own files."""
         files = msgspec.json.encode(files_of(self.config))
         return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
 
@@ -111,6 +113,6 @@ def code_version() -> str:
         files = [one for one in sorted(path.rglob("*")) if one.suffix in (".py", ".c")]
         for file in files or [path]:
             digest.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
-    for package, version in provenance.versions((*provenance.SCIENCE, "torch")).items():
+    for package, version in provenance.versions(PACKAGES).items():
         digest.update(f"{package} {version}\0".encode())
     return digest.hexdigest()

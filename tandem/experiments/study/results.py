@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
+from collections import Counter
 from typing import Any, NamedTuple
 
 import msgspec
@@ -14,8 +14,10 @@ from node_runtime import provenance
 from run_log.reporting.performance import of_episodes
 from run_log.reporting.summary import Spread
 from tandem.experiments.study.declaration import Declaration, Resolved
+from tandem.experiments.study.isolated import Failure
 from tandem.experiments.study.plan import RowPlan
-from tandem.experiments.study.runner import Timing
+from tandem.experiments.study.runner import RunnerError
+from tandem.experiments.study.timing import Timing
 from tandem.experiments.study.work import Record
 
 
@@ -40,7 +42,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
     J_by_episode: list[float | None]
     regret_by_episode: list[float | None]
-    """Of each episode; null where the plant was lost before its end."""
+    """J and regret of each episode; null where the plant was lost before its end."""
     overshoot: dict[str, float | None] | None
     """Per performance state, as a share of its initial deviation; null for one that began settled."""
     settled_s: float | None
@@ -59,6 +61,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     weights_adopted: int
     error_first_second: float | None
     error_last_second: float | None
+    arithmetic: str
+    """Processor, BLAS kernels and compiler of the machine that made the run: what its last digits depend on."""
 
     @property
     def J_first(self) -> float | None:
@@ -67,6 +71,49 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def regret_first(self) -> float | None:
         return self.regret_by_episode[0]
+
+
+class FailedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """A run that has no row, or whose regret is not known because the run with the true h failed."""
+
+    case: str
+    group: str
+    seed: int
+    x0: list[float] | None
+    floor: bool
+    """Whether it is the run with the true h from the same start."""
+    failure: Failure
+
+
+def failed(plans: list[RowPlan], failures: dict[str, Failure]) -> list[FailedRun]:
+    """In the order of the file, each run once."""
+    found: dict[str, FailedRun] = {}
+    for plan in plans:
+        for job, floor in ((plan.job, False), (plan.floor, True)):
+            if job.key in failures and job.key not in found:
+                found[job.key] = FailedRun(
+                    case=plan.case.name,
+                    group=plan.case.group,
+                    seed=plan.seed,
+                    x0=plan.x0,
+                    floor=floor,
+                    failure=failures[job.key],
+                )
+    return list(found.values())
+
+
+def with_results(
+    cases: list[Resolved], plans: list[RowPlan], records: dict[str, Record], failed: list[FailedRun]
+) -> list[Resolved]:
+    """The cases that have a run at least. Raises `RunnerError`: none has."""
+    made = {plan.case.name for plan in plans if plan.job.key in records}
+    if not made:
+        first = failed[0]
+        raise RunnerError(
+            f"every run failed; the first of {len(failed)}, case {first.case!r}, seed {first.seed}: "
+            f"{first.failure.text}\n{first.failure.traceback}".rstrip()
+        )
+    return [case for case in cases if case.name in made]
 
 
 class CaseResult(NamedTuple):
@@ -86,7 +133,7 @@ class CaseResult(NamedTuple):
         return np.array([_value(row, name) for row in self.rows])
 
     def median(self, name: str) -> float:
-        """Of the rows that have this figure; NaN where none has."""
+        """Median of the rows that have this figure; NaN where none has."""
         values = self.values(name)
         values = values[~np.isnan(values)]
         return float(np.median(values)) if values.size else math.nan
@@ -122,22 +169,27 @@ def _value(row: Row, name: str) -> float:
 def collect(
     plans: list[RowPlan], records: dict[str, Record], timings: dict[str, Timing], plant: Description
 ) -> list[CaseResult]:
-    """In the order of the file."""
+    """In the order of the file, without the runs that failed."""
     cases: dict[str, CaseResult] = {}
     for plan in plans:
-        case, record = plan.case, records[plan.job.key]
-        floor, timing = records[plan.floor.key], timings.get(case.name)
+        case, record = plan.case, records.get(plan.job.key)
+        floor, timing = records.get(plan.floor.key), timings.get(case.name)
+        if record is None:
+            continue
         result = cases.setdefault(case.name, CaseResult(case, [], [], timing))
         result.rows.append(_row(plan, record, floor, timing, plant))
         result.records.append(record)
     return list(cases.values())
 
 
-def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, plant: Description) -> Row:
+def _row(
+    plan: RowPlan, record: Record, floor: Record | None, timing: Timing | None, plant: Description
+) -> Row:
     config = plan.case.config
     x0 = plan.x0 or config.plant.x0 or plant.x0.tolist()
-    found, floors = _figures(record), _figures(floor)
-    J, least = _J_by_episode(record), _J_by_episode(floor)
+    found, floors = _figures(record), _figures(floor) if floor else {}
+    J = _J_by_episode(record)
+    least = _J_by_episode(floor) if floor else [None] * len(J)
     return Row(
         case=plan.case.name,
         group=plan.case.group,
@@ -162,11 +214,12 @@ def _row(plan: RowPlan, record: Record, floor: Record, timing: Timing | None, pl
         weights_adopted=record.weights_adopted,
         error_first_second=record.error_first,
         error_last_second=record.error_last,
+        arithmetic=record.arithmetic,
     )
 
 
 def _figures(record: Record) -> dict[str, Any]:
-    """Of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
+    """Figures of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
     if record.lost is not None:
         return {}
     return msgspec.structs.asdict(of_episodes(record.episodes[1:] or record.episodes))
@@ -188,10 +241,11 @@ def spread(timing: Timing) -> Spread:
 def summary(
     declared: Declaration,
     rows: list[Row],
+    failed: list[FailedRun],
+    timings: dict[str, Timing],
     plant: Description,
     command: str,
     code: str,
-    processes: int,
     quick: bool,
 ) -> dict[str, Any]:
     """What `summary.json` holds."""
@@ -203,7 +257,8 @@ def summary(
         "code": code,
         "machine": provenance.describe(),
         "versions": provenance.versions(provenance.SCIENCE),
-        "processes": processes,
-        "cores": os.cpu_count(),
+        "arithmetic": Counter(row.arithmetic for row in rows),
+        "solve_ms_measured_on": sorted({timing.processor for timing in timings.values()}),
         "rows": rows,
+        "failed": failed,
     }

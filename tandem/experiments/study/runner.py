@@ -1,4 +1,4 @@
-"""Runs what is not there yet, on all cores; then times the solver alone.
+"""Makes the runs that are not there yet: on this machine's cores, or wherever else runs can be made.
 
 A run is the same in any process, so neither the number of processes nor an interruption changes a figure.
 """
@@ -6,36 +6,72 @@ A run is the same in any process, so neither the number of processes nor an inte
 from __future__ import annotations
 
 import hashlib
-import os
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_context
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, as_completed, wait
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-import msgspec
-
-from node_runtime.config.sections import AdaptationConfig, Config, SensorsConfig
-from node_runtime.whole_file import read_regular, write_whole
-from tandem.experiments.simulation.faults import Faults
-from tandem.experiments.simulation.lockstep import follow
-from tandem.experiments.study.declaration import Resolved
-from tandem.experiments.study.plan import Job, RowPlan
-from tandem.experiments.study.work import Record, read, work
+from node_runtime.config.plant import files_of
+from node_runtime.whole_file import write_whole
+from tandem.experiments.study.isolated import ORDINARY, Children, Failure, Limits
+from tandem.experiments.study.plan import Job, RowPlan, code_version
+from tandem.experiments.study.work import Done, Record, Task, read, work
 
 Progress = Callable[[int, int], None]
 """Told what is done and of how many."""
+Answer = Done | Failure
 
-
+TRIES = 3
+"""How often a run is tried if its process ends. A run that raises or exceeds a limit would do so again."""
+POLL_S = 0.5
 LONGEST_NAME = 160
 """Letters of a case in a file's name, which may have 255 in all."""
 
 
 class RunnerError(RuntimeError):
     """The runs cannot go on; the text says why and what to do."""
+
+
+class Lost(Exception):
+    """A run was not made for a reason that is not its own, such as a worker that is gone."""
+
+
+class Workplace(Protocol):
+    """Where runs are made: on this machine, or on a cluster."""
+
+    def room(self) -> int:
+        """How many runs to hand over at a time, so that none has to wait for the next. Raises `RunnerError`."""
+
+    def submit(self, task: Task) -> Future[Answer]:
+        """Hand over a run. Raises `Lost` from the future's result where it is to be handed over again."""
+
+    def close(self) -> None:
+        """Stop what is still under way."""
+
+
+class Processes:
+    """Workplace of some processes on this machine."""
+
+    def __init__(self, count: int):
+        self._children, self._pool, self._count = Children(), ThreadPoolExecutor(count), count
+
+    def room(self) -> int:
+        return 2 * self._count
+
+    def submit(self, task: Task) -> Future[Answer]:
+        return self._pool.submit(self._make, task)
+
+    def _make(self, task: Task) -> Answer:
+        with self._children.one() as child:
+            answer: Answer = child.call(work, task, limits=task.limits)
+            return answer
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._children.kill()
+        self._pool.shutdown()
 
 
 class Want(NamedTuple):
@@ -45,6 +81,13 @@ class Want(NamedTuple):
     detail: bool
     logs: tuple[Path, ...]
     """Two cases may be one job: each has a log of its own."""
+
+
+class Made(NamedTuple):
+    """By key of the job."""
+
+    records: dict[str, Record]
+    failures: dict[str, Failure]
 
 
 def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Want]:
@@ -64,69 +107,124 @@ def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Wa
 
 
 def run_all(
-    wants: dict[str, Want], folder: Path, processes: int, progress: Progress = lambda done, total: None
-) -> dict[str, Record]:
-    """Every job's record, by key; those that `folder` holds already are not run again.
+    wants: dict[str, Want],
+    folder: Path,
+    workplace: Workplace,
+    progress: Progress = lambda done, total: None,
+    limits: Limits = ORDINARY,
+) -> Made:
+    """Every job's record, or why it has none; a record that `folder` holds already is taken as it is.
 
     Raises:
-        ConfigError: a configuration admits no controller.
-        RunnerError: a process was killed.
-        KeyboardInterrupt: after the runs that were under way have ended and been kept.
+        RunnerError: there is no place left to make runs.
+        OSError: a result cannot be written.
+        KeyboardInterrupt: after the runs that were under way have ended and been kept; at once when it comes twice.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob("*.partial"):
-        leftover.unlink()
+    for leftover in folder.glob(".*.new"):  # of a process that was killed
+        leftover.unlink(missing_ok=True)
     missing = [
-        (key, want)
+        key
         for key, want in wants.items()
         if read(folder / f"{key}.json", want.detail) is None or not all(log.is_file() for log in want.logs)
     ]
-    # Long ones first, or one of them would keep a single core busy at the end.
-    missing.sort(key=lambda one: _effort(one[1].job), reverse=True)
-    there = len(wants) - len(missing)
-    progress(there, len(wants))
-    with _workers(processes) as pool:
-        try:
-            futures = [
-                pool.submit(work, want.job, key, folder, want.detail, want.logs) for key, want in missing
-            ]
-            for done, future in enumerate(as_completed(futures), there + 1):
-                future.result()
-                progress(done, len(wants))
-        except BrokenProcessPool as error:
-            raise RunnerError(
-                "a process of the experiment was killed, for want of memory perhaps; the finished runs are kept: "
-                "start the same command again, with fewer --jobs"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+    # Long runs first, or one of them would keep a single core busy at the end.
+    missing.sort(key=lambda key: _effort(wants[key].job), reverse=True)
+    sweep = _Sweep(wants, folder, workplace, progress, limits, deque(missing))
+    try:
+        sweep.run()
+    except KeyboardInterrupt:
+        sweep.finish()
+        raise
     records = {}
     for key, want in wants.items():
+        if key in sweep.failures:
+            continue
         record = read(folder / f"{key}.json", want.detail)
         if record is None:
             raise RunnerError(f"{folder}: {key}.json was deleted or damaged during the run; run again")
         records[key] = record
-    return records
+    return Made(records, sweep.failures)
 
 
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Fresh processes that leave Ctrl-C to this one and import nothing from the current folder."""
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
-    try:
-        with ProcessPoolExecutor(
-            count, get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent
-        ) as pool:
-            yield pool
-    finally:
-        del os.environ["PYTHONSAFEPATH"]
-        if before is not None:
-            os.environ["PYTHONSAFEPATH"] = before
+class _Sweep:
+    """The runs of one call of `run_all`."""
 
+    def __init__(
+        self,
+        wants: dict[str, Want],
+        folder: Path,
+        workplace: Workplace,
+        progress: Progress,
+        limits: Limits,
+        missing: deque[str],
+    ):
+        self.wants, self.folder, self.workplace, self.limits = wants, folder, workplace, limits
+        self.missing, self.progress = missing, progress
+        self.done = len(wants) - len(missing)
+        self.under_way: dict[Future[Answer], str] = {}
+        self.tries: Counter[str] = Counter()
+        self.failures: dict[str, Failure] = {}
+        progress(self.done, len(wants))
 
-def _leave_ctrl_c_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    def run(self) -> None:
+        while self.missing or self.under_way:
+            room = self.workplace.room() - len(self.under_way)
+            for _ in range(min(room, len(self.missing))):
+                key = self.missing.popleft()
+                self.under_way[self.workplace.submit(self._task(key))] = key
+            if self.under_way:
+                self._keep(*wait(self.under_way, POLL_S, FIRST_COMPLETED).done)
+            else:
+                time.sleep(POLL_S)
+
+    def finish(self) -> None:
+        """Keep what is under way, and begin nothing."""
+        for future in list(self.under_way):
+            if future.cancel():
+                del self.under_way[future]
+        for future in as_completed(list(self.under_way)):
+            self._keep(future)
+
+    def _task(self, key: str) -> Task:
+        want = self.wants[key]
+        return Task(
+            job=want.job,
+            detail=want.detail,
+            log=bool(want.logs),
+            files=files_of(want.job.config),
+            limits=self.limits,
+        )
+
+    def _keep(self, *done: Future[Answer]) -> None:
+        for future in done:
+            key = self.under_way.pop(future)
+            try:
+                answer = future.result()
+            except Lost:
+                self.missing.append(key)
+                continue
+            if isinstance(answer, Failure) and answer.kind == "crash":
+                self.tries[key] += 1
+                if self.tries[key] < TRIES:
+                    self.missing.append(key)
+                    continue
+            if isinstance(answer, Done):
+                self._write(key, answer)
+            else:
+                self.failures[key] = answer
+            self.done += 1
+            self.progress(self.done, len(self.wants))
+
+    def _write(self, key: str, made: Done) -> None:
+        if made.code != code_version():
+            raise RunnerError(
+                "Tandem's code or a package was changed while the experiment ran; the finished runs are kept, and the "
+                "same command makes those again that depend on it"
+            )
+        for log in self.wants[key].logs:
+            write_whole(log, made.log or b"")
+        write_whole(self.folder / f"{key}.json", made.record)
 
 
 def _effort(job: Job) -> float:
@@ -138,66 +236,3 @@ def file_name(name: str) -> str:
     """Two names are two files, also where what a file's name had better not have is replaced."""
     clean = "".join(c if c.isascii() and (c.isalnum() or c in "-_=.") else "-" for c in name)[:LONGEST_NAME]
     return clean if clean == name else f"{clean}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-
-
-# -- solve times ---------------------------------------------------------------------------------------------
-
-
-class Timing(msgspec.Struct, frozen=True):
-    """Solve times, (n,) milliseconds, of some runs of one problem."""
-
-    runs: list[list[float]]
-
-
-def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
-    """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
-    config = case.config
-    controller = msgspec.structs.replace(config.controller, W=None)
-    given = config.plant
-    truth = given.truth if isinstance(given.truth, str) else {}
-    plant = msgspec.structs.replace(given, x0=None, truth=truth, sensors=SensorsConfig())
-    config = msgspec.structs.replace(
-        config, seed=seed, plant=plant, controller=controller, constant=Config().constant
-    )
-    if config.controller.oracle == "dnn":
-        trainer = msgspec.structs.replace(Config().trainer, enabled=True)
-        config = msgspec.structs.replace(config, adaptation=AdaptationConfig(), trainer=trainer)
-    return Job(config=config, steps=round(seconds * config.rate), episodes=1, faults=Faults())
-
-
-def time_all(
-    cases: list[Resolved],
-    repeats: Callable[[Resolved], int],
-    seconds: float,
-    folder: Path,
-    progress: Progress,
-) -> dict[str, Timing]:
-    """Solve times by case name; one process, nothing beside it. Those in `folder` are taken as they are.
-
-    repeats: runs of a case, at least; seconds: of control in each.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    keys = {case.name: timing_job(case, 0, seconds).key for case in cases}
-    by_key = {keys[case.name]: case for case in cases}
-    most = dict.fromkeys(by_key, 0)
-    for case in cases:
-        most[keys[case.name]] = max(most[keys[case.name]], repeats(case))
-    timings: dict[str, Timing] = {}
-    with _workers(1) as pool:
-        for done, (key, case) in enumerate(by_key.items(), 1):
-            path = folder / f"{key}.json"
-            try:
-                timing = msgspec.json.decode(read_regular(path), type=Timing)
-            except (OSError, msgspec.DecodeError):
-                timing = Timing([])
-            while len(timing.runs) < most[key]:
-                times = pool.submit(_time, timing_job(case, len(timing.runs), seconds)).result()
-                timing = Timing([*timing.runs, times])
-                write_whole(path, msgspec.json.encode(timing))
-            timings[key] = timing
-            progress(done, len(by_key))
-    return {case.name: timings[keys[case.name]] for case in cases}
-
-
-def _time(job: Job) -> list[float]:
-    return [timing.solve_ms for timing in follow(job.config, job.steps).run.timings]

@@ -1,8 +1,8 @@
-"""One run, in a process of its own: what it came to, in a file that appears whole or not at all."""
+"""One run: its record and its log, as bytes. Nothing is written here; the caller may be on another machine."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
 from pathlib import Path
 
 import msgspec
@@ -10,19 +10,23 @@ import numpy as np
 
 from controller_node.build import build_model, build_network_oracle, build_plant
 from lbmpc.plants import PlantError, get_plant, get_truth, true_motion
-from node_runtime.config.plant import true_plant_of
+from node_runtime.config.loading import to_json
+from node_runtime.config.plant import files_of, true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
-from node_runtime.whole_file import read_regular, require_regular, write_whole
+from node_runtime.realtime.scheduling import one_blas_thread
+from node_runtime.whole_file import read_regular
+from protocol import codec, topics
 from run_log.reporting.motion import trajectory
 from run_log.reporting.performance import Performance, performance
 from run_log.reporting.summary import summarise
-from run_log.run import Run, plant_of
+from run_log.run import Entry, Run, plant_of
 from run_log.writing.save import save
 from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.lockstep import Outcome, follow
+from tandem.experiments.study.isolated import ORDINARY, Limits
 from tandem.experiments.study.lemma import Lemma, measure
-from tandem.experiments.study.plan import Job
+from tandem.experiments.study.plan import Job, code_version
 
 Rests = tuple[np.ndarray, np.ndarray]
 """Where the true plant rests at the set-points of each tick of a cycle, as of `wave.rests`."""
@@ -48,7 +52,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     episodes: list[Performance]
     """Those that could be followed to their end; of set-points by turns the cycles."""
     performance: Performance
-    """Of all that could be followed."""
+    """Figures of the whole run, as far as it could be followed."""
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
@@ -58,6 +62,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """Mean prediction error in the first and the last second."""
     traces: Traces | None
     lemma: Lemma | None
+    arithmetic: str
+    """What may make another machine's last digits differ: processor, BLAS kernels, compiler of the solver."""
 
     @property
     def kept(self) -> bool:
@@ -65,22 +71,70 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return self.lost is None and self.performance.constraint_violations == 0
 
 
-def work(job: Job, key: str, folder: Path, detail: bool, logs: Sequence[Path]) -> None:
-    """Run `job` and write `folder`/`key`.json, and its logs.
+class Task(msgspec.Struct, frozen=True, kw_only=True):
+    """One run to be made, and what is wanted of it."""
+
+    job: Job
+    detail: bool
+    """With its traces."""
+    log: bool
+    """With its MCAP log."""
+    files: dict[str, str]
+    """The sha256 of the files that its configuration names, by key, as `files_of` finds them."""
+    limits: Limits = ORDINARY
+
+
+class Done(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run leaves."""
+
+    record: bytes
+    """A `Record`, as JSON."""
+    log: bytes | None
+    code: str
+    """`code_version` of the process that ran it."""
+
+
+def work(task: Task, config: Config | None = None) -> Done:
+    """Make one run.
+
+    Args:
+        task: what to run.
+        config: the task's configuration with the paths that its files have here; None: they are where it says.
 
     Raises:
-        ConfigError: the job's configuration admits no controller.
-        OSError: something else than a file has the name of a log.
+        ConfigError: the configuration admits no controller, or names another file here than where the task was made.
     """
-    rests = None if job.set_points is None else _rests(job, job.set_points)
-    outcome = _outcome(job)
-    for log in logs:
-        require_regular(log)
-        partial = log.with_suffix(".partial")
-        partial.unlink(missing_ok=True)
-        save(outcome.run, partial)
-        partial.replace(log)
-    write_whole(folder / f"{key}.json", msgspec.json.encode(_record(job, outcome, rests, detail)))
+    here = task.job if config is None else msgspec.structs.replace(task.job, config=config)
+    with one_blas_thread():
+        rests = None if here.set_points is None else _rests(here, here.set_points)
+        outcome = _outcome(here)
+        found = files_of(here.config)
+        for key, sha256 in task.files.items():
+            if found.get(key) != sha256:
+                raise ConfigError(f"{key}: the file that it names is another one here, or is gone")
+        record = msgspec.structs.replace(_record(here, outcome, rests, task.detail), job=task.job)
+    _rename(outcome.run, task.job.config)
+    log = _log(outcome.run) if task.log else None
+    return Done(record=msgspec.json.encode(record), log=log, code=code_version())
+
+
+def _rename(run: Run, config: Config) -> None:
+    """Have the run name its files by the paths of the machine that asked for it."""
+    run.config = config
+    for topic in topics.RUN_INFO.values():
+        for i, entry in enumerate(run.entries(topic)):
+            versions = dict(entry.message.versions)
+            if "architecture" in versions:
+                versions["architecture"] = config.network.architecture
+            info = msgspec.structs.replace(entry.message, config=to_json(config), versions=versions)
+            run.streams[topic.name][i] = Entry(entry.log_time, codec.encode(info), info)
+
+
+def _log(run: Run) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="tandem-") as folder:
+        path = Path(folder) / "run.mcap"
+        save(run, path)
+        return path.read_bytes()
 
 
 def _record(job: Job, outcome: Outcome, rests: Rests | None, detail: bool) -> Record:
@@ -99,6 +153,7 @@ def _record(job: Job, outcome: Outcome, rests: Rests | None, detail: bool) -> Re
         error_last=summary.prediction_error.last_second,
         traces=_traces(run) if detail else None,
         lemma=_lemma(run, job.config) if detail else None,
+        arithmetic=_arithmetic(run),
     )
 
 
@@ -110,7 +165,7 @@ def _outcome(job: Job) -> Outcome:
 
 
 def _cycles(run: Run, job: Job, rests: Rests) -> list[Performance]:
-    """Of each that could be followed to its end: dx and du are from where the true plant rests at the set-points."""
+    """Figures of each whole cycle: dx and du are from where the true plant rests at the set-points."""
     plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
     motion, (x, u) = trajectory(run, plant), rests
     outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))
@@ -127,6 +182,11 @@ def _rests(job: Job, values: wave.Values) -> Rests:
         return wave.rests(values, job.steps, true, build_plant(job.config), job.config.period)
     except PlantError as error:
         raise ConfigError(f"set_points: {error}") from error
+
+
+def _arithmetic(run: Run) -> str:
+    (info,) = (info for info in run.run_infos if info.process == "controller")
+    return "; ".join(info.versions[name] for name in ("processor", "blas", "kernels"))
 
 
 def _traces(run: Run) -> Traces:

@@ -122,10 +122,10 @@ def test_trainer_and_controller_use_the_same_window() -> None:
     with torch.no_grad():
         theirs = phi_of(network, network.tensor(trainer.buffer.contents()[0])).numpy()
     np.testing.assert_allclose(theirs, phis, atol=1e-12)
-    assert trainer.counters["bad samples"] == 0
+    assert trainer.counters["bad_samples"] == 0
     short = m.Sample(99, [0.0] * D, [0.0] * M, [0.0] * D, [[0.0] * (D + M)] * 2)
     assert trainer.add("run", [short]) == 0
-    assert trainer.counters["bad samples"] == 1
+    assert trainer.counters["bad_samples"] == 1
 
 
 def test_a_sample_without_a_past_keeps_its_format() -> None:

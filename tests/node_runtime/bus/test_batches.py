@@ -97,7 +97,7 @@ def test_an_unreadable_batch_is_counted_and_delivered(payload: bytes) -> None:
     delivery = Delivery(KEY, payload, 1)
     mailbox.put(delivery)
     assert mailbox.drain() == [delivery]
-    assert bad.counters() == {"bad controller/batch: malformed": 1}
+    assert bad.counters() == {"bad_controller_batch_malformed": 1}
 
 
 @pytest.mark.parametrize(("rate", "together"), [(20.0, False), (100.0, False), (101.0, True), (1000.0, True)])

@@ -78,11 +78,11 @@ def test_fragments_are_joined_in_any_order_and_twice() -> None:
 def test_a_lost_fragment_loses_only_its_message() -> None:
     receiver = Receiver()
     assert receiver.take(*fragments()[1:], *fragments(number=1)) == [MESSAGE]
-    assert receiver.bad.counters() == {"bad x: pieces lost": 1}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 1}
     assert receiver.take(*fragments()[:1]) == []
     receiver.reassembler.end()
     assert receiver.reassembler.held == 0
-    assert receiver.bad.counters() == {"bad x: pieces lost": 2}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 2}
 
 
 def test_writers_and_topics_do_not_mix() -> None:
@@ -111,13 +111,13 @@ def test_writers_and_topics_do_not_mix() -> None:
 def test_an_invalid_fragment_is_counted_without_other_effect(payload: bytes, reason: str) -> None:
     receiver, parts = Receiver(), fragments()
     assert receiver.take(*parts[:3], payload, *parts[3:]) == [MESSAGE]
-    assert receiver.bad.counters() == {f"bad x: {reason}": 1}
+    assert receiver.bad.counters() == {m.counter_name("bad x", reason): 1}
 
 
 def test_a_corrupted_message_is_not_used() -> None:
     receiver, parts = Receiver(), fragments()
     assert receiver.take(altered(parts[0], data=bytes(FRAGMENT_BYTES)), *parts[1:]) == []
-    assert receiver.bad.counters() == {"bad x: pieces do not make the message": 1}
+    assert receiver.bad.counters() == {"bad_x_pieces_do_not_make_the_message": 1}
     assert receiver.take(parts[0], altered(parts[1], crc32=zlib.crc32(b"")), *parts[1:]) == [MESSAGE]
 
 
@@ -127,7 +127,7 @@ def test_many_foreign_writers_cannot_fill_the_memory() -> None:
     for k in range(INCOMPLETE + 500):
         receiver.take(altered(small, writer=f"foreign-{k}"))
     assert receiver.reassembler.held == INCOMPLETE
-    assert receiver.bad.counters() == {"bad x: pieces lost": 500}
+    assert receiver.bad.counters() == {"bad_x_pieces_lost": 500}
     assert receiver.take(*fragments()) == [MESSAGE]
 
 
@@ -174,7 +174,7 @@ def test_only_fragments_are_sent_and_every_reader_gets_the_message(config: Confi
             assert delivery.payload == codec.encode(sent)
         wait_for(lambda: sum(travelled) > 3_000_000)
         assert max(travelled) <= FRAGMENT_BYTES + HEADER_BYTES
-        assert controller.counters()["sent bulk"] == len(travelled)
+        assert controller.counters()["sent_bulk"] == len(travelled)
 
 
 @pytest.mark.live
@@ -188,4 +188,4 @@ def test_answers_are_sent_in_fragments(config: Config) -> None:
         found: list[list[bytes]] = []
         wait_for(lambda: bool(found.append(trainer.ask("controller/large", {}, HANG_S)) or found[-1]))
         assert found[-1] == answers
-        assert "bad controller/large: pieces lost" not in trainer.counters()
+        assert "bad_controller_large_pieces_lost" not in trainer.counters()

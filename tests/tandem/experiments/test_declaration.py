@@ -10,7 +10,8 @@ import pytest
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation.faults import Drift, Faults
 from tandem.experiments.study.plan import Job, rows
-from tandem.experiments.study.runner import timing_job, wanted
+from tandem.experiments.study.runner import wanted
+from tandem.experiments.study.timing import timing_job
 from tests.helpers.paths import ROOT
 from tests.tandem.experiments.small import SHIPPED, SMALL, cases
 

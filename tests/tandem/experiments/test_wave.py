@@ -11,8 +11,8 @@ import pytest
 from lbmpc.plants import PlantError, true_motion
 from node_runtime.config.strict import ConfigError
 from tandem.experiments.simulation import wave
-from tandem.experiments.study.plan import rows
-from tandem.experiments.study.work import read, work
+from tandem.experiments.study.plan import Job, rows
+from tandem.experiments.study.work import Record, Task, work
 from tests.tandem.experiments.small import PLANT, SHIPPED, cases
 
 TRUE = PLANT.varied(slope=1.4)
@@ -42,6 +42,11 @@ def test_a_wave_has_one_cycle_more_than_is_counted() -> None:
     assert asked.values == [[1.65], [1.65], [1.75], [1.75]] * 2
 
 
+def record_of(job: Job) -> Record:
+    done = work(Task(job=job, detail=True, log=False, files={}))
+    return msgspec.json.decode(done.record, type=Record)
+
+
 def test_a_rest_is_one_of_the_true_plant_with_the_outputs_there() -> None:
     x, u = wave.rests({"y": [1.65, 1.75]}, 4, true_motion(TRUE), PLANT, 0.05)
     assert x[:, 1] == pytest.approx([1.65, 1.65, 1.75, 1.75])
@@ -57,7 +62,7 @@ def test_values_where_the_true_plant_has_no_rest_are_refused(tmp_path: Path) -> 
     path.write_text(WAVE.replace("{ y = [1.65, 1.7] }", "{ rdot = [1.0, 0.0] }"))
     job = next(rows(cases(path))).job
     with pytest.raises(ConfigError, match="set_points"):
-        work(job, job.key, tmp_path, False, [])
+        record_of(job)
 
 
 def test_an_episode_is_a_cycle_and_the_plant_continues(tmp_path: Path) -> None:
@@ -65,9 +70,7 @@ def test_an_episode_is_a_cycle_and_the_plant_continues(tmp_path: Path) -> None:
     path.write_text(WAVE)
     found = {}
     for plan in rows(cases(path)):
-        work(plan.job, plan.job.key, tmp_path, True, [])
-        record = read(tmp_path / f"{plan.job.key}.json", True)
-        assert record is not None
+        record = record_of(plan.job)
         assert record.traces is not None
         assert len(record.episodes) == CYCLES
         assert len(record.traces.x) == STEPS * CYCLES + 1
@@ -84,9 +87,7 @@ def test_to_stay_where_the_true_plant_rests_costs_nothing(tmp_path: Path) -> Non
     (x,), _u = wave.rests({"y": [1.65]}, 1, true_motion(TRUE), PLANT, 0.05)
     path.write_text(WAVE.replace("[1.65, 1.7]", "[1.65]").replace("[0.4, 1.6, 1.1547, 0.0]", str(x.tolist())))
     job = msgspec.structs.replace(next(rows(cases(path))).job, steps=6, episodes=1)
-    work(job, job.key, tmp_path, False, [])
-    record = read(tmp_path / f"{job.key}.json", False)
-    assert record is not None
+    record = record_of(job)
     assert record.episodes[0].J < 1e-9
     assert record.performance.J > 1e-5  # about (x_e, u_e) it is something
 

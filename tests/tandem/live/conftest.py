@@ -16,7 +16,7 @@ def monitor() -> Monitor:
     seen = Monitor(CONFIG, PLANT, 20.0)
     for process in topics.PROCESSES:
         counters = (
-            {"samples": 3, "bad plant/state: not finite": 2} if process == "controller" else {"samples": 3}
+            {"samples": 3, "bad_plant_state_not_finite": 2} if process == "controller" else {"samples": 3}
         )
         seen.feed(delivery(topics.HEALTH[process], health(process, counters, "a note " * 30), START - 1.0))
     for k in range(50):

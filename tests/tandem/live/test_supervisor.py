@@ -19,11 +19,17 @@ from run_log.writing.parts import part_path
 from tandem.live.files import claimed
 from tandem.terminal import Refused
 from tests.helpers.launched import PATIENCE_S, RUN, launched, small
-from tests.helpers.live import wait_for
+from tests.helpers.live import free_endpoint, wait_for
 from tests.helpers.paths import write_namesakes
 from tests.helpers.plants.tanks import write_tanks
 
 pytestmark = pytest.mark.live
+
+
+def live() -> list[str]:
+    """Arguments for a run that browsers can look at."""
+    pytest.importorskip("websockets", reason="pip install 'tandem-control[live]'")
+    return ["--live", "--set", f"live.port={free_endpoint().rpartition(':')[2]}"]
 
 
 def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path: Path):
@@ -60,10 +66,17 @@ def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path:
 
 
 def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
-    with launched(tmp_path, "--oracle", "linear") as run:
-        run.hears("the first command")
-        run.signal(signal.SIGINT)
-        code, result = run.ends()
+    with socket.socket() as other:
+        # A live view that finds its port taken is no reason not to run.
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        there = ("--live", "--set", f"live.port={port}")
+        with launched(tmp_path, "--oracle", "linear", *there) as run:
+            run.hears(f"no live view: live.port {port} is taken")
+            run.hears("the first command")
+            run.signal(signal.SIGINT)
+            code, result = run.ends()
     assert code == 0, run.said
     assert result["ticks"] >= 1
     assert not read_run(tmp_path / "run.mcap").truncated
@@ -119,10 +132,10 @@ def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
 
 
 def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
-    with launched(tmp_path, *small()) as run:
+    with launched(tmp_path, *small(), *live()) as run:
         run.hears("the first command")
         started = run.pids()
-        assert len(started) == 5
+        assert len(started) == 6
         run.signal(signal.SIGKILL)
         wait_for(lambda: run.pids() == [], PATIENCE_S, every=0.05)
     assert read_run(tmp_path / "run.mcap").ticks
@@ -138,10 +151,12 @@ def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
     assert result["ticks"] >= 1
 
 
-def test_a_dead_recorder_is_reported_and_the_loop_continues(tmp_path: Path):
+def test_a_dead_recorder_or_live_view_is_reported_and_the_loop_continues(tmp_path: Path):
     loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop continues"
-    with launched(tmp_path, "--oracle", "linear") as run:
+    with launched(tmp_path, "--oracle", "linear", *live()) as run:
         run.hears("the first command")
+        run.kill("live")
+        run.hears("the live-view died (killed by SIGKILL); the run continues without it")
         run.kill("record")
         run.hears(" ticks, ", times=3, after=loudly)
         run.signal(signal.SIGINT)

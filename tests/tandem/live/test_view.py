@@ -44,7 +44,7 @@ def test_the_view_shows_states_bounds_input_and_counters(monitor: Monitor):
         "1 fallback",
         "1 soft ticks",
         "1 adopted",
-        "bad plant/state: not finite 2",
+        "bad plant state not finite 2",
         "2.5 / 20 s",
         "●",
     ):

@@ -1,0 +1,1 @@
+"""The runs of an experiment on the workers of a Dask cluster."""

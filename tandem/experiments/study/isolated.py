@@ -1,0 +1,183 @@
+"""Functions called in processes of their own, within limits of time and memory.
+
+A call that crashes, never ends or fills the memory ends its process and nothing else. A process serves one call after
+the other, because importing CasADi and torch takes seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Pipe
+from pathlib import Path
+from resource import getpagesize
+from threading import Lock
+from time import monotonic
+from typing import Any, Literal
+
+import msgspec
+
+from node_runtime.config.sections import Positive, Seconds, Section
+from tandem.experiments.study import child_process
+
+POLL_S = 0.2
+"""How often memory and time are looked at."""
+GIB = 2**30
+
+
+class Limits(Section, frozen=True):
+    """What one run may take; a run beyond it is stopped."""
+
+    seconds: Seconds = 3600.0
+    memory_gib: Positive = 4.0
+    """Resident memory of the run's process."""
+
+
+ORDINARY = Limits()
+
+
+class Failure(msgspec.Struct, frozen=True, kw_only=True):
+    """A run without a result."""
+
+    kind: Literal["error", "crash", "time", "memory"]
+    """An exception, or why its process ended."""
+    text: str
+    """One line."""
+    traceback: str
+    """Empty where there was no exception."""
+    where: str = ""
+    """The worker; empty for this machine."""
+
+
+class Unwanted(Exception):
+    """The result is no longer wanted; the call was stopped."""
+
+
+class Child:
+    """One process. Not to be used by two threads at a time."""
+
+    def __init__(self) -> None:
+        self._channel, theirs = Pipe()
+        # -P: nothing is imported from the current folder. What a plant prints is not this process's output.
+        command = [sys.executable, "-P", "-m", child_process.__name__, str(theirs.fileno())]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=2, pass_fds=[theirs.fileno()]
+        )
+        theirs.close()
+        self._used = monotonic()
+
+    @property
+    def usable(self) -> bool:
+        """Whether it can take a call: it runs, and is not about to end because it was idle."""
+        return self._process.poll() is None and monotonic() - self._used < child_process.IDLE_S / 2
+
+    def call(
+        self,
+        function: Callable[..., Any],
+        *arguments: Any,
+        limits: Limits,
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> Any:
+        """The function's value, or a `Failure`.
+
+        function: of a module, since it is pickled by name; wanted: asked while the call goes on.
+
+        Raises:
+            Unwanted: `wanted` said no.
+        """
+        ends = monotonic() + limits.seconds
+        try:
+            self._channel.send_bytes(pickle.dumps((function, arguments)))
+            while not self._channel.poll(POLL_S):
+                if self._memory() > limits.memory_gib * GIB:
+                    self.kill()
+                    text = f"stopped: it held more than {limits.memory_gib:g} GiB of memory"
+                    return Failure(kind="memory", text=text, traceback="")
+                if monotonic() > ends:
+                    self.kill()
+                    text = f"stopped: it had not ended after {limits.seconds:g} s"
+                    return Failure(kind="time", text=text, traceback="")
+                if not wanted():
+                    self.kill()
+                    raise Unwanted
+            value, raised = pickle.loads(self._channel.recv_bytes())
+        except (EOFError, OSError):
+            return Failure(kind="crash", text=self._how_it_ended(), traceback="")
+        self._used = monotonic()
+        return value if raised is None else Failure(kind="error", text=raised[0], traceback=raised[1])
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> None:
+        """Have an idle one end."""
+        self._channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self.kill()
+
+    def _memory(self) -> int:
+        """Resident bytes; 0 where it has ended."""
+        try:
+            pages = Path(f"/proc/{self._process.pid}/statm").read_text().split()[1]
+        except (OSError, IndexError):
+            return 0
+        return int(pages) * getpagesize()
+
+    def _how_it_ended(self) -> str:
+        try:
+            code = self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return "its process closed the connection"
+        if code >= 0:
+            return f"its process ended with exit code {code}"
+        hint = ", perhaps by the system for want of memory" if -code == signal.SIGKILL else ""
+        return f"its process was ended by {signal.Signals(-code).name}{hint}"
+
+
+class Children:
+    """Processes for several threads, each started when it is first needed."""
+
+    def __init__(self) -> None:
+        self._idle: list[Child] = []
+        self._busy: set[Child] = set()
+        self._lock = Lock()
+
+    @contextlib.contextmanager
+    def one(self) -> Iterator[Child]:
+        """A process for one call."""
+        child = self._free() or Child()
+        with self._lock:
+            self._busy.add(child)
+        try:
+            yield child
+        finally:
+            with self._lock:
+                self._busy.discard(child)
+                self._idle.append(child)
+
+    def _free(self) -> Child | None:
+        while True:
+            with self._lock:
+                if not self._idle:
+                    return None
+                child = self._idle.pop()
+            if child.usable:
+                return child
+            child.end()
+
+    def kill(self) -> None:
+        """End all, also those in a call, which then is a `Failure`."""
+        with self._lock:
+            idle, self._idle = self._idle, []
+            busy = list(self._busy)
+        for child in busy:
+            child.kill()
+        for child in idle:
+            child.end()
