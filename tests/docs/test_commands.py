@@ -24,9 +24,9 @@ from tests.helpers.paths import ROOT
 
 EXISTING = [page for page in PAGES if page.exists()]
 NAMED_FILE = re.compile(r"[\w./-]+\.(?:py|toml|mcap|csv|json)(?=$|:)")
+WRITTEN = ("--log", "--out", "--output", "--layout")
 # What a command leaves behind without being told the name.
 LEFT = {"run": ["run.mcap", "run.png"], "keys": ["keys"], "record": ["run.mcap"]}
-OUTPUTS = ("--log", "--out", "--output", "--layout")
 
 
 def relative(page: Path) -> str:
@@ -77,7 +77,7 @@ def test_commands_parse_and_what_they_name_exists(
 
 def made_by(words: list[str]) -> set[str]:
     """The files that a command leaves behind, for those that follow."""
-    named = {value for option, value in itertools.pairwise(words) if option in OUTPUTS}
+    named = {value for option, value in itertools.pairwise(words) if option in WRITTEN}
     new = set(words[3:4]) if words[1:3] == ["model", "new"] else set()
     return named | new | set(LEFT.get(words[1] if words[1:] else "", []))
 

@@ -100,7 +100,7 @@ def test_the_table_fits_a_small_terminal_completely(logs: list[str], capsys: Cap
     assert out.count("±") == 2 * (2 + 1 + 1)
     assert re.search(r"held out +the log's model +nothing changes +W per second", out)
     assert re.search(r"poles, 1/s: -0\.01\d+, -0\.03\d+", out)
-    assert re.search(r"what moved least moved by \d\.\d %", out)
+    assert re.search(r"smallest excitation of any direction: \d\.\d %", out)
 
 
 def test_the_plant_file_passes_its_check_and_controls_better_than_the_wrong_model(
@@ -161,7 +161,7 @@ def test_one_linear_feedback_is_refused_with_its_equation(tmp_path: Path, capsys
         tmp_path / "run.mcap",
     )
     text = refused(capsys, str(tmp_path / "run.mcap"))
-    assert re.search(r"run.mcap: the samples do not say what A and B are:\n  - u = .*\+ constant, to", text)
+    assert re.search(r"run.mcap: the samples do not determine A and B:\n  - u = .*\+ constant, to", text)
     assert "the input is a linear function of the other variables, as under one fixed feedback" in text
     assert "Record motion that differs: from several x0" in text
 
@@ -178,7 +178,7 @@ def test_a_constant_input_is_refused_by_its_name(tmp_path: Path, capsys: Capture
 def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> None:
     save(ran(TANKS_FILE, [], 20), tmp_path / "short.mcap")
     text = refused(capsys, str(tmp_path / "short.mcap"))
-    assert re.search("19 samples are too few: .* has 4 numbers .*, and 40 samples are the least", text)
+    assert re.search("19 samples are too few: .* has 4 numbers .* and needs at least 40 samples", text)
     save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
     assert "is not explained by any model, like measurement noise" in refused(
         capsys, str(tmp_path / "noisy.mcap")
@@ -189,10 +189,10 @@ def test_contradicting_arguments_are_refused(logs: list[str], tmp_path: Path, ca
     save(ran(TANKS_FILE, ["rate=0.1"], 30), tmp_path / "slow.mcap")
     save(ran(None, [], 30), tmp_path / "other.mcap")
     assert "slow.mcap: sampled every 10 s, and" in refused(capsys, logs[0], str(tmp_path / "slow.mcap"))
-    assert "another plant (moore_greitzer)" in refused(capsys, logs[0], str(tmp_path / "other.mcap"))
+    assert "its plant (moore_greitzer)" in refused(capsys, logs[0], str(tmp_path / "other.mcap"))
     (tmp_path / "found.py").write_text("kept")
     for out, message in (
-        ("found.py", "exists already, and is not overwritten"),
+        ("found.py", "exists already and is not overwritten"),
         ("found.txt", "ends in .py"),
         ("away/found.py", "there is no folder"),
     ):

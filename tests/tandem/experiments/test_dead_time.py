@@ -63,7 +63,7 @@ def test_a_controller_with_the_memory_of_another_process_fills_its_line_again(lo
     core, again = ControllerCore(tanks(), "controller-a"), ControllerCore(tanks(), "controller-b")
     core.memory.restore(lossy.keyframes[2])
     lasting = core.memory.lasting()
-    # What was written while nobody listened is not known.
+    # Inputs that were written while the controller was down are not known.
     assert not any(name.startswith("line.") for name in lasting)
     again.memory.go_on(lasting, "controller-a")
     assert again.memory.belongs()["dead time"] == "7.5 s"
@@ -78,7 +78,7 @@ def test_a_controller_with_the_memory_of_another_process_fills_its_line_again(lo
 
 
 def moved(known: Known, *more: str) -> Run:
-    """Of a linear plant that is its own truth, with late commands and lost samples."""
+    """Run a linear plant that is its own truth, with late commands and lost samples."""
     settings = [
         "rate=20",
         "controller.oracle=linear",
@@ -148,7 +148,7 @@ def test_settings_of_the_configuration_for_it() -> None:
             compressor(f"plant.truth.dead_time={seconds}")
     with pytest.raises(ConfigError, match=r"plant\.dead_time"):
         compressor("plant.dead_time=-1")
-    with pytest.raises(ConfigError, match="50 is the most"):
+    with pytest.raises(ConfigError, match="at most 50"):
         build_model(compressor("plant.dead_time=9"))
     invariant = compressor("plant.dead_time=0.1", "controller.tightening=invariant")
     with pytest.raises(ConfigError, match=r"certified sets .* dead time of 0\.1 s"):

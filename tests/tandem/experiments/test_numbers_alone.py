@@ -1,5 +1,5 @@
-"""A plant of which the controller has matrices only, in lock-step: with equations, with matrices and with a wind as
-the truth."""
+"""A plant whose controller has matrices only, in lock-step. The truth is given by equations, by matrices or with a
+wind."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_matrices_that_are_their_own_truth_leave_no_h(model: str) -> None:
 def test_features_that_need_equations_say_so() -> None:
     with pytest.raises(ConfigError, match=r"perfect.* needs the equations of the true plant"):
         simulate(configured("matrices", "controller.oracle=perfect"), 1)
-    with pytest.raises(ConfigError, match=r"those of a period of 0.1 s"):
+    with pytest.raises(ConfigError, match=r"are given for a period of 0.1 s"):
         simulate(configured("sampled", "rate=20"), 1)
 
 
