@@ -123,7 +123,7 @@ class Views:
         return []
 
     def _of_user(self, name: str, payload: bytes, time_ns: int) -> list[Shown]:
-        if time_ns < self._due.get(name, 0):
+        if len(payload) > topics.USER_MAX_BYTES or time_ns < self._due.get(name, 0):
             return []
         view = self._users.get(name)
         if view is None:
