@@ -258,6 +258,6 @@ def test_an_unknown_state_name_is_refused(text: str, error: str) -> None:
 
 def test_the_configuration_error_is_readable() -> None:
     config = load(None, ["rate=100", "estimator.kind=kalman", 'estimator.measured=["speed"]'])
-    with pytest.raises(ConfigError, match=r"measured = speed: .* never tells of position"):
+    with pytest.raises(ConfigError, match=r"measured = speed: .* do not determine position"):
         build_estimator(config, chain())
     assert build_estimator(load(None, []), chain()) is None

@@ -110,7 +110,7 @@ def test_elimination_equals_projection() -> None:
             [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],
             [1.0, 1.0, 3.0, -3.0],
             FlatSetError,
-            "variable 1 only ever is 3",
+            "variable 1 is fixed at 3",
         ),
         (
             [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],

@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("known_pendulum")
 
 
 def test_a_w_that_h_leaves_only_between_samples_is_refused(cached: Path, capsys: pytest.CaptureFixture[str]):
-    """A few states in a corner of X are enough, which none of 100 samples met."""
+    """A few states in a corner of X suffice, although none of 100 samples is there."""
     sets = read_sets(cached / "sets.json")
     base = sets.certificate.pieces[0]
     W = np.array(base.W)
@@ -82,10 +82,10 @@ def test_a_wrong_claim_with_a_right_hash_is_refused(cached: Path, capsys: pytest
 
 def test_another_model_is_refused_by_the_hash_that_differs(cached: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["sets", "check", "sets.json", *OPTIONS, "--set", "rate=12"]) == 3
-    assert "about another model (period: sha256" in capsys.readouterr().err
+    assert "for another model (period: sha256" in capsys.readouterr().err
     config = invariant("controller.sets=sets.json", "rate=12")
     with pytest.raises(
-        ConfigError, match=r"sets\.json: the certificate is about another model .*period: sha256"
+        ConfigError, match=r"sets\.json: the certificate is for another model .*period: sha256"
     ):
         simulate(config, 2)
 

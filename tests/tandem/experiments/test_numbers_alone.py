@@ -27,7 +27,7 @@ SETTINGS = [
 
 
 def matrices(period: float | None = None) -> Known:
-    """The pendulum's, beside all else that it has."""
+    """Return the matrices of the pendulum with all its other fields."""
     _rest, a, b = PENDULUM.linearised()
     if period is not None:
         a, b = discretise(a, b, period)
@@ -48,7 +48,7 @@ def configured(model: str, *settings: str) -> Config:
 
 
 def said(run: Run) -> tuple[list[bytes], list[bytes]]:
-    """What the plant and the controller said, as it travels."""
+    """Return the encoded messages of plant and controller."""
     return [codec.encode(state) for state in run.plant_states], [codec.encode(one) for one in run.commands]
 
 
@@ -82,12 +82,12 @@ def test_matrices_that_are_their_own_truth_leave_no_h(model: str) -> None:
 def test_features_that_need_equations_say_so() -> None:
     with pytest.raises(ConfigError, match=r"perfect.* needs the equations of the true plant"):
         simulate(configured("matrices", "controller.oracle=perfect"), 1)
-    with pytest.raises(ConfigError, match=r"those of a period of 0.1 s"):
+    with pytest.raises(ConfigError, match=r"given for a period of 0.1 s"):
         simulate(configured("sampled", "rate=20"), 1)
 
 
 def test_a_known_wind_leaves_no_offset() -> None:
-    """The linear oracle learns nothing: where the model has the wind the plant comes to rest where it should."""
+    """The linear oracle does not learn. With the wind in the model the plant still settles at its target."""
     weights = "controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"
     start = "plant.x0=[-0.5,0,0,0,0,0]"
     ends = {}
