@@ -24,6 +24,7 @@ from tests.helpers.paths import ROOT
 
 EXISTING = [page for page in PAGES if page.exists()]
 NAMED_FILE = re.compile(r"[\w./-]+\.(?:py|toml|mcap|csv|json)(?=$|:)")
+WRITTEN = ("--log", "--out", "--output", "--layout")
 # Files that a command writes under a default name.
 LEFT = {"run": ["run.mcap", "run.png"], "keys": ["keys"], "record": ["run.mcap"]}
 
@@ -76,7 +77,7 @@ def test_commands_parse_and_what_they_name_exists(
 
 def made_by(words: list[str]) -> set[str]:
     """Create the files that a command would write, for the commands after it."""
-    named = {value for option, value in itertools.pairwise(words) if option in ("--log", "--out", "--output")}
+    named = {value for option, value in itertools.pairwise(words) if option in WRITTEN}
     new = set(words[3:4]) if words[1:3] == ["model", "new"] else set()
     return named | new | set(LEFT.get(words[1] if words[1:] else "", []))
 

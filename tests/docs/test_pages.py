@@ -14,7 +14,10 @@ from tests.helpers.paths import INSTALLED, ROOT
 
 PACKAGES = (*INSTALLED, "benchmarks", "verification", "examples", "tests")
 GENERATED_PAGES = {ROOT / "docs" / uri for uri in GENERATED}
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")])
+NAMED = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+PAGES = sorted(
+    [*(ROOT / name for name in NAMED), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
+)
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAME = "|".join(PACKAGES)
 PATH = re.compile(rf"(?<![\w/.<-])((?:{NAME}|configs|docs|docker)/[\w./-]*\w/?)(?![\w*<])")

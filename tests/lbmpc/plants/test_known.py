@@ -147,9 +147,7 @@ def test_a_model_in_discrete_time_is_used_at_its_own_rate_only() -> None:
     known = sampled(period=0.02)
     model = build_model(known, 1 / 50)
     np.testing.assert_array_equal(model.A, known.A)
-    with pytest.raises(
-        ModelError, match=r"given for a period of 0.02 s, but the rate gives 0.05 s: set rate = 50"
-    ):
+    with pytest.raises(ModelError, match=r"for a period of 0.02 s, but the rate gives 0.05 s: .*rate = 50"):
         build_model(known, 0.05)
 
 

@@ -183,7 +183,7 @@ def test_events_that_end_a_pause() -> None:
 
 def test_inputs_are_named_and_the_others_stay() -> None:
     assert assignments(["u=1.2"], PLANT) == {"u": 1.2}
-    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a number"), ("u=inf", "finite")):
+    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a finite number"), ("u=inf", "finite")):
         with pytest.raises(Refused, match=says):
             assignments([text], PLANT)
     scale = {"x1": 1.0, "a": 1.0, "b": 1.0}

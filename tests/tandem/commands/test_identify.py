@@ -178,7 +178,7 @@ def test_a_constant_input_is_refused_by_its_name(tmp_path: Path, capsys: Capture
 def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> None:
     save(ran(TANKS_FILE, [], 20), tmp_path / "short.mcap")
     text = refused(capsys, str(tmp_path / "short.mcap"))
-    assert re.search("19 samples are too few: .* has 4 numbers .* needs at least 40 samples", text)
+    assert re.search("19 samples are too few: .* has 4 numbers .* and needs at least 40 samples", text)
     save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
     assert "is not explained by any model, like measurement noise" in refused(
         capsys, str(tmp_path / "noisy.mcap")

@@ -220,6 +220,9 @@ def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
     }
     assert publishes["viewer"] == set()
     assert publishes["commander"] == {f"tandem/jet1/operator/{name}" for name in ("reference", "override")}
+    assert publishes["user"] == {"tandem/jet1/user/**"}
+    assert rights.rights_of("user").read_keys("jet1") == []
+    assert not any("/user/" in key for role in rights.ROLES if role != "user" for key in publishes[role])
     assert publishes["recorder"] == {"tandem/jet1/recorder/run_info", "tandem/jet1/recorder/health"}
     asked = [role for role in rights.ROLES if rights.rights_of(role).asks]
     answered = [role for role in rights.ROLES if rights.rights_of(role).answers]

@@ -306,7 +306,7 @@ MISTAKES: dict[str, tuple[str | None, tuple[str, ...], str]] = {
     "a horizon that leaves no digits": (
         None,
         ("unstable", "--rate", "10", "--set", "controller.horizon=200"),
-        "unstable: over a horizon of 200 steps .* at most 92 steps",
+        "unstable: over a horizon of 200 steps .* Possible: at most 92 steps",
     ),
     "poles that cannot be placed": (
         None,

@@ -131,7 +131,7 @@ def test_an_unexpected_error_of_one_plant_does_not_end_the_others(
         for plant in reversed(plants):
             plant.until(published, tick=True)
     assert looks[1] - looks[0] >= 0.5
-    assert any("jet1: dropped for 0.5 s after an unexpected error" in text for text in caplog.messages)
+    assert any("jet1: dropped for" in text for text in caplog.messages)
 
 
 def test_no_plant_receives_the_list_of_the_others(tmp_path: Path) -> None:
