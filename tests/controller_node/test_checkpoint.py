@@ -331,7 +331,7 @@ def test_a_killed_controller_is_restarted_with_its_memory(tmp_path: Path) -> Non
     errors = [r.prediction_error for r in old if r.prediction_error is not None]
     again = next(r.prediction_error for r in new if r.prediction_error is not None)
     assert again < 0.25 * errors[0], (errors[0], errors[-1], again)
-    assert f"goes on from {killed}" in second.said
+    assert f"continuing from {killed}" in second.said
     keyframe = next(k for k in ear.of(topics.KEYFRAME) if k.run_id == new[0].run_id)
     assert (keyframe.seq, keyframe.resumed) == (-1, killed)
     assert {name: keyframe.arrays[name] for name in saved.arrays} == saved.arrays

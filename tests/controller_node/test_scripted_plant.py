@@ -1,4 +1,4 @@
-"""The plant that a controller follows: a test plays one that forges, falls silent, is late or is replaced."""
+"""The controller with a scripted plant, which forges messages, stops, is late or is replaced."""
 
 from __future__ import annotations
 

@@ -81,6 +81,9 @@ def found(name: str) -> list[str]:
     """What is wrong with a file."""
     text = (ROOT / name).read_text(encoding="utf-8")
     said = [f"{len(line)} characters: {line.strip()[:60]}..." for line in long_lines(name, text)]
+    said += [
+        f"{mark[0]}: a merge that was not finished" for mark in re.finditer("^[<>]{7} ", text, re.MULTILINE)
+    ]
     read = prose(name, text)
     why = list(PATTERNS.values())
     said += [
@@ -101,6 +104,7 @@ def test_lines_are_short_and_english_is_plain() -> None:
     ("name", "text", "is_wrong"),
     [
         ("a.md", "Nobody knows.\n", True),
+        ("a.md", "<" * 7 + " HEAD\n", True),
         ("a.md", "```\nnobody\n```\nThe user `nobody` runs it.\n", False),
         ("a.py", '"""Of the policy that the plant follows."""\n', True),
         ("a.md", "x" * 121 + "\n", True),

@@ -186,5 +186,5 @@ def test_a_log_whose_parts_disagree_is_refused() -> None:
     after = x @ A_PLANT.T + u @ B_PLANT.T
     after[:30, 1] += 0.3 * x[:30, 1]
     said = refused(Transitions(x, u, after))
-    assert "what pressure does to" in said
+    assert "the effect of pressure on" in said
     assert "small compared with the error of a linear model" in said

@@ -116,7 +116,7 @@ def test_the_published_P_is_not_multiplied_by_the_period() -> None:
 
 def test_an_invalid_terminal_cost_is_refused_with_a_remedy() -> None:
     with pytest.raises(
-        ModelError, match=r"'published' at a period of 0\.5 s does not bound .* take 'riccati'"
+        ModelError, match=r"'published' at a period of 0\.5 s does not bound .* use 'riccati'"
     ):
         build_model(PLANT, 0.5, terminal="published")
 
@@ -133,7 +133,7 @@ def test_numbers_without_a_valid_P_are_refused() -> None:
         for terminal, other in (("riccati", "lyapunov"), ("lyapunov", "riccati")):
             with (
                 warnings.catch_warnings(action="ignore"),
-                pytest.raises(ModelError, match=f"'{terminal}' at .* take '{other}'"),
+                pytest.raises(ModelError, match=f"'{terminal}' at .* use '{other}'"),
             ):
                 build_model(steep, 0.1, terminal=terminal)
 

@@ -63,6 +63,17 @@ def test_attachments_have_versions_configuration_and_plant(whole: Path, config: 
     assert "state_verdict" in schemas["types"]["Tick"]["properties"]
 
 
+def test_metadata_has_units_versions_configuration_and_the_clock(whole: Path, config: Config) -> None:
+    with whole.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert found["tandem"]["clock"] == "Unix time of the machine that recorded"
+    assert found["tandem"]["log_time"] == "arrival at the recorder"
+    assert found["units"]["rdot"] == "1/s"
+    assert (found["seeds"], found["versions"]) == ({"seed": "7"}, {"python": "3.11"})
+    assert found["configuration"]["controller.keyframe_every"] == "20"
+    assert found["configuration"]["controller.solver.mode"] == config.controller.solver.mode
+
+
 def test_a_foreign_reader_reads_every_message(whole: Path, messages: list[Logged]) -> None:
     raw, views, series = 0, 0, 0
     with whole.open("rb") as stream:

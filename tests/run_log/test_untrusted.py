@@ -222,7 +222,7 @@ def test_a_network_that_no_message_could_carry_is_not_built(tmp_path: Path) -> N
     config, messages = synthetic(override(SMALL, ["controller.oracle=dnn", "network.hidden=[4096, 4096]"]), 3)
     run = read_run(write(tmp_path / "run.mcap", config, messages))
     run.streams.pop(topics.RUN_INFO["controller"].name)
-    with pytest.raises(LogError, match="hidden weights, and 4194304 is the most"):
+    with pytest.raises(LogError, match="hidden weights; at most 4194304 fit"):
         replay(run)
 
 

@@ -277,7 +277,7 @@ def test_options_that_exclude_a_dead_time_are_refused_by_name() -> None:
     delayed = model(0.1)
     with pytest.raises(CertificateError, match=r"dead time of 0\.1 s"):
         build_problem(delayed, LinearOracle(4, 1), 10, "invariant")
-    with pytest.raises(ModelError, match="60 periods, and 50"):
+    with pytest.raises(ModelError, match="60 periods; at most 50"):
         model(3.0)
     for wrong in (-0.1, math.inf, math.nan, "soon"):
         with pytest.raises(PlantDefinitionError, match="dead_time"):

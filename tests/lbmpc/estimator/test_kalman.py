@@ -203,15 +203,15 @@ def test_a_distrusted_measurement_is_ignored_but_has_an_innovation() -> None:
     trusted = np.array([True, False, True, True])
     motion.go()
     seen = motion.sample()
-    lies = seen._replace(y=seen.y + np.array([0.0, 0.4, 0.0, 0.0]))
-    after, estimate = kalman.update(memory, lies, trusted)
+    faulty = seen._replace(y=seen.y + np.array([0.0, 0.4, 0.0, 0.0]))
+    after, estimate = kalman.update(memory, faulty, trusted)
     without, _ = estimator(np.array([0, 2, 3])).update(memory, seen)
     for name in after:
         np.testing.assert_array_equal(after[name], without[name])
     assert estimate.innovation[1] > 8 * np.sqrt(estimate.innovation_variance[1])
     assert np.abs(estimate.innovation[0]) < 5 * np.sqrt(estimate.innovation_variance[0])
     # If no measurement is trusted, the sample counts as missing.
-    nothing, _ = kalman.update(memory, lies, np.zeros(4, dtype=bool))
+    nothing, _ = kalman.update(memory, faulty, np.zeros(4, dtype=bool))
     missed = kalman.missed(kalman.commanded(kalman.commanded(memory, motion.u), motion.u), 0.0)
     np.testing.assert_allclose(nothing["x"], missed["x"], rtol=1e-12)
 
@@ -258,6 +258,6 @@ def test_an_unknown_state_name_is_refused(text: str, error: str) -> None:
 
 def test_the_configuration_error_is_readable() -> None:
     config = load(None, ["rate=100", "estimator.kind=kalman", 'estimator.measured=["speed"]'])
-    with pytest.raises(ConfigError, match=r"measured = speed: .* never tells of position"):
+    with pytest.raises(ConfigError, match=r"measured = speed: .* do not determine position"):
         build_estimator(config, chain())
     assert build_estimator(load(None, []), chain()) is None

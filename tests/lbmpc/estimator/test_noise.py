@@ -102,8 +102,8 @@ def test_missing_and_distrusted_samples_add_no_innovations_and_keep_the_rest() -
     assert gathered == 15 * 6 - 1
     share = memory["noise"] / noise
     assert ((share > 1 / 1.6) & (share < 1.6)).all()
-    lies = Measured(np.full(4, 0.4), 7, 150, np.zeros(1), ())
-    after, _ = kalman.update(memory, lies, np.array([True, True, True, False]))
+    faulty = Measured(np.full(4, 0.4), 7, 150, np.zeros(1), ())
+    after, _ = kalman.update(memory, faulty, np.array([True, True, True, False]))
     assert after["finder.counts"].tolist() == [0, gathered]
     # A restarted plant keeps its sensors.
     again, _ = kalman.update(after, Measured(np.zeros(4), 8, 0, None, ()))

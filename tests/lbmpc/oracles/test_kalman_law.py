@@ -295,7 +295,7 @@ def test_the_memory_is_in_time_scales_of_the_plant_or_in_seconds(
 
 def test_a_last_layer_that_is_too_wide_is_refused_by_name() -> None:
     assert oracle_of(config("network.hidden=[4, 511]")).law.remembers == ("Sigma",)
-    with pytest.raises(ConfigError, match=r"the last of network\.hidden can have 511 neurons at most"):
+    with pytest.raises(ConfigError, match=r"at most 511 neurons in the last layer of network\.hidden"):
         oracle_of(config("network.hidden=[4, 512]"))
 
 

@@ -30,7 +30,7 @@ def observation(x: np.ndarray, number: int) -> Observation:
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-@pytest.mark.parametrize("theory", ["none", "lies", "nan"])
+@pytest.mark.parametrize("theory", ["none", "random", "nan"])
 def test_from_every_state_of_the_sets_the_controller_keeps_the_plant_inside(
     family: Certificate, theory: str, real_time: bool
 ) -> None:

@@ -88,7 +88,7 @@ def test_sets_of_equations_need_them_in_the_controller() -> None:
     regions = construct(build_model(PENDULUM, PERIOD), "box", np.zeros(2))
     problem = build_problem(MODEL, oracle_named("linear", MODEL), 5, "invariant", certificate=regions)
     with pytest.raises(
-        ModelError, match="the prediction over the delay, about which these sets are, needs the equa"
+        ModelError, match="the prediction over the delay, which these sets require, needs the equations"
     ):
         Controller(problem, Solver(problem))
 

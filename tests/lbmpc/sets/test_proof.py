@@ -53,7 +53,7 @@ def test_a_w_that_h_leaves_by_a_few_percent_is_refuted(family: Certificate, inde
     # A piece with a slope has a W of 1 to 2 times the necessary size; a hull is accurate to one percent.
     found = prove(MODEL, changed(family, index, W=shrunk(piece, 0.97 if index == 0 else 0.4)))
     assert f"in piece {piece.name}, from x = " in found.reason
-    assert "h is outside of W by" in found.reason
+    assert "h is outside W by" in found.reason
 
 
 def test_the_reported_place_is_outside(family: Certificate) -> None:
@@ -74,13 +74,13 @@ def test_the_reported_place_is_outside(family: Certificate) -> None:
 def test_another_slope_is_refuted(family: Certificate, part: str) -> None:
     last = len(family.pieces) - 1
     other = (np.array(getattr(family.pieces[last], part)) + 0.2).tolist()
-    assert "h is outside of W" in prove(MODEL, changed(family, last, **{part: other})).reason
+    assert "h is outside W" in prove(MODEL, changed(family, last, **{part: other})).reason
 
 
 def test_a_larger_box_than_w_was_made_for_is_refuted(family: Certificate) -> None:
     last = len(family.pieces) - 1
     wide = {"x_lower": (-HALF).tolist(), "x_upper": HALF.tolist()}
-    assert "h is outside of W" in prove(MODEL, changed(family, last, **wide)).reason
+    assert "h is outside W" in prove(MODEL, changed(family, last, **wide)).reason
 
 
 def test_the_budget_limits_an_undecidable_proof(family: Certificate) -> None:
@@ -95,7 +95,7 @@ def test_a_w_that_is_flat_off_the_axes_is_refused(family: Certificate) -> None:
 def test_a_w_without_width_in_a_state_is_proved_to_a_tolerance(family: Certificate) -> None:
     """A point counts as a segment of 2e-7, and the proof states how far h may be beyond W."""
     point = changed(family, 0, W=[[0.0, 0.0]])
-    assert "h is outside of W" in prove(MODEL, point).reason
+    assert "h is outside W" in prove(MODEL, point).reason
 
 
 def test_two_inputs() -> None:
@@ -116,7 +116,7 @@ def test_outside_the_domain_of_the_equations_there_is_no_proof() -> None:
         reason = prove(model, wrong).reason
     except DisturbanceError as error:
         reason = str(error)
-    assert "h is outside of W" in reason or "leaves its domain of definition" in reason
+    assert "h is outside W" in reason or "leaves its domain of definition" in reason
 
 
 def test_bounds_of_a_box_hold_at_its_points(family: Certificate) -> None:
@@ -147,4 +147,4 @@ def test_each_end_of_w_is_checked(family: Certificate, state: int, end: float) -
     """h is largest at one end of X and smallest at the other; one of them is cut off here."""
     W = np.array(family.pieces[0].W)
     W[:, state] = end * np.minimum(end * W[:, state], 0.97 * (end * W[:, state]).max())
-    assert "h is outside of W" in prove(MODEL, changed(family, 0, W=W.tolist())).reason
+    assert "h is outside W" in prove(MODEL, changed(family, 0, W=W.tolist())).reason

@@ -110,7 +110,7 @@ def test_elimination_equals_projection() -> None:
             [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],
             [1.0, 1.0, 3.0, -3.0],
             FlatSetError,
-            "variable 1 only ever is 3",
+            "variable 1 is fixed at 3",
         ),
         (
             [[1.0, 0], [-1.0, 0], [0, 1.0], [0, -1.0]],
@@ -118,7 +118,7 @@ def test_elimination_equals_projection() -> None:
             BadlyScaledError,
             "use other units",
         ),
-        ([[0.0], [1.0], [-1.0]], [-1.0, 1.0, 1.0], EmptySetError, "asks for 0 <= -1"),
+        ([[0.0], [1.0], [-1.0]], [-1.0, 1.0, 1.0], EmptySetError, "requires 0 <= -1"),
     ],
 )
 def test_sets_without_interior_are_reported(G: list, g: list, error: type[Exception], says: str) -> None:

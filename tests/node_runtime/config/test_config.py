@@ -92,7 +92,7 @@ def test_commented_values_of_the_shipped_file_are_valid():
             "bus.zzz=3",
             "unknown key 'bus.zzz'; known: endpoint, remote, insecure, tls, lease_ms, follow_silence",
         ),
-        ("network.activation=relu", "network.activation = 'relu' is unbounded"),
+        ("network.activation=relu", "network.activation = 'relu' is not bounded"),
         ("trainer.min_samples=5000", "trainer.min_samples = 5000 exceeds trainer.capacity = 2000"),
         ("name=a/b", "name = 'a/b' is not a string matching"),
         (f"seed={2**63}", "is not an integer of at least 0 and at most"),
@@ -175,7 +175,7 @@ def test_toml_and_json_are_read_back_equal(tmp_path: Path):
             "reference.outputs: moore_greitzer has no state 'q'; it has z, y, r, rdot",
         ),
         ('reference.outputs=["u"]', "reference.outputs: moore_greitzer has no state 'u'"),
-        ('reference.outputs=["y", "y"]', "reference.outputs: 'y' is there twice"),
+        ('reference.outputs=["y", "y"]', "reference.outputs: 'y' is used twice"),
         ("reference.values=[1.0]", "reference.values has 1 entries; no reference.outputs"),
         (
             'reference={outputs=["y"], values=[1.7, 1]}',
@@ -183,7 +183,7 @@ def test_toml_and_json_are_read_back_equal(tmp_path: Path):
         ),
         (
             'reference={outputs=["y"], values=[2.2]}',
-            "reference.values: y = 2.2 is outside of X, 1.1875 to 2.1875",
+            "reference.values: y = 2.2 is outside X, 1.1875 to 2.1875",
         ),
         ("plant.truth.mass=1.4", "no parameter 'mass'; it has beta, z_c, slope"),
         ("plant.truth.beta=0", "plant.truth: moore_greitzer with beta = 0: dx/dt is not finite"),

@@ -124,7 +124,7 @@ def test_package_of_the_current_folder_is_not_installed(here: Path):
         ("tanks.py:TANK", "tanks.py:TANK: tanks.py has nothing called 'TANK'; did you mean 'TANKS'?"),
         ("tanks.py:PLANT", "tanks.py:PLANT: tanks.py has nothing called 'PLANT'; it has TANKS, OTHER"),
         ("tanks.py:HEIGHT", "tanks.py:HEIGHT: HEIGHT is no plant but of type int; it has TANKS, OTHER"),
-        ("tanks.py", "tanks.py: which plant of it? write tanks.py:TANKS; it has TANKS, OTHER"),
+        ("tanks.py", "tanks.py: give the name of the plant: write tanks.py:TANKS; it has TANKS, OTHER"),
         (
             "./tanks:TANKS",
             "neither a file that ends in .py nor the name of a package; did you mean './tanks.py:TANKS'?",

@@ -90,9 +90,9 @@ def test_a_trainer_receives_no_commands_and_answers_no_queries(site: Site):
             for key in ("tandem/**", "tandem/jet1/**", "tandem/jet1/*/command")
         ]
         samples = session.declare_subscriber(topics.SAMPLES.key("jet1"), zenoh.handlers.RingChannel(8))
-        lies = session.declare_queryable(
+        false_answers = session.declare_queryable(
             f"tandem/jet1/{topics.OUTBOX_QUERY}",
-            lambda query: query.reply(query.key_expr, b"lie"),
+            lambda query: query.reply(query.key_expr, b"false"),
             complete=True,
         )
         controller.serve(topics.OUTBOX_QUERY, lambda _parameters: [b"true"])
@@ -106,7 +106,7 @@ def test_a_trainer_receives_no_commands_and_answers_no_queries(site: Site):
             one for sub in heard for one in iter(sub.try_recv, None) if "command" in str(one.key_expr)
         ]
         assert commands == []
-        lies.undeclare()
+        false_answers.undeclare()
 
 
 def test_the_router_drops_oversized_messages(site: Site):

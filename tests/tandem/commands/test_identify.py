@@ -161,7 +161,7 @@ def test_one_linear_feedback_is_refused_with_its_equation(tmp_path: Path, capsys
         tmp_path / "run.mcap",
     )
     text = refused(capsys, str(tmp_path / "run.mcap"))
-    assert re.search(r"run.mcap: the samples do not say what A and B are:\n  - u = .*\+ constant, to", text)
+    assert re.search(r"run.mcap: the samples do not determine A and B:\n  - u = .*\+ constant, to", text)
     assert "the input is a linear function of the other variables, as under one fixed feedback" in text
     assert "Record motion that differs: from several x0" in text
 
@@ -178,7 +178,7 @@ def test_a_constant_input_is_refused_by_its_name(tmp_path: Path, capsys: Capture
 def test_short_and_noisy_logs_are_refused(tmp_path: Path, capsys: Capture) -> None:
     save(ran(TANKS_FILE, [], 20), tmp_path / "short.mcap")
     text = refused(capsys, str(tmp_path / "short.mcap"))
-    assert re.search("19 samples are too few: .* has 4 numbers .*, and 40 samples are the least", text)
+    assert re.search("19 samples are too few: .* has 4 numbers .* and needs at least 40 samples", text)
     save(ran(TANKS_FILE, ["plant.x0=[8, 11]"], 120, noise=1.0 / 9.5), tmp_path / "noisy.mcap")
     assert "is not explained by any model, like measurement noise" in refused(
         capsys, str(tmp_path / "noisy.mcap")

@@ -178,7 +178,7 @@ def test_keys_that_do_not_fit_are_named(keys: Path, tmp_path: Path):
     assert credentials.of_process(str(mine), "trainer", "jet1").name == "trainer.jet1"
     for role, plant in (("controller", "jet1"), ("trainer", "jet2")):
         with pytest.raises(
-            ConfigError, match=rf"certificate of trainer\.jet1, and this process is {role}\.{plant}"
+            ConfigError, match=rf"certificate of trainer\.jet1, but this process is {role}\.{plant}"
         ):
             credentials.of_process(str(mine), role, plant)
     with pytest.raises(ConfigError, match=r"bus\.tls\.keys is missing"):
@@ -220,6 +220,9 @@ def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
     }
     assert publishes["viewer"] == set()
     assert publishes["commander"] == {f"tandem/jet1/operator/{name}" for name in ("reference", "override")}
+    assert publishes["user"] == {"tandem/jet1/user/**"}
+    assert rights.rights_of("user").read_keys("jet1") == []
+    assert not any("/user/" in key for role in rights.ROLES if role != "user" for key in publishes[role])
     assert publishes["recorder"] == {"tandem/jet1/recorder/run_info", "tandem/jet1/recorder/health"}
     asked = [role for role in rights.ROLES if rights.rights_of(role).asks]
     answered = [role for role in rights.ROLES if rights.rights_of(role).answers]

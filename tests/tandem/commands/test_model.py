@@ -101,7 +101,7 @@ def test_a_state_that_no_sensor_determines_is_a_fault(mine: Any, capsys: Capture
     )
     assert code == 2
     assert found["faults"] == [
-        "estimator.measured = x2: what is measured never tells of x1, which would have to be measured too"
+        "estimator.measured = x2: these measurements do not determine x1; measure them too"
     ]
 
 
@@ -148,7 +148,7 @@ def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, caps
     assert found["h_sampled"] is None
     code, found = checked(capsys, "mine", "--rate", "10")
     assert code == 2
-    assert "take rate = 50" in found["faults"][0]
+    assert "set rate = 50" in found["faults"][0]
 
 
 # -- what is worth a look --------------------------------------------------------------------
@@ -306,12 +306,12 @@ MISTAKES: dict[str, tuple[str | None, tuple[str, ...], str]] = {
     "a horizon that leaves no digits": (
         None,
         ("unstable", "--rate", "10", "--set", "controller.horizon=200"),
-        "unstable: over a horizon of 200 steps .* What makes sense: at most 92 steps",
+        "unstable: over a horizon of 200 steps .* Possible: at most 92 steps",
     ),
     "poles that cannot be placed": (
         None,
         ("twice", "--rate", "10"),
-        "no stabilising K at a period of 0.1 s: with one input no pole may be there twice",
+        "no stabilising K at a period of 0.1 s: with one input all poles must be different",
     ),
     "no terminal cost": (
         None,

@@ -80,7 +80,7 @@ def test_the_name_may_be_left_out_where_there_is_one(capsys: Capture) -> None:
     assert main(["model", "check", "my.py"]) == 2
     seen = capsys.readouterr()
     text = " ".join((seen.out + seen.err).split())
-    assert "which plant of it? write" in text
+    assert "give the name of the plant: write" in text
     assert "it has PLANT, MATRICES" in text
-    Path("one.py").write_text(Path("my.py").read_text().partition("# Where there are no equations")[0])
+    Path("one.py").write_text(Path("my.py").read_text().partition("# Without equations")[0])
     checked(capsys, "one.py")

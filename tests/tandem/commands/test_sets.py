@@ -82,10 +82,10 @@ def test_a_wrong_claim_with_a_right_hash_is_refused(cached: Path, capsys: pytest
 
 def test_another_model_is_refused_by_the_hash_that_differs(cached: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["sets", "check", "sets.json", *OPTIONS, "--set", "rate=12"]) == 3
-    assert "about another model (period: sha256" in capsys.readouterr().err
+    assert "for another model (period: sha256" in capsys.readouterr().err
     config = invariant("controller.sets=sets.json", "rate=12")
     with pytest.raises(
-        ConfigError, match=r"sets\.json: the certificate is about another model .*period: sha256"
+        ConfigError, match=r"sets\.json: the certificate is for another model .*period: sha256"
     ):
         simulate(config, 2)
 
@@ -144,7 +144,7 @@ def test_sets_that_another_user_could_have_written_are_not_used(
     monkeypatch.setattr(construction, "controllable_sets", lambda *_: [])
     monkeypatch.setattr(construction, "predecessor_iteration", _none)
     assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 3
-    assert "not believed" in (shown := " ".join(capsys.readouterr().out.split()))
+    assert "not trusted" in (shown := " ".join(capsys.readouterr().out.split()))
     assert "computed without it" in shown
     assert sorted((cached / "cache").rglob("*")) == before
 

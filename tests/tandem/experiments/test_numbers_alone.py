@@ -82,7 +82,7 @@ def test_matrices_that_are_their_own_truth_leave_no_h(model: str) -> None:
 def test_features_that_need_equations_say_so() -> None:
     with pytest.raises(ConfigError, match=r"perfect.* needs the equations of the true plant"):
         simulate(configured("matrices", "controller.oracle=perfect"), 1)
-    with pytest.raises(ConfigError, match=r"those of a period of 0.1 s"):
+    with pytest.raises(ConfigError, match=r"are given for a period of 0.1 s"):
         simulate(configured("sampled", "rate=20"), 1)
 
 

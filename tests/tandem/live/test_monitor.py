@@ -60,6 +60,14 @@ def test_bad_messages_are_counted_and_not_shown(monitor: Monitor, bad: Delivery)
     assert after.bad_messages == before.bad_messages + 1
 
 
+def test_a_users_own_topic_is_no_bad_message(monitor: Monitor) -> None:
+    before = monitor.snapshot(START + 2.5).bad_messages
+    monitor.feed(Delivery("tandem/jet1/user/weather/wind", b"\xff", 0))
+    assert monitor.snapshot(START + 2.5).bad_messages == before
+    monitor.feed(Delivery("tandem/jet2/user/weather/wind", b"\xff", 0))
+    assert monitor.snapshot(START + 2.5).bad_messages == before + 1
+
+
 def test_of_simultaneous_messages_every_tick_counts_and_only_the_newest_state_is_read() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(0), START)])

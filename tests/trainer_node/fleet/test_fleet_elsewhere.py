@@ -131,7 +131,7 @@ def test_an_unexpected_error_of_one_plant_does_not_end_the_others(
         for plant in reversed(plants):
             plant.until(published, tick=True)
     assert looks[1] - looks[0] >= 0.5
-    assert any("jet1 is left alone" in text for text in caplog.messages)
+    assert any("jet1: dropped for" in text for text in caplog.messages)
 
 
 def test_no_plant_receives_the_list_of_the_others(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_the_list_is_read_from_a_file(tmp_path: Path) -> None:
     assert load(tmp_path / "again.toml") == config
     for wrong, says in (
         (text + 'kees = "k"\n', "did you mean 'trainer.fleet[0].keys'"),
-        (text + text, "'jet1' is there twice"),
+        (text + text, "'jet1' is used twice"),
         (text.replace("jet1", "jet 1"), "name"),
         (text.replace("endpoint", "#"), "endpoint"),
     ):

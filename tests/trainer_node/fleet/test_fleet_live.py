@@ -50,7 +50,7 @@ def test_two_plants_get_weights_and_an_unmatched_one_gets_none(
         assert {weights.for_run for weights in two.adopted} == {"two"}
         pump.tick()
         assert not pump.adopted
-    assert "jet2 has come" in caplog.text
+    assert "jet2 added" in caplog.text
     assert "pump" not in caplog.text
 
 
