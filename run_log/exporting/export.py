@@ -138,7 +138,7 @@ def _empty_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise LogError(f"{folder}: cannot be used as a folder: {error.strerror}") from error
     if taken:
-        raise LogExistsError(f"{folder}: is not empty; name a new folder")
+        raise LogExistsError(f"{folder}: the folder is not empty; name a new one")
     return folder
 
 
@@ -148,7 +148,7 @@ def _new_file(path: str | Path) -> Path:
         # What is there at its place is never overwritten.
         path.open("xb").close()
     except FileExistsError as error:
-        raise LogExistsError(f"{path}: is there already; name a new file, or remove it first") from error
+        raise LogExistsError(f"{path}: exists already; name a new file, or remove this one first") from error
     except OSError as error:
         raise LogError(f"{path}: cannot be written: {error.strerror}") from error
     return path

@@ -114,7 +114,7 @@ def _refused(path: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise OSError(errno.EIO, f"the Rerun file is not whole: {error}", str(path)) from error
+        raise OSError(errno.EIO, f"the Rerun file is incomplete: {error}", str(path)) from error
 
 
 def _times(stamps: Sequence[int], since: Sequence[float]) -> list[rr.TimeColumn]:

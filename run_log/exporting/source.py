@@ -106,13 +106,13 @@ class Source:
         self.damage += [f"{part.path}: damaged {what}" for what in scan.damage]
         if nameless:
             self.damage.append(
-                f"{part.path}: {nameless} messages are of channels whose names were in a damaged place; "
+                f"{part.path}: {nameless} messages belong to channels whose names are in a damaged part; "
                 f"`tandem recover {part.path}` finds them in the index"
             )
         if scan.cut_at is not None:
             part.truncated = True
             self.notes.append(
-                f"{part.path} was cut short at byte {scan.cut_at} of {scan.size}; all before that is exported"
+                f"{part.path} was cut short at byte {scan.cut_at} of {scan.size}; all messages before that are exported"
             )
 
     def _is_new(self, one: Logged) -> bool:
@@ -132,13 +132,13 @@ class Source:
             later = existing_parts(self.run.path)
             if part.truncated and later and later[-1] not in self.parts:
                 self.notes.append(
-                    f"{part.path} does not say whether it goes on; {later[-1].name} is not exported"
+                    f"{part.path} does not say whether it continues; {later[-1].name} is not exported"
                 )
             return None
         # A log says a name, and no other folder.
         path = part.path.with_name(Path(part.continued).name or "?")
         if path in self.parts or not path.exists():
-            self.notes.append(f"{part.path} goes on in {part.continued}, which is not beside it")
+            self.notes.append(f"{part.path} continues in {part.continued}, which is not in the same folder")
             return None
         return path
 
@@ -172,7 +172,7 @@ def _opening(path: Path) -> Run:
                     run.streams[name] = [Entry(record.log_time, payload, info)]
                     break
     if not header:
-        raise LogError(f"{path}: ends before anything was written to it; there is nothing to export")
+        raise LogError(f"{path}: contains no message; there is nothing to export")
     interpret(run)
     run.streams.clear()
     return run

@@ -207,7 +207,7 @@ class Events:
         for name in now.keys() - before.keys():
             yield self._say("fault", Level.ERROR, "controller", f"{who}: sensor {name} is {now[name]}")
         for name in before.keys() - now.keys():
-            yield self._say("fault", Level.INFO, "controller", f"{who}: sensor {name} is believed again")
+            yield self._say("fault", Level.INFO, "controller", f"{who}: sensor {name} is trusted again")
 
     def _of_health(self, health: m.Health) -> Iterator[Shown | None]:
         who = health.process
@@ -218,7 +218,7 @@ class Events:
             )
         for name, count in health.counters.items():
             if name.startswith(m.BAD) and count and self._change(f"{who} {name}", True, False) is not None:
-                yield self._say("bad", Level.WARNING, who, f"messages are not obeyed: {name}")
+                yield self._say("bad", Level.WARNING, who, f"messages were ignored: {name}")
 
     def _of_run_info(self, info: m.RunInfo) -> Iterator[Shown | None]:
         if self._change(f"run of {info.process}", info.run_id, "") is not None:
@@ -227,7 +227,7 @@ class Events:
     def _of_keyframe(self, keyframe: Any) -> Iterator[Shown | None]:
         if keyframe.resumed:
             yield self._say(
-                "resumed", Level.INFO, "controller", f"goes on from the memory of run {keyframe.resumed}"
+                "resumed", Level.INFO, "controller", f"continues from the memory of run {keyframe.resumed}"
             )
 
     def _change(self, kind: str, now: Any, usual: Any = None) -> Any:

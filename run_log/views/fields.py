@@ -56,9 +56,7 @@ FIELDS: dict[str, Meaning] = {
         "Distance to the boundary of the certified sets, in half-widths; negative outside", "1"
     ),
     "set_piece": Meaning("Which of the certified sets the state is in; -1 for none"),
-    "sensor_faults": Meaning(
-        "Sensors that are not believed, by state: the fault, and what is known of the state"
-    ),
+    "sensor_faults": Meaning("Sensor faults, by state: the kind of fault, and how the state is still known"),
     "reference": Meaning("Where the outputs should be in this tick"),
     "reference_verdict": Meaning("Outcome of the tick's reference: taken, or refused with a reason"),
     "reference_from": Meaning("Run of the sender of that reference"),

@@ -102,7 +102,7 @@ class Fields(NamedTuple):
     names: str
     """In this order, after run_id and seq."""
     made: Callable[[Any], Json] = lambda _message: {}
-    """The values of those that the message does not have, or has otherwise; None, or none at all, of what it lacks."""
+    """Values of fields that the message lacks or has in another form; None or absent if it has no value."""
     types: Mapping[str, Any] = {}
     """Types of these values, where the message's own are not right."""
 

@@ -163,7 +163,7 @@ class LogWriter:
             self._mcap.add_metadata(CONTINUED, {"in": readable(continued.name)})
         self._mcap.finish()
         if not self.sink.close():
-            raise LogError(f"{self.sink.error}; the log is cut short: `tandem recover` saves what there is")
+            raise LogError(f"{self.sink.error}; the log is incomplete: `tandem recover` saves its messages")
 
     def __enter__(self) -> LogWriter:
         return self

@@ -29,7 +29,7 @@ class Process:
     slow_because: str = ""
     """What a person who waits should know."""
     optional: bool = False
-    """Nothing waits for it, and the run goes on without it."""
+    """Nothing waits for it, and the run continues without it."""
 
 
 # In the order of starting. The controller comes last: learning starts with its first tick.

@@ -180,7 +180,7 @@ class Supervisor:
             while not opened.wait(0.02) and not self.wish.stop:
                 self._fail_if_dead(router)
                 if time.monotonic() > deadline:
-                    raise self._not_ready(router, "nobody answers at its endpoint")
+                    raise self._not_ready(router, "no answer at its endpoint")
         finally:
             stop.set()
         if opened.is_set():
@@ -199,7 +199,9 @@ class Supervisor:
             self._fail_if_dead(*(child for child in self.children.values() if not child.process.optional))
             if time.monotonic() > deadline:
                 said = self.monitor.status(name)
-                raise self._not_ready(child, f"its last word was {said!r}" if said else "it said nothing")
+                raise self._not_ready(
+                    child, f"its last status was {said!r}" if said else "it sent no message"
+                )
             self._listen()
         if not self.wish.stop:
             now = time.monotonic()
@@ -212,7 +214,7 @@ class Supervisor:
 
     def _not_ready(self, child: Child, why: str) -> StartError:
         waited = time.monotonic() - child.started_at
-        text = f"the {child.name} did not get ready within {waited:.0f} s: {why}"
+        text = f"the {child.name} was not ready within {waited:.0f} s: {why}"
         words = child.last_words()
         return StartError(f"{text}\n{words}" if words else text, child.exit_code())
 
@@ -234,7 +236,7 @@ class Supervisor:
             if first is not None and time.monotonic() >= first + self.monitor.seconds + GRACE_S:
                 return None
             if first is None and "plant" in self.children and time.monotonic() > waiting_since + 30.0:
-                return "the controller is ready, but no command came for 30 s"
+                return "the controller is ready, but no command arrived for 30 s"
             for child in self.children.values():
                 if child.exit_code() is not None:
                     trouble = self._died(child)
@@ -250,7 +252,10 @@ class Supervisor:
         places = " or ".join(filter(None, (bus.endpoint, bus.remote)))
         states = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
         key = topics.PLANT_STATE.key(self.config.name)
-        return f"waiting for the plant: its router is at {places}", f"it publishes {states} as {key}"
+        return (
+            f"waiting for a plant to connect to the router at {places}",
+            f"the plant must publish {states} as {key}",
+        )
 
     def _died(self, child: Child) -> str | None:
         """What to do about a process that has ended: text that ends the run, or None to go on."""
@@ -271,7 +276,7 @@ class Supervisor:
             self._deaths[child.name] = deaths + 1
             self._restart_at[child.name] = now + wait
             self.monitor.ended(child.name)
-            self.monitor.say(f"{died}; started again in {wait:g} s", now, "bad")
+            self.monitor.say(f"{died}; it restarts in {wait:g} s", now, "bad")
         elif now >= self._restart_at[child.name]:
             del self._restart_at[child.name]
             self._start(child.name)
@@ -280,8 +285,8 @@ class Supervisor:
     def _without(self, child: Child, died: str) -> str:
         """What a person should know about a process that the run goes on without."""
         if child.name == "recorder":
-            return f"NOT LOGGED from here on: {died}; the loop goes on"
-        return f"{died}; the run goes on without it\n{child.last_words()}"
+            return f"NOT LOGGED from here on: {died}; the loop continues"
+        return f"{died}; the run continues without it\n{child.last_words()}"
 
     def _listen(self, wait_s: float = 0.02) -> None:
         """Take what arrives within a little time, together, and show it now and then."""

@@ -71,7 +71,7 @@ def test_mujocos_warm_start_is_reset() -> None:
 
 
 def test_the_crane_without_wind_and_with_the_known_load_moves_by_the_matrices() -> None:
-    """In the first instant, but for the load's size, of which a point mass has none."""
+    """At the first instant, apart from the size of the load: the matrices are those of a point mass."""
     true, known = loaded(CRANE)
     model = type(true.model).from_xml_path(str(ROOT / "examples" / "mujoco_crane" / "crane.xml"))
     model.opt.wind[:] = 0.0

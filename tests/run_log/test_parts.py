@@ -25,7 +25,7 @@ STEPS, EVERY = 160, 20
 INFO = m.RunInfo(
     run_id="plant-x", seq=0, process="plant", config="", versions={}, seed=0, units={}, unix_time=0.0
 )
-SETS = m.CertifiedSets(run_id="somebody", seq=0, kind="terminal", sha256="", content=b"")
+SETS = m.CertifiedSets(run_id="another", seq=0, kind="terminal", sha256="", content=b"")
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_every_part_replays_alone_and_no_tick_is_lost_at_a_seam(ran: Run, tmp_pa
         (2, "run.part3.mcap"),
         (3, None),
     ]
-    assert "goes on in run.part2.mcap" in runs[0].note
+    assert "continues in run.part2.mcap" in runs[0].note
     for run in runs:
         # What was said once is in every part, and a part's edges are no gaps.
         assert [entry.message for entry in run.entries(topics.SETS)] == [SETS]
@@ -147,9 +147,9 @@ def test_without_a_controller_the_old_part_ends_after_a_while(ran: Run, tmp_path
 
 def test_nothing_is_overwritten(ran: Run, tmp_path: Path) -> None:
     other = tmp_path / "run.part2.mcap"
-    other.write_bytes(b"somebody's")
+    other.write_bytes(b"another file")
     record(ran, config(ran, tmp_path / "run.mcap"), entries(ran))
-    assert other.read_bytes() == b"somebody's"
+    assert other.read_bytes() == b"another file"
     assert read_run(tmp_path / "run.mcap").continued == "run.part3.mcap"
     assert read_run(tmp_path / "run.part3.mcap").part == 3
     with pytest.raises(LogExistsError):

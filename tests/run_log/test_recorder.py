@@ -112,7 +112,7 @@ def test_every_message_is_in_the_log(config: Config, plant: Bus, ear: BusListene
     assert [e.payload for e in run.entries(topics.PLANT_STATE)] == [codec.encode(state(0))]
     payloads, said = [e.payload for e in run.entries(topics.TIMING)], [*timings, *last_words]
     assert payloads == [codec.encode(one) for one in said[: len(payloads)]]
-    # Once nobody has said anything for a while it ends; and this process too may have been without a core.
+    # The recorder ends after a time without messages, and this process may have been without a core for as long.
     assert len(payloads) >= 305
     assert run.bad == {"controller/tick: malformed": 2, "controller/tick: not finite": 1} or run.bad == {
         "controller/tick: malformed": 3

@@ -166,9 +166,9 @@ def test_summary_of_applied_input_and_settled_states(config: Config, messages: l
     at_rest = moved(messages, x=lambda s: PLANT.x_e.tolist(), applied=lambda s: [2.1547 + 5e-7])
     summary = summarise(gather(config, at_rest))
     assert (summary.settled_s, summary.constraint_violations, summary.deviation) == (0.0, 0, 0.0)
-    # Who begins settled has no deviation of which an overshoot could be a share.
+    # A state that begins at its target has no initial deviation, so its overshoot is undefined.
     assert summary.overshoot == {"z": None, "y": None}
-    # The equilibrium is none under that input.
+    # With that input the state is not an equilibrium.
     assert summary.excess_between_samples is None
     outside = moved(at_rest, applied=lambda s: [2.1547 + 2e-6] if s.seq == 9 else None)
     assert summarise(gather(config, outside)).constraint_violations == 1
@@ -295,17 +295,17 @@ def test_reading_needs_neither_torch_nor_a_display() -> None:
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
 def test_a_picture_replaces_files_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
-    (tmp_path / "elsewhere").write_text("somebody else's")
+    (tmp_path / "elsewhere").write_text("another file")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
     with pytest.raises(LogError, match=r"run\.png: cannot be written: it is a (pipe|link|folder)"):
         save(Figure, tmp_path / "run.png")
     assert (tmp_path / "run.png").lstat().st_mode == kind
-    assert (tmp_path / "elsewhere").read_text() == "somebody else's"
+    assert (tmp_path / "elsewhere").read_text() == "another file"
 
 
 def test_a_picture_of_an_unknown_kind_is_refused_with_those_that_are_known(
     whole: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(LogError, match=r"no picture has that ending.*png.*svg"):
+    with pytest.raises(LogError, match=r"not a picture format.*png.*svg"):
         picture(read_run(whole), tmp_path / "run.picture")

@@ -74,9 +74,9 @@ def test_samples_of_strangers_are_left_out(episodes: Run) -> None:
 
 
 def test_a_log_without_samples_and_one_of_another_plant_are_refused(episodes: Run) -> None:
-    with pytest.raises(LogError, match="holds no samples"):
+    with pytest.raises(LogError, match="contains no samples"):
         observed(Run(episodes.path, episodes.config), build_model(episodes.config))
     with pytest.raises(
-        LogError, match="not those of a plant with the states angle, rate and the inputs torque"
+        LogError, match="do not fit a plant with the states angle, rate and the inputs torque"
     ):
         observed(episodes, pendulum())

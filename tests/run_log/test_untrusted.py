@@ -89,7 +89,7 @@ def test_many_chunks_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_another_compression_than_ours_is_damage(tmp_path: Path) -> None:
     path = bomb(tmp_path / "run.mcap", 1000, "lz4")
-    with pytest.raises(LogError, match="its compression 'lz4' is none that a log of Tandem has"):
+    with pytest.raises(LogError, match="its compression 'lz4' is not used in logs of Tandem"):
         read_run(path)
 
 
@@ -199,7 +199,7 @@ def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path
     messages = synthetic(Config(), 20)[1]
     run = gather(config, messages, tmp_path / "run.mcap")
     for read in (summarise, lambda run: report(run, tmp_path)):
-        with pytest.raises(LogError, match="nothing is loaded because a log names it"):
+        with pytest.raises(LogError, match="Tandem loads no file because a log names it"):
             read(run)
     # What a controller has said of itself is in the log as well.
     told = [
@@ -213,7 +213,7 @@ def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path
         for topic, message, at in messages
     ]
     run = gather(Config(), told, tmp_path / "run.mcap")
-    with pytest.raises(LogError, match="nothing is loaded because a log names it"):
+    with pytest.raises(LogError, match="Tandem loads no file because a log names it"):
         replay(run)
     assert not mark.exists()
 

@@ -42,7 +42,7 @@ STEPS = 30
 
 
 class Simulator:
-    """Somebody's own, of the same plant."""
+    """A user's own simulator of the same plant."""
 
     def __init__(self, fails_after: int = 10_000):
         self.motion, self.left = Truth(PLANT), fails_after
@@ -108,7 +108,7 @@ def test_a_plant_that_moves_elsewhere_gets_the_same_inputs_and_labels(simulated:
         u = loop.control(x)
         x = truth.step(x, u, 0.05)
     ours, theirs = payloads(loop.result.run), payloads(simulated)
-    # Where the last input led nobody has said yet.
+    # The state after the last input is not reported yet.
     theirs[topics.PLANT_STATE.name].pop()
     assert ours == theirs
 
@@ -118,7 +118,7 @@ def test_an_invalid_state_changes_nothing() -> None:
     loop.control(PLANT.x0)
     for bad in ([1.0, 2.0], [np.nan, 0, 0, 0], 3.0):
         with pytest.raises(
-            ValueError, match=r"is no state of moore_greitzer: 4 finite numbers \(z, y, r, rdot\)"
+            ValueError, match=r"is not a state of moore_greitzer: give 4 finite numbers \(z, y, r, rdot\)"
         ):
             loop.control(bad)
     other.control(PLANT.x0)

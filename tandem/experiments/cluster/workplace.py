@@ -33,7 +33,7 @@ PATIENCE_S = 300.0
 """How long a sweep waits for a scheduler that is gone, or for a worker."""
 LOOK_S = 1.0
 """How often the workers are counted."""
-KEPT = "the finished runs are kept: the same command goes on from there"
+KEPT = "the finished runs are kept; the same command continues from there"
 
 
 class Cluster:

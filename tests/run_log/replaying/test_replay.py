@@ -143,7 +143,9 @@ def test_two_records_of_one_tick_are_refused(run: Run) -> None:
     assert replay(run).equal  # the same again is harmless
     liar = with_x(again.message, [0.5] * 4)
     run.streams[topics.TICK.name].append(Entry(0, codec.encode(liar), liar))
-    with pytest.raises(LogError, match="controller/tick of tick 12 is there twice, and different"):
+    with pytest.raises(
+        LogError, match="controller/tick of tick 12 is in the log twice with different content"
+    ):
         replay(run)
 
 

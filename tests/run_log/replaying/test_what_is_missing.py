@@ -1,4 +1,4 @@
-"""What a log lacks is said, and what is behind a gap is replayed all the same."""
+"""Replay reports the messages that a log lacks, and replays the ticks after a gap."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_replay_continues_after_a_gap_and_says_so(run: Run, first: int, count: i
     (note,) = (note for note in found.notes if "gap" in note)
     ticks = "1 tick" if count == 1 else f"{count} ticks"
     assert note.startswith(f"gap of {ticks} at tick {first} of ")
-    assert note.endswith(f"the recorder lost them; replay goes on at tick {again}, behind the next keyframe")
+    assert note.endswith(f"the recorder lost them; replay continues at tick {again}, after the next keyframe")
 
 
 def test_a_difference_behind_a_gap_is_found(run: Run) -> None:
@@ -50,7 +50,7 @@ def test_a_difference_behind_a_gap_is_found(run: Run) -> None:
 def test_the_last_tick_of_a_whole_run_may_be_lost_too(run: Run) -> None:
     found = replay(edited(run, topics.TICK, STEPS - 1, lambda _: None))
     assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS - 1, 1)
-    assert any("no keyframe behind it" in note for note in found.notes)
+    assert any("no later keyframe" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,9 @@ def test_the_last_tick_of_a_whole_run_may_be_lost_too(run: Run) -> None:
 def test_missing_messages_of_a_tick_are_named(run: Run, topic: Topic, seq: int, name: str) -> None:
     found = replay(edited(run, topic, seq, lambda _: None))
     assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS, 1)
-    assert any(f"not compared, the recorder lost them: {name} of tick {seq} " in note for note in found.notes)
+    assert any(
+        f"not compared because the recorder lost them: {name} of tick {seq} " in note for note in found.notes
+    )
 
 
 def test_many_gaps_and_unreadable_ticks_are_named(run: Run) -> None:

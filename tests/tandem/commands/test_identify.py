@@ -100,7 +100,7 @@ def test_the_table_fits_a_small_terminal_completely(logs: list[str], capsys: Cap
     assert out.count("±") == 2 * (2 + 1 + 1)
     assert re.search(r"held out +the log's model +nothing changes +W per second", out)
     assert re.search(r"poles, 1/s: -0\.01\d+, -0\.03\d+", out)
-    assert re.search(r"what moved least moved by \d\.\d %", out)
+    assert re.search(r"smallest excitation of any direction: \d\.\d %", out)
 
 
 def test_the_plant_file_passes_its_check_and_controls_better_than_the_wrong_model(
@@ -189,10 +189,10 @@ def test_contradicting_arguments_are_refused(logs: list[str], tmp_path: Path, ca
     save(ran(TANKS_FILE, ["rate=0.1"], 30), tmp_path / "slow.mcap")
     save(ran(None, [], 30), tmp_path / "other.mcap")
     assert "slow.mcap: sampled every 10 s, and" in refused(capsys, logs[0], str(tmp_path / "slow.mcap"))
-    assert "another plant (moore_greitzer)" in refused(capsys, logs[0], str(tmp_path / "other.mcap"))
+    assert "its plant (moore_greitzer)" in refused(capsys, logs[0], str(tmp_path / "other.mcap"))
     (tmp_path / "found.py").write_text("kept")
     for out, message in (
-        ("found.py", "exists already, and is not overwritten"),
+        ("found.py", "exists already and is not overwritten"),
         ("found.txt", "ends in .py"),
         ("away/found.py", "there is no folder"),
     ):

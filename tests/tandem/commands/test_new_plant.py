@@ -56,7 +56,7 @@ def test_both_plants_of_a_new_file_are_the_same_cart(capsys: Capture) -> None:
 def test_a_new_plant_file_overwrites_nothing(tmp_path: Path, capsys: Capture) -> None:
     Path("my.py").write_text("kept")
     for name, message in (
-        ("my.py", "my.py: exists already, and is not overwritten"),
+        ("my.py", "my.py: exists already and is not overwritten"),
         ("my.txt", "ends in .py"),
         ("away/my.py", "there is no folder"),
         (f"{'x' * 300}.py", "File name too long"),

@@ -82,7 +82,7 @@ def test_a_controller_with_another_plant_than_the_recorder_is_named(made: Path):
     assert replay(run).notes == []
     assert run.plant is not None
     run.plant = run.plant.changed({"pump": (0.0, 0.11)})
-    assert any("knew another plant than the recorder" in note for note in replay(run).notes)
+    assert any("had another plant than the recorder" in note for note in replay(run).notes)
 
 
 def test_a_log_has_the_known_plant_and_the_hash_of_its_file(made: Path):
@@ -99,7 +99,7 @@ def test_replay_report_and_recover_load_nothing_that_a_log_names(
     assert main(["report", "run.mcap", "--json"]) == 0
     text = said(capsys)
     assert '"excess_between_samples":null' in text
-    assert "nothing is said of the motion between samples" in text
+    assert "the motion between samples is unknown" in text
     log = elsewhere / "run.mcap"
     (elsewhere / "cut.mcap").write_bytes(log.read_bytes()[: log.stat().st_size * 3 // 4])
     assert recover("cut.mcap", "whole.mcap").log == "whole.mcap"
@@ -130,12 +130,12 @@ def test_a_file_that_differs_from_the_logs_is_reported(elsewhere: Path, capsys: 
     file = write_tanks(elsewhere)
     file.write_text(file.read_text() + "# another\n")
     (note,) = as_json(capsys, "replay", "run.mcap", "--plant", "tanks.py:TANKS")["notes"]
-    assert note.startswith("tanks.py:TANKS is not the file of the log: its sha256 is ")
+    assert note.startswith("tanks.py:TANKS is not the file that the log names: its sha256 is ")
     file.write_text(file.read_text().replace("0.1 * lower", "0.1 * x[1]"))
     *_, note = as_json(capsys, "replay", "run.mcap", "--plant", "tanks.py:TANKS")["notes"]
-    assert note == "tanks.py:TANKS differs from the log in A; the log's numbers are used"
+    assert note == "tanks.py:TANKS differs from the log in A; the values of the log are used"
     assert main(["report", "run.mcap", "--plant", "tanks.py:TANKS"]) == 0
-    assert "is not the file of the log" in said(capsys)
+    assert "is not the file that the log names" in said(capsys)
 
 
 @pytest.mark.parametrize("command", ["replay", "report"])

@@ -174,7 +174,7 @@ def require_inputs(run: Run, plant: Description, period: float) -> None:
 
 
 def wild(tick: m.Tick, plant: Description, rng: np.random.Generator) -> m.Tick:
-    """The tick with a sample that is none, or that nobody expects."""
+    """Return the tick with an invalid or an unexpected sample."""
     state = tick.state
     if state is not None:
         far = (10.0 ** rng.uniform(-3, 9, plant.m)).tolist()

@@ -63,7 +63,7 @@ def test_a_controller_with_the_memory_of_another_process_fills_its_line_again(lo
     core, again = ControllerCore(tanks(), "controller-a"), ControllerCore(tanks(), "controller-b")
     core.memory.restore(lossy.keyframes[2])
     lasting = core.memory.lasting()
-    # What was written while nobody listened is not known.
+    # Inputs that were written while the controller was down are not known.
     assert not any(name.startswith("line.") for name in lasting)
     again.memory.go_on(lasting, "controller-a")
     assert again.memory.belongs()["dead time"] == "7.5 s"
@@ -78,7 +78,7 @@ def test_a_controller_with_the_memory_of_another_process_fills_its_line_again(lo
 
 
 def moved(known: Known, *more: str) -> Run:
-    """Of a linear plant that is its own truth, with late commands and lost samples."""
+    """Run a linear plant that is its own truth, with late commands and lost samples."""
     settings = [
         "rate=20",
         "controller.oracle=linear",

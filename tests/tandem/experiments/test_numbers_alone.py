@@ -1,5 +1,5 @@
-"""A plant of which the controller has matrices only, in lock-step: with equations, with matrices and with a wind as
-the truth."""
+"""A plant whose controller has matrices only, in lock-step. The truth is given by equations, by matrices or with a
+wind."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ def test_an_interrupted_experiment_continues(small: Path, tmp_path: Path) -> Non
     started.send_signal(signal.SIGINT)
     said, _ = started.communicate(timeout=120)
     assert started.returncode == 130, said
-    assert "goes on from there" in said
+    assert "continues from there" in said
     assert "Traceback" not in said
     kept = {path.name: path.stat().st_mtime_ns for path in runs.glob("*.json")}
     plans = [plan for plan in rows(cases(small)) if plan.case.group == "comparison"]

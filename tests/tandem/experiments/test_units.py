@@ -34,7 +34,7 @@ class Loop:
     h_hat: np.ndarray
     slack: np.ndarray
     said: list[tuple[object, ...]]
-    """Per tick: status, mode, iterations, the row with the slack, what became of hidden weights."""
+    """Per tick: status, mode, iterations, the row with the slack, and the verdict on hidden weights."""
 
 
 def run(plant: Plant, x: np.ndarray, u: np.ndarray, oracle: str, steps: int = STEPS) -> Loop:

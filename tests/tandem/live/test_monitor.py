@@ -46,7 +46,7 @@ def test_a_process_without_messages_is_shown_as_silent(monitor: Monitor):
     "bad",
     [
         Delivery(topics.PLANT_STATE.key(CONFIG.name), b"\xff", 0),
-        Delivery("tandem/jet1/nobody/knows", b"", 0),
+        Delivery("tandem/jet1/not/known", b"", 0),
         delivery(topics.PLANT_STATE, state(60, float("nan")), START + 2.5),
         delivery(topics.PLANT_STATE, state(3), START + 2.5),
     ],
@@ -102,16 +102,16 @@ def plant_row(now: Snapshot) -> tuple[str, str]:
 
 def test_a_plant_that_publishes_only_states_counts_as_running() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
-    assert plant_row(seen.snapshot(START)) == ("not heard of", "")
+    assert plant_row(seen.snapshot(START)) == ("no message", "")
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
-    assert plant_row(seen.snapshot(START + 1.0)) == ("running", "says only its states")
+    assert plant_row(seen.snapshot(START + 1.0)) == ("running", "publishes only states")
     assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "")
     # One that was chatty may be followed by one that is not.
     seen.feed(delivery(topics.HEALTH["plant"], health("plant", {}, "as usual"), START + 3.0))
     assert plant_row(seen.snapshot(START + 3.0)) == ("running", "as usual")
     assert plant_row(seen.snapshot(START + 6.0)) == ("silent", "as usual")
     seen.feed(delivery(topics.PLANT_STATE, state(99), START + 6.0))
-    assert plant_row(seen.snapshot(START + 6.0)) == ("running", "says only its states")
+    assert plant_row(seen.snapshot(START + 6.0)) == ("running", "publishes only states")
 
 
 def test_a_slow_plant_is_not_silent_between_two_samples() -> None:
@@ -129,7 +129,7 @@ def test_a_bad_message_is_reported_once() -> None:
     for _ in range(3):
         seen.feed(Delivery(topics.PLANT_STATE.key(CONFIG.name), msgspec.msgpack.encode(fields), 0))
     (event,) = seen.new_events()
-    assert event.text == "plant/state: malformed: Object missing required field `source`; not obeyed"
+    assert event.text == "plant/state: malformed: Object missing required field `source`; ignored"
     assert seen.bad.total == 3
 
 
@@ -143,6 +143,6 @@ def test_begin_and_end_of_manual_control_are_reported() -> None:
         # What is shown of the input is what acts.
         assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
     assert [event.text for event in now.events if "hand" in event.text] == [
-        "the plant is driven by hand",
-        "the plant is no longer driven by hand: plan",
+        "the plant is under manual control",
+        "the plant is no longer under manual control: plan",
     ]
