@@ -63,7 +63,7 @@ def prose(name: str, text: str) -> str:
 
 
 def long_lines(name: str, text: str) -> list[str]:
-    """The lines that are too long. Of Markdown tables and code blocks are left out, and what a link leads to."""
+    """Return the lines that are too long; Markdown tables, code blocks and targets of links are left out."""
     if name.endswith(".md"):
         text = re.sub(r"^( *)```.*?^\1```", "", text, flags=re.DOTALL | re.MULTILINE)
         text = re.sub(r"\]\([^)\s]*\)", "]", text)
