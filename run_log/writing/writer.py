@@ -49,7 +49,7 @@ from run_log.writing.user_budget import UserBudget
 
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 MAX_STRANGERS = 100
-"""Channels for keys that are in no topic table; whoever makes up more of them is not logged."""
+"""Largest number of channels for keys that are in no topic table. Messages of further keys are not logged."""
 
 
 class LogWriter:
@@ -119,7 +119,7 @@ class LogWriter:
         return self._views.lost
 
     def write(self, name: str, payload: bytes, log_time: int) -> None:
-        """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
+        """Log a message of the topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
 
         A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
         raises for bad input or a full disk: see `counters`, `bad` and `sink.error`.

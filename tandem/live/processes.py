@@ -66,7 +66,7 @@ class Child:
         """config: the TOML file it reads; folder: where its output goes; options: more of its command line."""
         self.process, self.name = process, process.name
         self.started_at = 0.0
-        """Of the newest start, seconds on the monotonic clock."""
+        """Time of the newest start, seconds on the monotonic clock."""
         self._output = folder / f"{process.name}.txt"
         self._command = [*command_line(process.command, config), *options]
         self._running: subprocess.Popen[bytes] | None = None

@@ -247,7 +247,7 @@ class Supervisor:
         return None
 
     def _what_a_plant_needs(self) -> tuple[str, str]:
-        """For whoever starts it elsewhere, or looks why nothing comes."""
+        """Return two lines for the person who starts the plant elsewhere: where it connects, and what it publishes."""
         plant, bus = self.monitor.plant, self.config.bus
         places = " or ".join(filter(None, (bus.endpoint, bus.remote)))
         states = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
