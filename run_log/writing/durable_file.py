@@ -25,7 +25,7 @@ class Sink:
         patient: False raises `LogError` when the file cannot be created; True goes on trying.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: not patient, and the file cannot be created.
     """
 

@@ -1,4 +1,4 @@
-"""The reference is made from the code, and has words for every key, field and option."""
+"""The reference is generated from the code and describes every key, field and option."""
 
 from __future__ import annotations
 
