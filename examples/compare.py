@@ -40,7 +40,7 @@ class Row:
 
     oracle: str
     J: list[float]
-    """Of each episode."""
+    """Closed-loop cost of each episode."""
     rest: np.ndarray
     """(d,) x - x_e at the end."""
     violations: int

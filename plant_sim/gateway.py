@@ -57,7 +57,7 @@ NOTES: dict[InputSource, str] = {
     "command": "",
     "plan": "no fresh command: following the backup policy, or the last plan",
     "safe": "no fresh command and nothing left to follow: safe input",
-    "manual": "driven by hand",
+    "manual": "under manual control",
 }
 BEFORE_COMMANDS = "safe input until the first command"
 

@@ -21,7 +21,7 @@ from protocol.messages import Override
 HandVerdict = Literal["ok", "out of order", "ended", "no model"]
 
 LEASE_OVER = "the lease is over"
-NO_LONGER = "no longer driven by hand: "
+NO_LONGER = "no longer under manual control: "
 """Start of the text in a gateway's health that gives the reason in `Hand.ended`."""
 
 

@@ -1,4 +1,4 @@
-"""What a log file looks like, for whoever writes or reads one: its format number, channels and metadata."""
+"""Format of a log file, for writing and reading: its number, channels and metadata."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROFILE = "tandem"
 VERSIONS = {1: "0.1.0", 2: "0.2.0", 3: "0.2.0"}
 """By format: the version of Tandem that brought it. A new line is due when an older reader would be misled."""
 FORMAT = max(VERSIONS)
-"""Of the logs that are written now: which channels, attachments and metadata there are."""
+"""Number of the format that is written: it determines channels, attachments and metadata."""
 READABLE = (2, 3)
 """Formats that this version reads. In format 2 a raw channel has a message's bytes without a wrapping."""
 LIBRARY = f"tandem log {FORMAT}; {LIBRARY_IDENTIFIER}"
@@ -49,17 +49,19 @@ def check_header(path: Path, header: Header) -> None:
     if header.profile != PROFILE:
         whose = f"profile {header.profile!r}" if header.profile else "no profile"
         raise LogError(
-            f"{path}: is an MCAP file with {whose}, written by {header.library!r}; not a log of Tandem"
+            f"{path}: is an MCAP file with {whose}, written by {header.library!r}, and not a log of Tandem"
         )
     found = re.match(r"tandem log (\d{1,9});", header.library)
     if found is None:
-        raise LogError(f"{path}: was written as {header.library!r}, which says no format of a log of Tandem")
+        raise LogError(
+            f"{path}: was written as {header.library!r}, which does not name a log format of Tandem"
+        )
     number = int(found[1])
     if number not in READABLE:
         way = (
             f"Tandem {VERSIONS[number]} reads it"
             if number in VERSIONS
-            else "it needs a newer Tandem: the version that wrote it, or a later one"
+            else "it needs the version of Tandem that wrote it, or a later one"
         )
         ours = ", ".join(map(str, READABLE))
-        raise LogError(f"{path}: is a log of format {number}, and this version reads formats {ours}; {way}")
+        raise LogError(f"{path}: has the log format {number}, and this version reads formats {ours}; {way}")

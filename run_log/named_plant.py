@@ -17,7 +17,7 @@ from run_log.run import Run, as_logged, equations_of, recorded_plant
 
 
 def name_plant(run: Run, reference: str) -> list[str]:
-    """Take it, and say where it is not what the log was made with.
+    """Use this plant for the run; return notes on its differences from the log.
 
     Args:
         run: a log; gets `named`.
@@ -31,7 +31,9 @@ def name_plant(run: Run, reference: str) -> list[str]:
     _require_names(run, reference, here)
     run.named = named
     if run.plant is not None and (other := _other(run.plant, here)):
-        notes.append(f"{reference} differs from the log in {', '.join(other)}; the log's numbers are used")
+        notes.append(
+            f"{reference} differs from the log in {', '.join(other)}; the values of the log are used"
+        )
     return notes
 
 
@@ -54,36 +56,36 @@ def _named(run: Run, reference: str) -> tuple[Known | Plant, list[str]]:
     whole = absolute(reference, Path.cwd())
     named = load_plant(whole) if is_reference(whole) else PLANTS.get(whole)
     if named is None:
-        raise ConfigError(
-            f"{reference}: no plant of that name comes with Tandem; a file is written tanks.py:TANKS"
-        )
+        raise ConfigError(f"{reference}: Tandem has no plant of that name; for a file, write tanks.py:TANKS")
     sha256 = sha256_of(whole)
     theirs = sorted(text for key, text in run.files.items() if key.startswith("plant."))
     if not theirs or sha256 is None or sha256 in theirs:
         return named, []
     logged = " and ".join(text[:12] for text in theirs)
-    return named, [f"{reference} is not the file of the log: its sha256 is {sha256[:12]}, the log's {logged}"]
+    note = f"{reference} is not the file that the log names: its sha256 is {sha256[:12]}, and the log has {logged}"
+    return named, [note]
 
 
 def _require_names(run: Run, reference: str, here: Known | Plant) -> None:
     if run.plant is not None and (run.plant.states, run.plant.inputs) != (here.states, here.inputs):
         names = (*run.plant.states, *run.plant.inputs)
         raise ConfigError(
-            f"{reference}: is about {', '.join((*here.states, *here.inputs))}, and the log about {', '.join(names)}"
+            f"{reference}: has the states and inputs {', '.join((*here.states, *here.inputs))}, and the log has "
+            f"{', '.join(names)}"
         )
 
 
 def given_plant(run: Run, config: Config, changed: set[str]) -> GivenPlant:
-    """What a replay controls: the log's numbers, and equations where somebody has named them or Tandem has them.
+    """Return the plant of a replay: the log's numbers, and equations if they are named or belong to Tandem.
 
     Args:
         run: a log.
-        config: of one of its controllers, with the changes of whoever replays.
-        changed: the keys of these changes. They may name code; what the log names is never loaded.
+        config: that of one of its controllers, with the changes of the replay.
+        changed: the keys of these changes. They may name code. Code that only the log names is never loaded.
 
     Raises:
         ConfigError: the plant does not fit the configuration.
-        LogError: the log does not say which plant it was, and nobody else does.
+        LogError: neither the log nor the changes say which plant it was.
     """
     if changed & {"plant", "plant.model"}:
         known = plant_of(config, get_plant)

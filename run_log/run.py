@@ -109,8 +109,8 @@ class Run:
     def controllers(self) -> list[str]:
         """Runs with ticks, in order, without strangers.
 
-        A stranger said nothing of itself (no info, health or keyframe), or has no tick that one of its own results is
-        of, by the checksum in the result. Where that is so of all, nobody is one.
+        A stranger sent no info, health or keyframe, or none of its results belongs to one of its ticks by the checksum
+        in the result. If that holds for every run, none counts as a stranger.
         """
         spoke = {x.run_id for x in (*self.run_infos, *self.health, *self.keyframes)}
         sums: dict[tuple[str, int], set[int]] = {}
@@ -142,18 +142,18 @@ def gather(config: Config, messages: Iterable[tuple[Topic, m.Message, int]], pat
 
 
 def recorded_plant(run: Run, config: Config) -> Known | Plant | None:
-    """Its numbers, or what somebody has named beside it; None: it is a plant that comes with Tandem, by its name.
+    """Return the plant's numbers in the log, or the plant file that the reader named; None for a plant of Tandem.
 
     config: the log's, or that of one of its controllers.
 
     Raises:
-        LogError: it is none of these.
+        LogError: the plant is not known.
     """
     known, model = run.plant or run.named, config.plant.model
     if known is None and is_reference(model):
         raise LogError(
-            f"{run.path}: its plant, {model}, is not in the log, and nothing is loaded because a log names it; if you "
-            "have that file, name it: --plant FILE:NAME"
+            f"{run.path}: its plant, {model}, is not in the log, and Tandem loads no file because a log names it; "
+            "if you have that file, add --plant FILE:NAME"
         )
     return known
 
@@ -171,27 +171,27 @@ def as_logged(run: Run, config: Config, changed: Collection[str] = ()) -> Config
 
 
 def plant_of(run: Run) -> Known | Plant:
-    """The plant that the run is about, as its log says; of a log that does not say it, the one of that name here.
+    """Return the plant of the run from its log; if the log does not contain it, Tandem's plant of that name.
 
-    Nothing is loaded that a log names.
+    No file is loaded because a log names it.
 
     Raises:
-        LogError: the log does not carry its plant, and this Tandem does not have it or cannot use it.
+        LogError: the log does not contain its plant, and this Tandem does not have it or cannot use it.
     """
     known = recorded_plant(run, run.config)
     try:
         return node_runtime.config.plant.plant_of(as_logged(run, run.config), get_plant, known)
     except ConfigError as error:
-        end = "" if known is not None else " The log needs the plant that it was made with."
+        end = "" if known is not None else " The log needs the plant with which it was recorded."
         raise LogError(f"{run.path}: {error}{end}") from error
 
 
 def equations_of(run: Run, config: Config) -> Plant | None:
-    """Those that its plant was linearised from: of a plant that comes with Tandem, or that somebody has named.
+    """Return the equations from which the plant was linearised, if Tandem or the named plant file has them.
 
     Args:
         run: a log.
-        config: how they are configured.
+        config: the configuration for them.
 
     Raises:
         ConfigError: they do not fit the configuration.
@@ -204,7 +204,7 @@ def equations_of(run: Run, config: Config) -> Plant | None:
 
 
 def true_plant_of(run: Run) -> Known | Plant | TrueMotion | None:
-    """The plant as it really moved: `equations_of` with `plant.truth`; None where that cannot be known from here.
+    """Return the true plant: `equations_of` with `plant.truth`; None if it is not known here.
 
     Raises:
         LogError: the plant has no such parameters.

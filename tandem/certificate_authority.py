@@ -72,11 +72,11 @@ def create(plant: str, hosts: Sequence[str], folder: Path, days: int) -> list[Is
     """Create an authority for one plant and a certificate for every role, in `folder`, which must not exist yet."""
     if folder.exists() or folder.is_symlink():
         raise Refused(
-            f"{folder}: exists already, and keys never overwrite anything. `tandem keys renew --role ROLE` makes one "
-            "certificate anew; another --out makes another authority, whose certificates do not fit the former's"
+            f"{folder}: exists already, and keys are never overwritten. `tandem keys renew --role ROLE` renews one "
+            "certificate; with another --out a new authority is created, and the old certificates do not fit it"
         )
     if not 1 <= days < AUTHORITY_DAYS:
-        raise Refused(f"--days {days}: at least 1 and below the authority's {AUTHORITY_DAYS}")
+        raise Refused(f"--days {days}: choose at least 1 and less than the authority's {AUTHORITY_DAYS}")
     names = _host_names([*ALWAYS, *hosts])
     key = ec.generate_private_key(ec.SECP256R1())
     authority = _authority(plant, key)
@@ -107,21 +107,23 @@ def renew(
         key = serialization.load_pem_private_key(read_bytes(place / KEY), password=None)
     except (ConfigError, ValueError, TypeError) as error:
         raise Refused(
-            f"{error}. A certificate is renewed with the authority's key: if it lies elsewhere, --authority FOLDER"
+            f"{error}. The authority's key is needed to renew a certificate; if it is elsewhere, add --authority FOLDER"
         ) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != authority.public_key():
-        raise Refused(f"{place / KEY}: is not the key of {CERTIFICATE} beside it")
+        raise Refused(f"{place / KEY}: is not the key of {CERTIFICATE} in the same folder")
     _, plant = _role_and_plant(authority)
     old = _issued(folder / role)
     if old is None and not any(one.plant == plant for one in found(folder)):
-        raise Refused(f"{folder}: has no certificate of {plant}; is it the plant's folder of keys?")
+        raise Refused(f"{folder}: contains no certificate of {plant}; name the folder with the plant's keys")
     if old is not None and plant != old.plant:
-        raise Refused(f"{place}: is the authority of {plant}, and {folder / role} is of {old.plant}")
+        raise Refused(f"{place}: is the authority of {plant}, and {folder / role} belongs to {old.plant}")
     left = (authority.not_valid_after_utc - datetime.now(UTC)).days
     if not 1 <= days < left:
-        raise Refused(f"--days {days}: at least 1, and less than the {left} that the authority has left")
+        raise Refused(
+            f"--days {days}: choose at least 1 and less than {left}, the days until the authority expires"
+        )
     if hosts and role != "router":
-        raise Refused(f"--host: only the router's certificate names hosts, not the {role}'s")
+        raise Refused(f"--host: only the router's certificate contains host names, not the {role}'s")
     names = _host_names([*(ALWAYS if old is None else old.hosts), *hosts]) if role == "router" else []
     with _refused_where_it_cannot_write(folder):
         (folder / role).mkdir(mode=0o700, exist_ok=True)
@@ -134,11 +136,11 @@ def renew(
 def found(folder: Path) -> list[Issued]:
     """Load all certificates of a folder, of a plant's folder, or of several plants'."""
     if not folder.is_dir():
-        raise Refused(f"{folder}: no such folder; `tandem keys create --plant NAME` makes one")
+        raise Refused(f"{folder}: no such folder; `tandem keys create --plant NAME` creates one")
     places = sorted(path.parent for depth in ("", "*/", "*/*/") for path in folder.glob(depth + CERTIFICATE))
     all_of_them = [issued for place in places if (issued := _issued(place)) is not None]
     if not all_of_them:
-        raise Refused(f"{folder}: no {CERTIFICATE} in it, or in a folder of it")
+        raise Refused(f"{folder}: neither this folder nor a folder in it contains a {CERTIFICATE}")
     order = {role: i for i, role in enumerate((AUTHORITY_FOLDER, *ROLES))}
     return sorted(all_of_them, key=lambda one: (one.plant, order.get(one.role, len(order))))
 
@@ -175,7 +177,9 @@ def _host_names(hosts: Sequence[str]) -> list[x509.GeneralName]:
             address = ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
         except ValueError:
             if not host.isascii() or not host or any(sign in host for sign in "/: "):
-                raise Refused(f"--host {host}: neither a name nor an address; no port, no protocol") from None
+                raise Refused(
+                    f"--host {host}: not a host name or an address; omit port and protocol"
+                ) from None
             names[host.lower()] = x509.DNSName(host.lower())
         else:
             names[str(address)] = x509.IPAddress(address)

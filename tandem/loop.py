@@ -129,8 +129,8 @@ class Loop:
         state, d = np.array(x, dtype=float), self.plant.d
         if state.shape != (d,) or not np.isfinite(state).all():
             raise ValueError(
-                f"x = {np.array2string(state, threshold=20)} is no state of {self.plant.name}: {d} finite numbers "
-                f"({', '.join(self.plant.states)})"
+                f"x = {np.array2string(state, threshold=20)} is not a state of {self.plant.name}: give {d} "
+                f"finite numbers ({', '.join(self.plant.states)})"
             )
         return self._step(state).u
 
@@ -156,8 +156,8 @@ class Loop:
             given = np.array(u, dtype=float)
         if given.shape != (plant.m,) or not np.isfinite(given).all():
             raise ValueError(
-                f"u = {np.array2string(given, threshold=20)} is no input of {plant.name}: {plant.m} finite numbers "
-                f"({', '.join(plant.inputs)})"
+                f"u = {np.array2string(given, threshold=20)} is not an input of {plant.name}: give {plant.m} "
+                f"finite numbers ({', '.join(plant.inputs)})"
             )
         self._lockstep.manual(given)
 
@@ -211,7 +211,7 @@ class Loop:
     def run(self, steps: int) -> Result:
         """Run so many more periods, or fewer if the plant is lost; return the result of all periods so far."""
         if steps < 1:
-            raise ValueError(f"steps = {steps}: at least 1")
+            raise ValueError(f"steps = {steps}: must be at least 1")
         with one_blas_thread():
             try:
                 for _ in range(steps):

@@ -14,12 +14,12 @@ from node_runtime.printable import printable
 from tandem.terminal import Refused
 
 DIGITS = 12
-"""Of a matrix: more than any log determines, and enough for a horizon."""
+"""Significant digits of a matrix entry: more than any log determines, and enough for a horizon."""
 COMMENTS = {
     "A": "x+ = A x + B u in deviations from (x_e, u_e)",
     "offset": "x+ - x at (x_e, u_e): Tandem takes the nearest point of rest for (x_e, u_e)",
-    "W": "half-widths of what A and B leave out, per second",
-    "period": "s: A and B hold at this rate only",
+    "W": "half-widths of the error of A and B, per second",
+    "period": "s: A and B are valid at this rate only",
     "dead_time": "s, from when an input is written until the plant begins to answer: A and B are what follows then",
 }
 """Comment of a field, on the line before it."""
@@ -28,9 +28,9 @@ COMMENTS = {
 def require_new(file: Path) -> None:
     """Raise `Refused` if a plant file cannot be written there."""
     if file.suffix != ".py":
-        raise Refused(f"{file}: the name of a plant file ends in .py")
+        raise Refused(f"{file}: the name of a plant file must end in .py")
     if os.path.lexists(file):
-        raise Refused(f"{file}: exists already, and is not overwritten; choose another name")
+        raise Refused(f"{file}: exists already and is not overwritten; choose another name")
     if not file.absolute().parent.is_dir():
         raise Refused(f"{file}: there is no folder {file.absolute().parent}")
 

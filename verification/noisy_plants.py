@@ -48,7 +48,7 @@ class Noisy(NamedTuple):
     """A shipped configuration, or a file."""
     settings: list[str]
     steps: int = 200
-    """Of an episode."""
+    """Number of steps in an episode."""
 
 
 PLANTS = {

@@ -89,7 +89,7 @@ class Memory(msgspec.Struct, frozen=True):
 
 
 class Lateness(msgspec.Struct, frozen=True):
-    """Of the control loop."""
+    """Late ticks of the control loop."""
 
     ticks: int
     late: int

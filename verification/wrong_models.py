@@ -46,7 +46,7 @@ class Wrong:
     """A shipped configuration, or a file."""
     settings: list[str]
     steps: int = 200
-    """Of an episode."""
+    """Number of steps in an episode."""
     second: float = 1.0
     """Seconds of one unit of the horizon: slow plants need minutes."""
 

@@ -142,7 +142,7 @@ class Row:
     waits: float = 0.0
     """Age of the oldest waiting sample at the end, in seconds."""
     cpu: float = 0.0
-    """Of the trainer, cores."""
+    """Processor time of the trainer, in cores."""
 
 
 def main() -> int:

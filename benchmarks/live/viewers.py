@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -82,34 +83,36 @@ def _alternate(settings: Viewers, log: Path) -> Iterator[tuple[bool, float, floa
     there = [f"bus.endpoint={endpoint}", f"live.port={port}", f"rate={settings.rate:g}", *settings.set]
     options = [word for one in there for word in ("--set", one)]
     arguments = ["--seconds", "100000", "--log", str(log), *options]
-    run = _tandem("run", *arguments)
-    try:
+    with _tandem("run", *arguments) as run:
         assert run.stdout is not None
         while b"the first command" not in (line := run.stdout.readline()):
             if not line:
                 raise RuntimeError("the run ended before its first command")
         for turn in range(2 * settings.turns):
             viewed = turn % 2 == 1
-            live = _tandem("live", *options) if viewed else None
-            if live is not None:
-                _await_port(port)
-            time.sleep(SETTLE_S)
-            begin = time.time()
-            if live is not None:
-                asyncio.run(_look(port, settings))
-                live.terminate()
-                live.wait()
-            else:
-                time.sleep(settings.seconds)
-            yield viewed, begin, time.time()
-    finally:
-        run.terminate()
-        run.wait()
+            with _tandem("live", *options) if viewed else nullcontext():
+                if viewed:
+                    _await_port(port)
+                time.sleep(SETTLE_S)
+                begin = time.time()
+                if viewed:
+                    asyncio.run(_look(port, settings))
+                else:
+                    time.sleep(settings.seconds)
+                end = time.time()
+            yield viewed, begin, end
 
 
-def _tandem(*arguments: str) -> subprocess.Popen[bytes]:
+@contextmanager
+def _tandem(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a tandem command until the block ends."""
     command = [sys.executable, "-P", "-m", "tandem", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def _await_port(port: int) -> None:

@@ -108,7 +108,7 @@ def _section(words: tuple[str, ...], read: Help) -> str:
         rows = [_row(name, meaning) for name, meaning in read.options if not name.startswith(COMMON)]
         arguments = [name for name, _ in read.options if not name.startswith("-")]
         lines += [f"```text\n{' '.join([name, *arguments, '[OPTIONS]'])}\n```\n"]
-        lines += [table(["argument", "default", "meaning"], rows)]
+        lines += [table(["argument", "meaning", "default"], rows)]
     return "\n".join(lines)
 
 
@@ -116,4 +116,4 @@ def _row(name: str, meaning: str) -> list[str]:
     """Return the cells of one argument: a default stands in brackets at the end of its meaning."""
     found = re.fullmatch(r"(?P<text>.*?) ?\((?P<default>default: .*|required|repeatable)\)", meaning)
     text, default = (found["text"], found["default"].removeprefix("default: ")) if found else (meaning, "")
-    return [f"`{cell(name)}`", cell("off" if default == "False" else default), cell(text)]
+    return [cell(f"`{name}`"), cell(text), cell("off" if default == "False" else default)]

@@ -88,11 +88,10 @@ def _section(name: str, cls: type[Section]) -> str:
     for field in keys(cls):
         kind = inspect.type_info(field.type)
         text = docs.get(field.name, "")
-        rows.append(
-            [f"`{field.name}`", cell(words_of_type(kind)), cell(_default(field)), unit_of(kind), cell(text)]
-        )
+        cells = [cell(text), cell(_default(field)), unit_of(kind), cell(words_of_type(kind))]
+        rows.append([f"`{field.name}`", *cells])
     title = f"[{name}]" if name else "Top level"
-    parts = [f"## {title}", own_doc(cls), table(["key", "type", "default", "unit", "meaning"], rows)]
+    parts = [f"## {title}", own_doc(cls), table(["key", "meaning", "default", "unit", "type"], rows)]
     if name == "trainer":
         parts += [f"One entry of `fleet`: {own_doc(PlantPlace)}", _entry(PlantPlace)]
     return "\n\n".join(part.strip() for part in parts if part) + "\n"

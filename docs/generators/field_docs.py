@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import html
 import inspect
 import re
 import textwrap
@@ -35,8 +36,15 @@ def own_doc(cls: type) -> str:
 
 
 def cell(text: str) -> str:
-    """Return text as one cell of a Markdown table."""
-    return re.sub(r"\s+", " ", text).strip().replace("|", r"\|")
+    """Return text as one cell of a Markdown table; code with a bar in it becomes HTML, as Markdown cannot escape it."""
+    parts = re.split(r"(`[^`]*`)", re.sub(r"\s+", " ", text).strip())
+    return "".join(_code(part) if part.startswith("`") else part.replace("|", "&#124;") for part in parts)
+
+
+def _code(span: str) -> str:
+    if "|" not in span:
+        return span
+    return f"<code>{html.escape(span.strip('`')).replace('|', '&#124;')}</code>"
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:

@@ -51,31 +51,20 @@ def _topics() -> str:
             [
                 f"`{topic.name}`",
                 f"[{topic.type.__name__}](#{topic.type.__name__.lower()})",
-                topic.writer,
-                ", ".join(readers),
+                " → ".join([topic.writer, *([", ".join(readers)] if readers else [])]),
                 topic.lane,
-                f"{topic.max_bytes:,}",
-                _rate(topic.max_hz),
-                _rate(topic.view_hz),
+                _size(topic.max_bytes),
+                _limits(topic),
             ]
         )
-    head = [
-        "topic",
-        "message",
-        "written by",
-        "read by",
-        "lane",
-        "bytes at most",
-        "messages a second",
-        "views a second",
-    ]
+    head = ["topic", "message", "from → to", "lane", "largest", "limits"]
     above = f"{topics.BATCH_ABOVE_HZ:g}"
     return table(head, rows) + (
-        "\n- **read by** leaves out the roles that read everything.\n"
+        "\n- **to** leaves out the roles that read everything.\n"
         "- **lane**: `control` is sent at once and dropped rather than queued. `bulk` blocks, on a session and a "
         "thread of its own.\n"
-        "- **messages a second**: a faster loop publishes every n-th message only. An empty cell is no limit.\n"
-        "- **views a second**: how many messages get a view in the log. The log holds the bytes of all.\n"
+        "- **limits**: a faster loop publishes every n-th message only, or the log has views of fewer messages. "
+        "The log holds the bytes of all.\n"
         f"- Above {above} Hz a loop sends what is only logged as a [Batch](#batch).\n"
     )
 
@@ -88,13 +77,19 @@ def _roles() -> str:
         rows.append(
             [
                 role,
-                _names(topic.name for topic in rights.publishes),
+                _names(_published(role)),
                 reads,
                 _names(rights.asks),
                 _names(rights.answers),
             ]
         )
     return table(["role", "publishes", "reads", "asks", "answers"], rows)
+
+
+def _published(role: str) -> list[str]:
+    """Return the keys that a role publishes at, below the plant's; without those for a fast loop's direct messages."""
+    keys = [key.removeprefix(topics.below("-", "")) for key in rights_of(role).publish_keys("-")]
+    return [key for key in keys if not key.startswith(topics.DIRECT)]
 
 
 def _message(cls: type[msgspec.Struct]) -> str:
@@ -113,5 +108,10 @@ def _names(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _rate(hz: float) -> str:
-    return "" if math.isinf(hz) else f"{hz:g}"
+def _size(most: int) -> str:
+    return f"{most // 2**20} MiB" if most >= 2**20 else f"{most // 2**10} KiB"
+
+
+def _limits(topic: topics.Topic) -> str:
+    said = [(topic.max_hz, "messages"), (topic.view_hz, "views")]
+    return ", ".join(f"{hz:g} {what}/s" for hz, what in said if not math.isinf(hz))

@@ -112,7 +112,7 @@ class Scan:
                 case Opcode.ATTACHMENT:
                     expected = int.from_bytes(body[-4:], "little")
                     if expected not in (0, zlib.crc32(body[:-4])):
-                        raise ValueError("its checksum does not fit")
+                        raise ValueError("its checksum is wrong")
                     return [Attachment.read(data)]
                 case Opcode.CHUNK:
                     return self._chunk(Chunk.read(data))
@@ -120,27 +120,27 @@ class Scan:
                     return []
         except UNREADABLE as error:
             name = Opcode(opcode).name.lower()
-            self._damaged(position, f"a record ({name}) does not fit its checksum or cannot be read: {error}")
+            self._damaged(position, f"a record ({name}) has a wrong checksum or cannot be read: {error}")
             return []
 
     def _chunk(self, chunk: Chunk) -> list[Record]:
         size = chunk.uncompressed_size
         if chunk.compression not in ("", "zstd"):
-            raise ValueError(f"its compression {chunk.compression!r} is none that a log of Tandem has")
+            raise ValueError(f"its compression {chunk.compression!r} is not used in logs of Tandem")
         packed = chunk.compression == "zstd"
         if (zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)) != size:
-            raise ValueError("its size is not the size it says")
+            raise ValueError("its size differs from the stated size")
         self.unpacked += size
         if self.unpacked > max(UNPACKED_TIMES * self.size, UNPACKED_ALWAYS):
             raise LogError(
-                f"{self.path}: {self.size} bytes that unpack to more than {self.unpacked - 1}: not read, since no log "
-                f"of Tandem unpacks to {UNPACKED_TIMES} times its size, and this one would take the memory"
+                f"{self.path}: {self.size} bytes that unpack to more than {self.unpacked - 1}: not read, because no "
+                f"log of Tandem unpacks to {UNPACKED_TIMES} times its size, and this one would fill the memory"
             )
         return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, Record)]
 
     def _check_data_end(self, position: int, body: bytes, checksum: int) -> None:
         if len(body) != 4 or int.from_bytes(body, "little") not in (0, checksum):
-            self._damaged(position, "the checksum over all data does not fit")
+            self._damaged(position, "the checksum over all data is wrong")
 
     def _summary(self, stream: IO[bytes], start: int) -> Iterator[Record]:
         """Read the schemas and channels again: a damaged chunk may have held their first occurrence."""
@@ -156,7 +156,7 @@ class Scan:
             return
         checksum = FOOTER.unpack(footer)[-1] if marked else -1
         if not whole or checksum not in (0, zlib.crc32(summary[:-4])):
-            self._damaged(start, "the checksum over the index at its end does not fit")
+            self._damaged(start, "the checksum over the index at its end is wrong")
             return
         position = 0
         while position + PREFIX.size < len(summary):
@@ -178,6 +178,6 @@ class Scan:
         if not self.keep_going:
             raise LogError(
                 f"{self.path}: damaged or edited {text}. "
-                f"`tandem recover {self.path}` makes a new file of what is still good."
+                f"`tandem recover {self.path}` writes the intact messages to a new file."
             )
         self.damage.append(text)

@@ -48,15 +48,15 @@ def read_run(path: str | Path) -> Run:
             case Message() if record.channel_id in names:
                 _take(run, *names[record.channel_id], record)
     if header is None:
-        raise LogError(f"{path}: ends before anything was written to it; there is nothing to recover")
+        raise LogError(f"{path}: contains no message; there is nothing to recover")
     if scan.cut_at is not None:
         run.truncated = True
         run.note = (
-            f"{path} was cut short at byte {scan.cut_at} of {scan.size}; all before that is read. "
-            f"`tandem recover {path}` makes a whole file of it."
+            f"{path} was cut short at byte {scan.cut_at} of {scan.size}; all messages before that are read. "
+            f"`tandem recover {path}` makes a complete file of it."
         )
     elif run.continued is not None:
-        run.note = f"{path} is part {run.part} of its log, which goes on in {run.continued}."
+        run.note = f"{path} is part {run.part} of its log, which continues in {run.continued}."
     interpret(run)
     return run
 
@@ -117,8 +117,8 @@ def _config(path: Path, run: Run) -> Config:
         [info.config for info in run.run_infos] if attached is None else [attached.decode(errors="replace")]
     )
     if not texts:
-        raise LogError(f"{path}: holds no configuration, so nothing in it can be interpreted")
+        raise LogError(f"{path}: contains no configuration, so its messages cannot be interpreted")
     try:
         return from_json(texts[0])
     except ConfigError as error:
-        raise LogError(f"{path}: {error}; the log was made by another version of Tandem") from error
+        raise LogError(f"{path}: {error}; another version of Tandem wrote the log") from error

@@ -63,7 +63,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
                 stamps.append((record.channel_id, record.log_time))
     times = [time for i, time in stamps if i in channels and channels[i].topic.startswith(RAW)]
     if header is None or (not times and not attachments):
-        raise LogError(f"{path}: ends before anything was written to it; there is nothing to recover")
+        raise LogError(f"{path}: contains no message; there is nothing to recover")
     whole = probe.cut_at is None and not probe.damage
     if not whole:
         _copy(probe, out, header, schemas, channels)
@@ -118,4 +118,4 @@ def _copy(
                 sink.flush()
     writer.finish()
     if not sink.close():
-        raise LogError(f"{sink.error}; {out} is not whole")
+        raise LogError(f"{sink.error}; {out} is incomplete")

@@ -44,13 +44,13 @@ def observed(run: Run, model: Model) -> Observed:
         if not controllers or entry.message.run_id in controllers:
             found |= {(entry.message.run_id, sample.seq): sample for sample in entry.message.samples}
     if not found:
-        raise LogError(f"{run.path}: holds no samples{run.unreadable}")
+        raise LogError(f"{run.path}: contains no samples{run.unreadable}")
     order = sorted(found, key=lambda key: (controllers.index(key[0]) if controllers else 0, key[1]))
     samples = [found[key] for key in order]
     sizes = {(len(sample.x), len(sample.u), len(sample.h)) for sample in samples}
     if sizes != {(plant.d, plant.m, plant.d)}:
         raise LogError(
-            f"{run.path}: its samples are not those of a plant with the states {', '.join(plant.states)} and the "
+            f"{run.path}: its samples do not fit a plant with the states {', '.join(plant.states)} and the "
             f"inputs {', '.join(plant.inputs)}"
         )
     x, u, h = (np.array([getattr(sample, name) for sample in samples]) for name in ("x", "u", "h"))

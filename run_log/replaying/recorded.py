@@ -58,7 +58,7 @@ def _recorded(run: Run, run_id: str) -> RecordedController:
     try:
         config = from_json(infos[0].config) if infos else run.config
     except ConfigError as error:
-        raise LogError(f"{run.path}: {error}; the log was made by another version of Tandem") from error
+        raise LogError(f"{run.path}: {error}; another version of Tandem wrote the log") from error
     said = [health.status for health in run.health if health.run_id == run_id]
     return RecordedController(
         run_id=run_id,
@@ -83,8 +83,8 @@ def _by_tick(run: Run, run_id: str, topic: Topic) -> dict[int, Entry[Any]]:
         seq = entry.message.seq
         if entry.message.run_id == run_id and found.setdefault(seq, entry).payload != entry.payload:
             raise LogError(
-                f"{run.path}: {topic.name} of tick {seq} is there twice, and different; "
-                f"another process spoke as {run_id}, or the log was edited"
+                f"{run.path}: {topic.name} of tick {seq} is in the log twice with different content; "
+                f"another process used the name {run_id}, or the log was edited"
             )
     return found
 

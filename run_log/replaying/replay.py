@@ -83,7 +83,7 @@ def replay(
     recorded = recorded_controllers(run)
     if not recorded:
         raise LogError(
-            f"{run.path}: holds no tick of a controller; there is nothing to replay{run.unreadable}"
+            f"{run.path}: contains no tick of a controller; there is nothing to replay{run.unreadable}"
         )
     if from_tick is not None:
         inside = [r for r in recorded if 0 <= from_tick <= r.last]
@@ -146,7 +146,7 @@ def _core(
     except ConfigError as error:
         if overrides:
             raise ConfigError(f"{error}{hint}") from error
-        raise LogError(f"{run.path}: its configuration admits no controller: {error}{hint}") from error
+        raise LogError(f"{run.path}: its configuration does not give a controller: {error}{hint}") from error
 
 
 def _know_architecture(
@@ -164,13 +164,13 @@ def _know_architecture(
             "would have done"
         )
     elif own is not None:
-        # Under the name that it has in the log, so that a file of which a comment has changed replays to the byte.
+        # Under its name in the log, so that a file with a changed comment replays byte for byte.
         recorded_name = recorded.architecture if is_reference(recorded.architecture) else own.name
         register(reference, recorded_name, own.architecture)
     elif is_reference(reference):
         name = (recorded.architecture or Path(reference).name).partition("@")[0]
         raise LogError(
-            f"{run.path}: its network is {name}, and no file is loaded because a log names it: add --architecture "
+            f"{run.path}: its network is {name}, and Tandem loads no file because a log names it: add --architecture "
             f"{name}, with the path to it"
         )
 
@@ -179,7 +179,9 @@ def _other_text(run: Run, recorded: list[RecordedController], own: OwnArchitectu
     then = {r.architecture for r in recorded if r.architecture}
     if own is None or then <= {own.name}:
         return []
-    return [f"recorded with {', '.join(sorted(then))}, replayed with {own.name}: the file's text is another"]
+    return [
+        f"recorded with {', '.join(sorted(then))}, replayed with {own.name}: the content of the file differs"
+    ]
 
 
 def _replay_tick(
@@ -219,12 +221,12 @@ def _restore(
     except ValueError as error:
         if start == -1 and not entry.message.resumed:
             return  # a difference, and already noted; a changed configuration begins with its own memory
-        hint = "; from the first tick on, the changed configuration begins with a memory of its own"
+        hint = "; from the first tick on, the changed configuration starts with a new memory"
         raise LogError(f"{run.path}: {error}{hint if core.config != recorded.config else ''}") from error
 
 
 def _sets_for(run: Run, recorded: RecordedController, config: Config) -> CertifiedSets | None:
-    """The certified sets that were in force; None: there were none, or others are asked for now."""
+    """Return the certified sets in use; None: there were none, or the changed configuration names others."""
     then = recorded.config.controller
     if config.controller.tightening != "invariant" or config.controller.sets != then.sets:
         return None
@@ -243,21 +245,19 @@ def _notes(run: Run, recorded: list[RecordedController], overrides: Sequence[str
     strangers = {tick.run_id for tick in run.ticks} - set(run.controllers)
     if strangers:
         notes.append(
-            "not replayed, since it never said what it is, or its results are not of its ticks: "
+            "not replayed, because it did not identify itself or its results do not belong to its ticks: "
             f"{', '.join(sorted(strangers))}"
         )
     for r in recorded:
         if -1 in r.keyframes and (before := r.keyframes[-1].message.resumed):
-            notes.append(f"{r.run_id}: goes on from the memory of {before}, out of a checkpoint")
+            notes.append(f"{r.run_id}: continues from the memory of {before}, read from a checkpoint")
         if run.plant is not None and r.known and r.known != sha256_of_known(run.plant):
             notes.append(
-                f"{r.run_id}: knew another plant than the recorder, whose numbers these are: its file changed between "
-                "the starts"
+                f"{r.run_id}: had another plant than the recorder, and the recorder's is used here: "
+                "the plant file changed between the starts"
             )
         if not r.complete:
-            notes.append(
-                f"{r.run_id}: the log does not hold the run to its end; replayed up to tick {r.last}"
-            )
+            notes.append(f"{r.run_id}: the log ends before the run does; replayed up to tick {r.last}")
     return notes
 
 
@@ -282,10 +282,11 @@ def _foreign(
 def _where(differs: list[str], unsaid: list[str], equal: bool) -> list[str]:
     notes = []
     if differs:
-        end = "equal all the same" if equal else f"equal to about {ROUNDING:g} at best, not to the byte"
+        end = "still equal" if equal else f"equal to about {ROUNDING:g} at best, not to the byte"
         notes.append(f"recorded with {', '.join(differs)}: {end}")
     if unsaid and not equal:
         notes.append(
-            f"the log does not say its {', '.join(unsaid)}: whether it was recorded here cannot be known from it"
+            f"the log does not contain its {', '.join(unsaid)}, so it is not known whether it was "
+            "recorded on this machine"
         )
     return notes

@@ -43,9 +43,9 @@ def replayable(run: Run, recorded: RecordedController, from_tick: int | None) ->
         begin = min(later, default=last)
         segments.lost += begin - gap + 1
         way = (
-            f"replay goes on at tick {begin + 1}, behind the next keyframe"
+            f"replay continues at tick {begin + 1}, after the next keyframe"
             if later
-            else "there is no keyframe behind it to go on from"
+            else "there is no later keyframe to continue from"
         )
         segments.notes.append(
             f"gap of {length} tick{'s' * (length > 1)} at tick {gap} of {recorded.run_id}: the recorder lost them; "
@@ -67,7 +67,7 @@ def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Seg
     # Those with their next tick first: a recorder that comes late is sent some of ticks that it never heard.
     later = min((seq for seq in inside if seq + 1 in recorded.ticks), default=min(inside, default=None))
     missing = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log"
-    unknown = f"{missing}: the controller's memory is not known there"
+    unknown = f"{missing}: the controller's memory at that tick is not known"
     if from_tick is not None:
         way = "" if later is None else f"; the first one is after tick {later}: use --from-tick {later + 1}"
         raise LogError(f"{run.path}: {unknown}{way}{run.unreadable}")
@@ -95,7 +95,7 @@ def _note_uncompared(run: Run, recorded: RecordedController, segments: Segments)
         if absent:
             more = f" and {len(absent) - NAMED} more" if len(absent) > NAMED else ""
             segments.notes.append(
-                f"not compared, the recorder lost them: {name} of tick {', '.join(map(str, absent[:NAMED]))}{more} "
-                f"of {recorded.run_id}{run.unreadable}"
+                f"not compared because the recorder lost them: {name} of tick "
+                f"{', '.join(map(str, absent[:NAMED]))}{more} of {recorded.run_id}{run.unreadable}"
             )
     segments.lost += len(uncompared)

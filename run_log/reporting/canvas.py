@@ -109,7 +109,7 @@ def save(make: Callable[[], Figure], path: Path, dpi: int | None = None) -> Path
         known = figure.canvas.get_supported_filetypes()
         if ending not in known:
             raise PictureError(
-                f"{path}: no picture has that ending; name it .png, or one of {', '.join(sorted(known))}"
+                f"{path}: not a picture format; use .png, or one of {', '.join(sorted(known))}"
             )
         buffer = io.BytesIO()
         figure.savefig(buffer, format=ending, dpi=dpi or "figure")

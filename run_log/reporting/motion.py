@@ -39,8 +39,7 @@ class Trajectory(msgspec.Struct, frozen=True):
     by_hand: tuple[tuple[float, float], ...] = ()
     """(from, to) in seconds since the start: intervals of manual control; none in a part."""
     goal: np.ndarray | None = None
-    """(n, d) where the states should be, plant units, where somebody gave another reference than the configured one;
-    None: nobody did."""
+    """(n, d) target of the states, plant units, if a reference other than the configured one was given; else None."""
 
     def part(self, first: int, last: int) -> Trajectory:
         """Return the motion of the samples `first` to `last`, the last one included, as a trajectory of its own."""
@@ -71,7 +70,7 @@ def trajectory(run: Run, plant: Description) -> Trajectory:
     states = [s for s in run.plant_states if len(s.x) == plant.d and (s.run_id in followed or not followed)]
     if not states:
         raise LogError(
-            f"{run.path}: holds no state of a plant with {plant.d} states ({', '.join(plant.states)})"
+            f"{run.path}: contains no state of a plant with {plant.d} states ({', '.join(plant.states)})"
         )
     by_plant: dict[str, list[PlantState]] = {}
     for s in states:

@@ -113,7 +113,7 @@ def _bounded(ax: Axes, low: float, high: float, values: np.ndarray, aims: np.nda
 def _mark_by_hand(data: Traces, ax: Axes) -> None:
     """Mark the intervals of manual control."""
     for i, (began, ended) in enumerate(data.motion.by_hand):
-        label = "by hand" if i == 0 else "_nolegend_"
+        label = "manual" if i == 0 else "_nolegend_"
         ax.axvspan(began, ended, color=GREEN, alpha=0.12, linewidth=0, label=label)
 
 
@@ -182,7 +182,7 @@ def _weight(data: Traces, i: int, ax: Axes) -> None:
     ax.step(data.t, data.weight[:, i], where="post", color=VERMILION, linestyle="--", label="of the network")
     ax.step(data.t, data.constant_weight[:, i], where="post", color=BLUE, label="of a constant")
     ax.set_ylim(-0.05, 1.05)
-    ax.set_ylabel(f"what counts in ĥ\nof {words(data.plant.states[i])}")
+    ax.set_ylabel(f"weights in ĥ\nof {words(data.plant.states[i])}")
 
 
 def _error(data: Traces, ax: Axes) -> None:

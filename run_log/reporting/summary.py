@@ -126,7 +126,7 @@ def _sensor_faults(period: float, ticks: list[m.Tick], results: list[m.TickResul
     for result in results:
         t = when.get((result.run_id, result.seq), result.seq * period)
         for name in now.keys() - result.sensor_faults.keys():
-            told.append(f"{now.pop(name)}; believed again from {t:.1f} s")
+            told.append(f"{now.pop(name)}; trusted again from {t:.1f} s")
         for name, fault in result.sensor_faults.items():
             now.setdefault(name, m.words_of_fault(name, fault, t))
     return [*told, *now.values()]

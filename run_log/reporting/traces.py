@@ -60,7 +60,7 @@ def traces(run: Run) -> Traces:
     controllers = set(run.controllers)
     results = [r for r in run.results if r.run_id in controllers]
     if not results:
-        raise LogError(f"{run.path}: holds no tick of a controller; there is nothing to draw")
+        raise LogError(f"{run.path}: contains no tick of a controller; there is nothing to draw")
     keys = [(r.run_id, r.seq) for r in results]
     when = _tick_times(run, motion)
     ticks = {(tick.run_id, tick.seq): tick for tick in run.ticks}

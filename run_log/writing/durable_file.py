@@ -25,7 +25,7 @@ class Sink:
         patient: False raises `LogError` when the file cannot be created; True goes on trying.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: not patient, and the file cannot be created.
     """
 
@@ -104,7 +104,7 @@ class Sink:
                 self._failed(f"{self.path}: cannot be created: {error.filename} is not a folder")
                 return
             raise LogExistsError(
-                f"{self.path}: exists already, and a log never overwrites anything; choose another name"
+                f"{self.path}: exists already, and a log never overwrites a file; choose another name"
             ) from error
         except OSError as error:
             self._failed(f"{self.path}: cannot be created: {error.strerror}")

@@ -121,7 +121,7 @@ class PartedLog:
         return self._writer.last_bad or self._last_bad_before
 
     def write(self, name: str, payload: bytes, log_time: int, now: float) -> None:
-        """Log what came on topic `name`, as `LogWriter.write`; `now` on the monotonic clock, s."""
+        """Log a message of topic `name`, as `LogWriter.write`; `now` is on the monotonic clock, s."""
         if name in REPEATED:
             self._remember(name, payload)
         self._writer.write(name, payload, log_time)
@@ -195,13 +195,13 @@ class PartedLog:
         except LogError as error:
             log.error("%s", error)
             self._torn = str(error)
-        log.info("%s is complete; the log goes on in %s", old.sink.path, self.path)
+        log.info("%s is complete; the log continues in %s", old.sink.path, self.path)
         while 0 < self._config.log.keep < len(self._paths):
             oldest = self._paths.pop(0)
             try:
                 oldest.unlink(missing_ok=True)
             except OSError as error:
-                log.error("%s: cannot be removed, as log.keep asks: %s", oldest, error.strerror)
+                log.error("%s: cannot be removed for log.keep: %s", oldest, error.strerror)
 
 
 def _sum(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

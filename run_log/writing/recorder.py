@@ -1,4 +1,4 @@
-"""`tandem record`: logs everything that is said on the bus of one plant, in a process of its own."""
+"""`tandem record`: logs every message on the bus of one plant, in a separate process."""
 
 from __future__ import annotations
 
@@ -34,10 +34,11 @@ GATHER_S = 0.02
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """Record to `config.log.path` until told to stop; then finish the file.
 
-    A disk that is full or read-only stops nobody: it is named in Health and tried again, as long as it takes.
+    A full or read-only disk does not stop the recorder. It reports the error in Health and tries again until it can
+    write.
 
     Returns:
-        0; 2 when the path is taken, the plant unknown or the endpoint none; 4 when nothing could ever be written.
+        0; 2 if the path exists, the plant is unknown or the endpoint is invalid; 4 if nothing could be written.
     """
     with (
         stopped_by_signals(stop) as stopping,
@@ -55,7 +56,7 @@ def main(config: Config, stop: threading.Event | None = None) -> int:
         try:
             with Bus(config, "recorder", run_id, stopping) as bus:
                 mailbox = bus.everything()
-                # Only now, so that what it says of itself is in the log too.
+                # After the subscription, so that the log contains the recorder's own messages.
                 info = run_info(config, "recorder", run_id, plant.units)
                 with HealthPublisher(bus, info, lambda: writer.counters, punctuality) as health:
                     _record(config, writer, mailbox, health, stopping)
@@ -108,8 +109,10 @@ def _say(writer: PartedLog, health: HealthPublisher) -> None:
         log.error("%s; trying again, %d messages dropped so far", error, writer.counters["dropped"])
         note = f"NOT LOGGED: {error}"
     if writer.lost:
-        log.error("ticks of the controller never arrived here; the log has gaps, and replay names them")
-        note += "; THE LOG HAS GAPS: messages never arrived, see the counter 'lost ticks'"
+        log.error(
+            "ticks of the controller did not reach the recorder; the log has gaps, and replay lists them"
+        )
+        note += "; THE LOG HAS GAPS: messages were lost, see the counter 'lost ticks'"
     health.set("running", note)
 
 
@@ -118,7 +121,9 @@ def _finish(writer: PartedLog) -> int:
         log.warning("logged without a view: %s; the last one: %s", writer.bad, writer.last_bad)
     if writer.lost:
         log.error(
-            "%s: %d ticks never arrived here and are not in it", writer.path, writer.counters["lost_ticks"]
+            "%s: %d ticks did not reach the recorder and are missing",
+            writer.path,
+            writer.counters["lost_ticks"],
         )
     try:
         writer.close()

@@ -14,7 +14,7 @@ def save(run: Run, path: str | Path) -> None:
     """Write all messages of `run` to a new log, in the order of their times.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: the file cannot be written, or not to its end.
     """
     entries = [(entry, topic) for topic in topics.ALL for entry in run.entries(topic)]

@@ -48,18 +48,18 @@ class ArchitectureCheck(Command):
         accepted = NETWORKS - sum(refused.values())
         if not accepted:
             raise ConfigError(
-                f"{name}: refuses all of {NETWORKS} random sizes; the first: {next(iter(refused))}"
+                f"{name}: refuses all {NETWORKS} random sizes; the first reason: {next(iter(refused))}"
             )
         self.say(
             f"{name}: {accepted} networks of random sizes",
-            *(f"  refused {count}: {text}" for text, count in refused.items()),
-            f"  h_hat of numpy, CasADi and torch: {found.value:.1e} apart, in units of the output scale",
-            f"  slopes of CasADi and torch: {found.slope:.1e} apart",
+            *(f"  {count} refused: {text}" for text, count in refused.items()),
+            f"  largest difference of h_hat between numpy, CasADi and torch: {found.value:.1e} of the output scale",
+            f"  largest difference of the slopes between CasADi and torch: {found.slope:.1e}",
             f"  largest entry of phi: {found.phi:.6g}"
             + ("" if found.phi <= 1.0 else "; it must be bounded by 1"),
         )
         self.say(
-            "they agree" if found.holds else "NOT the same network",
+            "the implementations agree" if found.holds else "the implementations DIFFER",
             style="green" if found.holds else "bold red",
         )
         self.emit(

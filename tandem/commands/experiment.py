@@ -49,7 +49,7 @@ class Experiment(Command):
         if self.what == "list":
             return self._list()
         if self.out is None:
-            raise Refused("--out DIR is missing: where should the report go?")
+            raise Refused("--out DIR is missing: name the folder for the report")
         return self._run(self.out)
 
     def _list(self) -> int:
@@ -109,7 +109,7 @@ class Experiment(Command):
             except OSError as error:
                 raise Refused(f"{error.filename or out}: cannot be written: {error.strerror}") from error
             except KeyboardInterrupt:
-                text = f"interrupted; finished runs are kept in {out}: the same command goes on from there"
+                text = f"interrupted; finished runs are kept in {out}; the same command continues from there"
                 self.say(text)
                 raise
         seconds = time.monotonic() - began
@@ -184,4 +184,4 @@ def _find(what: str) -> Path:
     if path.suffix == ".toml" or path.exists():
         return path
     hint = did_you_mean(what, files, f"there are {', '.join(files) or 'none'}")
-    raise Refused(f"no experiment is called {what!r}; {hint} Or name a file, FILE.toml")
+    raise Refused(f"no shipped experiment has the name {what!r}; {hint} You can also name a file, FILE.toml")

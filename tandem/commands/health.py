@@ -37,7 +37,7 @@ def answer(config: Config, process: str, seconds: float, as_json: bool) -> int:
     """Print the state of the process; return 0 if it is ready or running, 1 if it is not or does not report."""
     health = ask(config, process, seconds)
     if health is None:
-        text = f"{process}: not heard of for {seconds:g} s at {config.bus.endpoint}"
+        text = f"{process}: no message for {seconds:g} s at {config.bus.endpoint}"
         if not as_json:
             terminal.write(text + "\n")
         else:

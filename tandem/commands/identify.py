@@ -92,11 +92,11 @@ class Identify(Command):
             if first is None:
                 first = model
             elif (model.plant.states, model.plant.inputs) != (first.plant.states, first.plant.inputs):
-                raise Refused(f"{file}: another plant ({model.plant.name}) than that of {self.files[0]}")
+                raise Refused(f"{file}: its plant ({model.plant.name}) is not that of {self.files[0]}")
             elif abs(model.period - first.period) > SAME_PERIOD * first.period:
                 raise Refused(
-                    f"{file}: sampled every {model.period:g} s, and {self.files[0]} every {first.period:g} s: A and B "
-                    "are those of one period"
+                    f"{file}: sampled every {model.period:g} s, and {self.files[0]} every {first.period:g} s; the "
+                    "logs need the same period"
                 )
             logs.append(observed(ran, model))
             self.say(*notes, *([ran.note] if ran.note else []), style="yellow")
@@ -105,8 +105,8 @@ class Identify(Command):
             raise Refused("no log is given")
         if learned := sorted(oracles & LEARNING):
             self.say(
-                f"the oracle {' and '.join(learned)} answers with u to what a linear model leaves out, and A and B may "
-                "take its answer for the plant's: logs with controller.oracle=linear say more",
+                f"with the oracle {' and '.join(learned)} u depends on the error of the linear model, which may "
+                "bias A and B; logs with controller.oracle=linear avoid this",
                 style="yellow",
             )
         return first.plant, first.period, logs
@@ -119,7 +119,7 @@ class Identify(Command):
 
         self.say(
             f"{known.name}: {found.samples} samples, one every {found.period:g} s",
-            "x+ = A x + B u + c, in deviations from x_e and u_e; below each entry its standard error",
+            "x+ = A x + B u + c, in deviations from x_e and u_e; the standard error is below each entry",
             "",
         )
         tables = matrix_tables(
@@ -133,19 +133,20 @@ class Identify(Command):
         for table in tables:
             self.console.print(table)
         self.say(
-            "", "one step ahead, RMS and largest, in half-widths per second; what is held out is not fitted"
+            "",
+            "error one step ahead, RMS and largest, in half-widths per second; held-out samples are not fitted",
         )
         self.console.print(_quality_table(known, found, own))
         self.say(
             "",
             f"poles, 1/s: {poles_text(poles(found.A, found.period))}",
-            f"what moved least moved by {percent(float(found.excitation[-1]))} of a half-width (RMS)",
+            f"smallest excitation of any direction: {percent(float(found.excitation[-1]))} of a half-width (RMS)",
         )
         worse = [s for s, a, b in zip(known.states, found.held_out.rms, own.rms, strict=True) if a > b]
         if worse:
             self.say(
-                f"of {', '.join(worse)} the log's own model predicts what is held out no worse: keep it, or record "
-                "more motion",
+                f"the log's model predicts the held-out samples of {', '.join(worse)} at least as well: keep it, or "
+                "record more motion",
                 style="yellow",
             )
 
@@ -207,7 +208,7 @@ def _source(known: Known, found: Identified, logs: str) -> str:
     found_here = {key: getattr(found, key) for key in ("A", "B", "offset", "period", "W")}
     fields = {**found_here, **shared_fields(known)}
     about = [
-        f"{known.name} as {found.samples} samples have it, one every {found.period:g} s ({logs}).",
+        f"{known.name} identified from {found.samples} samples, one every {found.period:g} s ({logs}).",
         "",
         f"W is {MARGIN:g} times the largest residual of samples that were held out of the fit.",
         "",

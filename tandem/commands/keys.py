@@ -78,9 +78,9 @@ class KeysCreate(Shows):
         router = next(one for one in made if one.role == "router")
         authority_key = folder / certificate_authority.AUTHORITY_FOLDER / "key.pem"
         self.say(
-            f"The router answers to {', '.join(router.hosts)}; --host adds others.",
-            f"Each machine gets its own roles' folders and nothing else. {authority_key} can make any of these: it is "
-            "needed to renew one and never to run, so keep it elsewhere.",
+            f"The router's certificate is valid for {', '.join(router.hosts)}; --host adds others.",
+            f"Copy to each machine only the folders of its own roles. Anyone who holds {authority_key} can issue "
+            "certificates. It is needed only to renew them, so keep it elsewhere.",
         )
         return 0
 
@@ -108,19 +108,19 @@ class KeysRenew(Command):
 
         for role in self.role:
             if role not in ROLES:
-                raise Refused(f"--role {role}: one of {', '.join(ROLES)}")
+                raise Refused(f"--role {role}: choose one of {', '.join(ROLES)}")
         if not self.role:
-            raise Refused(f"--role is missing: one of {', '.join(ROLES)}")
+            raise Refused(f"--role is missing: choose one of {', '.join(ROLES)}")
         renewed = []
         for role in self.role:
             hosts = self.host if role == "router" or len(self.role) == 1 else []
             old, new = certificate_authority.renew(role, self.folder, hosts, self.days, self.authority)
             renewed.append(new)
             was = "" if old is None else f", was {old.valid_until:%Y-%m-%d}"
-            still = "" if old is None else " The old certificate works until its end."
+            still = "" if old is None else " The old certificate remains valid until it expires."
             self.say(
                 f"{new.folder}: valid until {new.valid_until:%Y-%m-%d}{was}. Copy the folder to the {role}'s machine "
-                f"and start the {role} again.{still}",
+                f"and restart the {role}.{still}",
             )
         self.emit({"certificates": [_plain(one) for one in renewed]})
         return 0
@@ -168,9 +168,9 @@ def _may(role: str) -> list[str]:
     from tandem.certificate_authority import AUTHORITY_FOLDER
 
     if role == AUTHORITY_FOLDER:
-        return ["make certificates of all roles; may do nothing on the bus itself"]
+        return ["issue certificates of all roles; no rights on the bus"]
     if role not in ROLES:
-        return ["nothing: it is no role of ours"]
+        return ["nothing: not a role of this version"]
     rights = rights_of(role)
     own = ", ".join(topic.name.removeprefix(f"{role}/") for topic in rights.publishes)
     reads = "everything" if rights.reads_all else ", ".join(topic.name for topic in rights.reads)

@@ -32,13 +32,12 @@ class Recover(Command):
         file = self.file
         saved = recover(file, self.output or file.with_suffix(f".recovered{file.suffix or '.mcap'}"))
         if saved.log is None:
-            text = f"{file} is whole: {saved.messages} messages over {saved.seconds:.1f} s; nothing to do"
+            text = f"{file} is complete: {saved.messages} messages over {saved.seconds:.1f} s; nothing to do"
         else:
             text = f"{saved.log}: {saved.messages} messages over {saved.seconds:.1f} s saved from {file}"
             if saved.cut_at is not None:
-                text += (
-                    f", which was cut at byte {saved.cut_at} ({saved.lost_bytes} bytes of a torn record lost)"
-                )
+                lost = f"{saved.lost_bytes} bytes of an incomplete record are lost"
+                text += f", which was cut at byte {saved.cut_at} ({lost})"
         self.say(text, *saved.damage)
         self.emit(msgspec.to_builtins(saved))
         return 0

@@ -59,17 +59,19 @@ class Replay(Command):
             )
             self.say(text, style="yellow" if found.lost_ticks else "green")
         elif found.rounding and found.elsewhere is not False:
-            whose = "as promised for" if found.elsewhere else "which is promised for"
+            whose = "the tolerance for" if found.elsewhere else "which is the tolerance for"
             text = (
                 f"{found.differing_ticks} of {found.ticks} ticks differ by rounding, "
                 f"{found.largest_difference:.3g} at most in any input: within {ROUNDING:g}, {whose} a log of another "
-                "machine or build; not equal to the byte"
+                "machine or build; not equal byte for byte"
             )
             self.say(text, style="yellow")
         else:
             self.console.print(f"{found.differing_ticks} of {found.ticks} ticks differ", style="bold red")
             if found.rounding:
-                text = "by rounding alone, but log and machine name the same processor, kernels and versions"
+                text = (
+                    "only by rounding, although log and machine have the same processor, kernels and versions"
+                )
                 self.console.print(text, style="bold red")
         if found.lost_ticks:
             text = f"{found.lost_ticks} ticks could not be replayed or compared: the log has gaps"

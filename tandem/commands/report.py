@@ -49,7 +49,7 @@ class Report(Command):
         self.say(*(f"picture {picture}" for picture in drawn))
         if true_plant_of(ran) is None:
             notes.append(
-                "nothing is said of the motion between samples: the log has no equations; --plant FILE:NAME names them"
+                "the motion between samples is unknown: the log has no equations; add --plant FILE:NAME"
             )
         self.say(*filter(None, (ran.note, *(f"note: {note}" for note in notes))), style="yellow")
         for error in failed:

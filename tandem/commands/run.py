@@ -107,8 +107,8 @@ class Run(Configured):
                 terminal.complain(f"{error}\nAll output is in {files.folder}.", self.json)
                 return 2 if error.exit_code == 2 else 1
             except Impatient:
-                text = f"ended at once, everything was killed; {files.log} may be cut short"
-                terminal.complain(f"{text}: `tandem recover {files.log}` makes it whole", self.json)
+                text = f"ended at once and killed all processes; {files.log} may be incomplete"
+                terminal.complain(f"{text}: `tandem recover {files.log}` repairs it", self.json)
                 return INTERRUPTED
             try:
                 return self._conclude(resolved, files, trouble, logged, monitor.first_command is not None)
@@ -193,11 +193,9 @@ class Run(Configured):
         from tandem.live.supervisor import Impatient
 
         if trouble is None and not began:
-            trouble = "stopped before the first command" + (": no plant came" if self.no_plant else "")
+            trouble = "stopped before the first command" + (": no plant connected" if self.no_plant else "")
         if trouble is None and not logged:
-            trouble = (
-                f"the recorder did not end well, and {files.log} lacks what came after; see {files.folder}"
-            )
+            trouble = f"the recorder ended early, and the end of the run is missing in {files.log}; see {files.folder}"
         parts = existing_parts(files.log)
         if not parts and not began:
             # It was stopped while the processes started, and the recorder had not begun a log.

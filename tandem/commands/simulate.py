@@ -63,7 +63,7 @@ class Simulate(Configured):
         terminal.limited("--episodes", self.episodes, 1, MOST_STEPS // self.steps)
         if self.log is not None and self.log.exists():
             raise Refused(
-                f"{self.log}: exists already, and a log never overwrites anything; choose another name"
+                f"{self.log}: exists already, and a log never overwrites a file; choose another name"
             )
         from controller_node.build import build_model
         from controller_node.guarantee import guarantee

@@ -52,7 +52,7 @@ def claimed(log: Path) -> Iterator[tuple[RunFiles, list[str]]]:
     """
     files = RunFiles.of(log)
     if log.suffix in (".png", ".processes"):
-        raise Refused(f"{log}: the picture has that name; call the log NAME.mcap")
+        raise Refused(f"{log}: the picture gets this name; name the log NAME.mcap")
     if log.is_dir():
         raise Refused(f"{log}: is a folder; name a file")
     try:
@@ -91,12 +91,12 @@ def _move_aside(files: RunFiles) -> list[str]:
         new = aside.with_name(aside.name + old.name.removeprefix(stem))
         old.rename(new)
         if old != files.folder:
-            said.append(f"{old} was there already; it is now {new}")
+            said.append(f"{old} existed already and was renamed to {new}")
     return said
 
 
 def _busy(log: Path) -> str:
-    return f"{log}: another run is writing it; choose another name with --log"
+    return f"{log}: another run is writing this log; choose another name with --log"
 
 
 def _lock(folder: Path) -> int | None:

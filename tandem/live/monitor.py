@@ -93,7 +93,7 @@ class Monitor:
             codec.check_dimensions(topic, message, self.plant.d, self.plant.m)
         except codec.BadMessage as error:
             if self.bad.count(topic.name, error.reason, error.detail):
-                self.say(f"{error}; not obeyed", now, "bad")
+                self.say(f"{error}; ignored", now, "bad")
             return
         follower = self._followers.setdefault(topic.name, Follower(self.config.bus.follow_silence))
         verdict = "ok" if topic.shared else follower.accept(message.run_id, message.seq, now)
@@ -113,7 +113,7 @@ class Monitor:
             case m.Command():
                 if self.first_command is None:
                     self.first_command = now
-                    self.say("the first command: the run begins", now)
+                    self.say("first command: the run begins", now)
                 if seen.source != "manual":
                     self._u = message.u
             case m.Tick():
@@ -139,7 +139,7 @@ class Monitor:
         before = self._seen.source
         if before and (state.source == "manual") != (before == "manual"):
             by_hand = state.source == "manual"
-            what = "driven by hand" if by_hand else f"no longer driven by hand: {state.source}"
+            what = "under manual control" if by_hand else f"no longer under manual control: {state.source}"
             self.say(f"the plant is {what}", now, "note" if by_hand else "good")
         if state.source == "manual":
             self._u = state.acting
@@ -192,7 +192,7 @@ class Monitor:
         for name in told.keys() - before.keys():
             self.say(f"tick {result.seq}: {told[name]}", now, "bad")
         for name in before.keys() - told.keys():
-            self.say(f"tick {result.seq}: sensor {name} is believed again", now, "good")
+            self.say(f"tick {result.seq}: sensor {name} is trusted again", now, "good")
         self._seen.sensor_faults = {name: before.get(name, text) for name, text in told.items()}
 
     def _take_weight(self, weight: float, tick: str, now: float) -> None:
@@ -203,7 +203,7 @@ class Monitor:
         nothing = now - self._counted > self._patience
         if nothing != seen.adds_nothing:
             seen.adds_nothing = nothing
-            self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning counts again'}", now)
+            self.say(f"{tick} {ADDS_NOTHING if nothing else 'learning has an effect again'}", now)
 
     def _take_margin(self, result: m.TickResult, now: float) -> None:
         margin = result.set_margin
@@ -239,7 +239,7 @@ class Monitor:
         for name, count in health.counters.items():
             if name.startswith(m.BAD):
                 if (health.process, name) not in self._bad_elsewhere:
-                    self.say(f"{health.process}: {name.replace('_', ' ')}; not obeyed", now, "bad")
+                    self.say(f"{health.process}: {name.replace('_', ' ')}; ignored", now, "bad")
                 self._bad_elsewhere[health.process, name] = count
 
     def say(self, text: str, now: float, weight: Weight = "note") -> None:
@@ -303,11 +303,11 @@ class Monitor:
         if health is not None and now - at <= SILENT_S:
             return ProcessRow(name, health.status, note, counters)
         if name == "plant" and not self._plant.silent(now):
-            return ProcessRow(name, "running", "says only its states", {})
+            return ProcessRow(name, "running", "publishes only states", {})
         known = health is not None or (name == "plant" and self._plant.known)
         if name == "trainer" and not known and not self.config.trainer.enabled:
             return ProcessRow(name, "not configured", note, counters)
-        return ProcessRow(name, "silent" if known else "not heard of", note, counters)
+        return ProcessRow(name, "silent" if known else "no message", note, counters)
 
 
 def _gauges(

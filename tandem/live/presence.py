@@ -30,7 +30,7 @@ class Presence:
         again = self.known and run_id != self._run_id
         self._run_id, self._at, self._missed = run_id, now, False
         if again:
-            return f"the plant was started again{away}, as {run_id}: a new episode"
+            return f"the plant was restarted{away} as {run_id}: a new episode"
         return f"the plant is back{away}" if missed else ""
 
     def miss(self, now: float) -> str:

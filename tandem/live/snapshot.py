@@ -30,7 +30,7 @@ class ProcessRow:
 
     name: str
     status: str
-    """Status of its Health; "not heard of", "not configured", "silent" or "ended" if there is none."""
+    """Status of its Health; "no message", "not configured", "silent" or "ended" if there is none."""
     note: str
     counters: dict[str, int]
 

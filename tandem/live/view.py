@@ -27,7 +27,7 @@ STATUS_STYLE = {
     "starting": "yellow",
     "stopping": "yellow",
     "silent": "bold yellow",
-    "not heard of": "dim",
+    "no message": "dim",
     "not configured": "dim",
     "failed": "bold red",
     "ended": "bold red",
@@ -103,12 +103,12 @@ def _sets(now: Snapshot) -> tuple[str, str]:
     return f"in set {now.set_piece}, margin {now.set_margin:.2g}", "default"
 
 
-RESTS = {"nearest": "; out of reach, at the nearest rest", "no rest": "; no rest was found"}
+RESTS = {"nearest": "; out of reach, at the nearest steady state", "no rest": "; no steady state was found"}
 """Text about a target whose outputs are not at their reference."""
 
 
 def _set_point(now: Snapshot) -> str:
-    """Reference of the outputs, their distance from it, and whether the plant can rest there."""
+    """Reference of the outputs, their distance from it, and whether the plant has a steady state there."""
     if not now.reference:
         return "the equilibrium"
     at = {gauge.name: gauge.value for gauge in now.states}
@@ -164,7 +164,7 @@ def _gauges(now: Snapshot, width: int) -> Table:
 
 def _beside(gauge: Gauge, faults: Mapping[str, str]) -> Text:
     if gauge.name in faults:
-        return Text("not believed", "bold red")
+        return Text("not trusted", "bold red")
     return Text("" if gauge.value is None else f"off by {gauge.value - gauge.target:+.4f}")
 
 
@@ -222,7 +222,7 @@ def _loop(now: Snapshot) -> Table:
         "command": "follows commands",
         "plan": Text("follows the last plan", "bold yellow"),
         "safe": Text("its own safe input", "bold red"),
-        "manual": Text("driven by hand", "bold yellow"),
+        "manual": Text("under manual control", "bold yellow"),
     }
     mode = now.mode or "-", "default" if now.mode in ("", "solver") else "bold red"
     slack = f"{now.slack:.1e} {now.slack_row}" if now.slack else "none"
@@ -261,7 +261,7 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("rolled back", _counted(now.rolled_back, "sets")),
             ("loss", Text(loss)),
             ("buffer", Text(f"{now.samples} samples")),
-            ("bad messages", _counted(now.bad_messages, "not obeyed")),
+            ("bad messages", _counted(now.bad_messages, "ignored")),
             *([] if now.noise is None else [("noise found", Text(_noise(now.noise)))]),
         ]
     )

@@ -132,7 +132,7 @@ def commanding(config: Config, *heard: Topic) -> Iterator[Commander]:
         bus.open()
     except OpenInterrupted as error:
         raise Refused(
-            f"no router at {config.bus.endpoint} within {ROUTER_S:g} s: nothing was said. `tandem run` has its router "
+            f"no router at {config.bus.endpoint} within {ROUTER_S:g} s: nothing was sent. `tandem run` has its router "
             f"there only with --set bus.endpoint={config.bus.endpoint}"
         ) from error
     finally:

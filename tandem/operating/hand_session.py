@@ -60,12 +60,12 @@ class Follower:
             case m.Health():
                 self.told = message.note.partition(NO_LONGER)[2]
             case m.Override(mode="auto", seq=0) if self._said_at is not None:
-                return self._lost(f"{message.run_id} gave it back to the controller")
+                return self._lost(f"{message.run_id} returned the plant to the controller")
             case m.Override(mode="manual", seq=0) if self._said_at is not None and self._of is m.Override:
                 return self._lost(f"{message.run_id} took over")
             case m.Reference() if self._said_at is not None and self._of is m.Reference:
                 self.elsewhere = True
-                return self._lost(f"{message.run_id} said where to go")
+                return self._lost(f"{message.run_id} gave another reference")
         return ""
 
     def _lost(self, why: str) -> str:
@@ -77,10 +77,10 @@ class Follower:
         if self._said_at is None or self._of is m.Reference:
             return ""
         if before is not None and state.run_id != before.run_id:
-            return "the gateway was started again"
+            return "the gateway was restarted"
         by_hand = state.source == "manual"
         if self.begun and not by_hand:
-            return "the plant is not driven by hand any more"
+            return "the plant is no longer under manual control"
         # A message after one sample acts from the next one on, and the sample after that reports it.
         self.begun = self.begun or (by_hand and state.seq > self._said_at + 1)
         return ""
@@ -100,7 +100,7 @@ def completed(named: Mapping[str, float], plant: Description, acts: Sequence[flo
     """Return the whole input, (m,); inputs without a name keep their value. Raises `Refused` if it is not known."""
     others = [name for name in plant.inputs if name not in named]
     if others and acts is None:
-        raise Refused(f"it is not known what acts now: name {', '.join(others)} too")
+        raise Refused(f"the acting input is not known: give values for {', '.join(others)} too")
     now = dict(zip(plant.inputs, acts or (), strict=False))
     return np.array([named[name] if name in named else now[name] for name in plant.inputs])
 

@@ -53,9 +53,7 @@ def from_words(words: Sequence[str]) -> dict[str, float]:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise Refused(
-                f"{word}: write NAME=VALUE, with a number that is finite, each name once, as in y=1.8"
-            )
+            raise Refused(f"{word}: write NAME=VALUE, with a finite number and each name once, as in y=1.8")
         values[name] = value
     return values
 
@@ -71,10 +69,10 @@ def from_file(path: Path, lease: float | None = None) -> m.Reference:
     if len(names) < 2 or names[0] != TIME or len(set(names)) < len(names):
         found = f", and it is {','.join(names)[:60]!r}" if names else ""
         raise Refused(
-            f"{path}: its first line names the columns: {TIME}, then states, each once, as in time,y{found}"
+            f"{path}: the first line must name the columns: {TIME}, then states, each once, as in time,y{found}"
         )
     if not 1 < len(rows) <= m.MOST_POINTS + 1:
-        raise Refused(f"{path}: {len(rows) - 1} rows; 1 to {m.MOST_POINTS} below the names of the columns")
+        raise Refused(f"{path}: {len(rows) - 1} rows; give 1 to {m.MOST_POINTS} below the column names")
     table = []
     for number, row in enumerate(rows[1:], 2):
         try:

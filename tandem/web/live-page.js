@@ -192,7 +192,7 @@ function showProcesses() {
     const known = health.get(name);
     const now = newest + Math.max(0, performance.now() / 1000 - arrived);
     const silent = known && now - known.at > SILENT_S;
-    const status = !known ? "not heard of" : silent ? "silent" : known.message.status;
+    const status = !known ? "no message" : silent ? "silent" : known.message.status;
     const tone = CALM.includes(status) ? "good" : status === "failed" ? "bad" : known ? "wait" : "";
     const row = element("li", undefined, `state ${tone}`);
     row.append(element("b", name), ` ${status}`);

@@ -112,7 +112,9 @@ def test_text_outside_the_marks_does_not_change(report: Report, tmp_path: Path) 
 def test_a_document_without_marks_is_refused_before_the_measurement(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.solver.__main__.measure", lambda *_: pytest.fail("measured all the same"))
+    monkeypatch.setattr(
+        "benchmarks.solver.__main__.measure", lambda *_: pytest.fail("measured before the check")
+    )
     path = tmp_path / "notes.md"
     path.write_text("nothing here\n")
     assert main(Benchmark(document=path)) == 2

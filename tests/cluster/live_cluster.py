@@ -238,7 +238,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(cluster: DaskClu
     command.popen.send_signal(signal.SIGINT)
     code, said = command.end()
     assert code == 130
-    assert "the same command goes on from there" in said
+    assert "the same command continues from there" in said
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "runs").iterdir()}
     assert 2 <= len(kept) < 16
     code, said = Command(*arguments, cwd=tmp_path).end()

@@ -199,7 +199,7 @@ def test_a_container_has_no_more_than_it_needs(project: Project, watch: Watch, s
     }
     size = json.loads(docker("image", "inspect", seen["Image"]))[0]["Size"] / 1e6
     base = json.loads(docker("image", "inspect", BASE))[0]["Size"] / 1e6
-    say(f"  {service}: image {size:.0f} MB, of which base {base:.0f} MB; {found}")
+    say(f"  {service}: image {size:.0f} MB, including the base of {base:.0f} MB; {found}")
     if service != "trainer":
         torch = subprocess.run(
             ["docker", "exec", seen["Id"], "python", "-c", "import torch"],

@@ -238,7 +238,7 @@ def test_a_controller_continues_with_its_memory_and_its_log_replays() -> None:
     log.append((topics.KEYFRAME, after.memory.keyframe(20), 20))
     found = replay(gather(config(), log))
     assert found.equal, found.first_difference
-    assert any("goes on from the memory of controller-a" in note for note in found.notes)
+    assert any("continues from the memory of controller-a" in note for note in found.notes)
 
 
 def test_memory_of_another_shape_is_reported() -> None:

@@ -1,4 +1,4 @@
-"""The reference is made from the code, and has words for every key, field and option."""
+"""The reference is generated from the code and describes every key, field and option."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def test_the_page_of_the_configuration_has_every_key_of_the_shipped_file() -> No
         section = page.split(f"## [{name}]" if name else "## Top level", 1)[1].split("\n## ", 1)[0]
         for key in configuration.keys(cls):
             assert f"| `{key.name}` |" in section
-    assert "| `rate` | number > 0 | `20.0` | Hz |" in page
-    assert "| `dead_time` | number ≥ 0 |  | s |" in page
+    assert "| `20.0` | Hz | number > 0 |" in page
+    assert "|  | s | number ≥ 0 |" in page
 
 
 def test_no_section_is_left_out() -> None:
@@ -45,7 +45,8 @@ def test_every_command_is_on_the_page_with_its_options() -> None:
         assert read.text, f"{words}: no description"
         assert all(meaning for _, meaning in read.options)
     assert page.count("\n## tandem ") == len(AnyCommand.__args__)
-    assert "| `--seconds S` | 20; with --no-plant until Ctrl-C |" in page
+    assert re.search(r"\| `--seconds S` \| .+ \| 20; with --no-plant until Ctrl-C \|", page)
+    assert "<code>--config NAME&#124;FILE</code>" in page
 
 
 def test_a_help_text_is_read_by_its_boxes() -> None:
@@ -55,12 +56,18 @@ def test_a_help_text_is_read_by_its_boxes() -> None:
     assert dict(read.options)["--architecture FILE:NAME"].endswith("(default: none)")
 
 
+def test_every_role_is_on_the_page_with_what_it_publishes() -> None:
+    page = messages.page()
+    assert "| viewer |  | everything |" in page
+    assert "| user | `user/**` |" in page
+    assert "| commander | `operator/reference`, `operator/override` | everything |" in page
+
+
 @pytest.mark.parametrize("topic", topics.ALL, ids=lambda topic: topic.name)
 def test_every_topic_and_its_message_is_on_the_page(topic: topics.Topic) -> None:
     page = messages.page()
     assert (
-        f"| `{topic.name}` | [{topic.type.__name__}](#{topic.type.__name__.lower()}) | {topic.writer} |"
-        in page
+        f"| `{topic.name}` | [{topic.type.__name__}](#{topic.type.__name__.lower()}) | {topic.writer}" in page
     )
     fields = page.split(f"### {topic.type.__name__}\n", 1)[1].split("\n### ", 1)[0]
     own = [name for name in topic.type.__struct_encode_fields__ if name not in ("run_id", "seq")]

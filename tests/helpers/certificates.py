@@ -11,7 +11,7 @@ from tandem import certificate_authority
 
 
 def issue(keys: Path, place: str, name: str, days: float) -> None:
-    """Of the authority of these keys, into their folder `place`: for any name, and valid for as long as one likes."""
+    """Issue a certificate by the authority of these keys into their folder `place`, for any name and duration."""
     key = load_pem_private_key((keys / "authority" / "key.pem").read_bytes(), None)
     issued_by = credentials.load_certificate(keys / "authority" / "certificate.pem")
     (keys / place).mkdir(mode=0o700, exist_ok=True)

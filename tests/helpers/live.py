@@ -33,15 +33,15 @@ PROGRAM = (
 
 
 PORTS = itertools.cycle(range(10_000 + 150 * (os.getpid() % 150), 32_500))
-"""Below what the system hands out itself. Tests that run beside these begin elsewhere, so nobody takes a port between
-the look at it and its router, nor while its router is restarted."""
+"""Ports below those that the system assigns. Parallel test processes begin at different ports, so no other test takes a
+port between the check and the start of its router, or while its router restarts."""
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on, and that no other test will ask for soon."""
+    """Return a loopback endpoint without a listener that no other test will use soon."""
     for port in PORTS:
         with socket.socket() as probe, contextlib.suppress(OSError):
-            # As routers do: what a closed link left behind is no listener.
+            # As routers do: a closed link that still holds the port does not count as a listener.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(("127.0.0.1", port))
             return f"tcp/127.0.0.1:{port}"
@@ -60,7 +60,7 @@ def live_config(*assignments: str) -> Config:
 
 
 HANG_S = 120.0
-"""Nobody waits longer than this for something that must come."""
+"""Longest wait, in seconds, for an event that must occur."""
 
 
 class Process:
@@ -97,7 +97,7 @@ class Process:
 
 
 def matched(bus: Bus, topic: Topic) -> bool:
-    """Whether somebody is subscribed to this topic; a message sent before that reaches nobody."""
+    """Whether this topic has a subscriber. Messages sent before that are not received."""
     return bus._publisher(topic).matching_status.matching
 
 

@@ -1,4 +1,4 @@
-"""Pictures depend on nobody's settings for Matplotlib."""
+"""Pictures do not depend on the user's Matplotlib settings."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_any_failure_of_a_picture_is_one_line(tmp_path: Path) -> None:
 
 
 def test_an_impossible_format_or_folder_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(PictureError, match=r"x\.zzz: no picture has that ending; name it \.png"):
+    with pytest.raises(PictureError, match=r"x\.zzz: not a picture format; use \.png"):
         save(Figure, tmp_path / "x.zzz")
     (tmp_path / "file").write_text("")
     with pytest.raises(PictureError, match="cannot be written"):

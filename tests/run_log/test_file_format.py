@@ -1,4 +1,4 @@
-"""A log says its format first, and a reader refuses a format that it does not know, in words."""
+"""A log begins with its format, and a reader refuses an unknown format with a message."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def log_of(path: Path, library: str) -> Path:
 
 
 def stated(path: Path) -> tuple[str, str]:
-    """The library in the header, and the format in the metadata."""
+    """Return the library in the header, and the format in the metadata."""
     with path.open("rb") as stream:
         reader = make_reader(stream)
         (identity,) = (record for record in reader.iter_metadata() if record.name == IDENTITY)
@@ -50,7 +50,7 @@ def test_a_log_says_its_format_and_recovery_keeps_it(tmp_path: Path) -> None:
 
 def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> None:
     path = log_of(tmp_path / "x.mcap", f"tandem log {FORMAT + 1}; mcap-python/9.9")
-    said = rf"x\.mcap: is a log of format {FORMAT + 1}, and this version reads formats 2, 3; it needs a newer Tandem"
+    said = rf"x\.mcap: has the log format {FORMAT + 1}, and this version reads formats 2, 3; it needs the version"
     with pytest.raises(LogError, match=said):
         read_run(path)
     with pytest.raises(LogError, match=said):
@@ -60,7 +60,7 @@ def test_a_log_of_a_newer_format_is_refused_with_what_to_do(tmp_path: Path) -> N
 
 def test_a_log_of_an_older_format_names_the_version_that_reads_it(tmp_path: Path) -> None:
     path = log_of(tmp_path / "old.mcap", "tandem log 1; mcap-python/1.6.0")
-    said = r"old\.mcap: is a log of format 1, and this version reads formats 2, 3; Tandem 0\.1\.0 reads it"
+    said = r"old\.mcap: has the log format 1, and this version reads formats 2, 3; Tandem 0\.1\.0 reads it"
     with pytest.raises(LogError, match=said):
         read_run(path)
     with pytest.raises(LogError, match=said):
@@ -68,12 +68,12 @@ def test_a_log_of_an_older_format_names_the_version_that_reads_it(tmp_path: Path
 
 
 def test_the_format_is_that_of_this_version_or_an_earlier_one() -> None:
-    """The number goes up together with the version that the package will be released as."""
+    """The number increases together with the version of the next release."""
     ours = tomllib.loads((CONFIGS.parent / "pyproject.toml").read_text())["project"]["version"]
     assert [int(n) for n in VERSIONS[FORMAT].split(".")] <= [int(n) for n in ours.split(".")]
 
 
 @pytest.mark.parametrize("library", ["", "tandem log", "tandem log one; x", "another; tandem log 1; x"])
 def test_a_header_without_a_format_is_refused(tmp_path: Path, library: str) -> None:
-    with pytest.raises(LogError, match="says no format of a log of Tandem"):
+    with pytest.raises(LogError, match="does not name a log format of Tandem"):
         read_run(log_of(tmp_path / "x.mcap", library))

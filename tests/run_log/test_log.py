@@ -1,4 +1,4 @@
-"""The log of a run: what goes in comes out; others can read it; what a full disk does to it."""
+"""The log of a run: it contains every message, foreign readers can read it, and it survives a full disk."""
 
 from __future__ import annotations
 
@@ -61,6 +61,17 @@ def test_attachments_have_versions_configuration_and_plant(whole: Path, config: 
     schemas = json.loads(attached["schemas.json"])
     assert schemas["channels"]["raw/controller/tick"] == "Tick"
     assert "state_verdict" in schemas["types"]["Tick"]["properties"]
+
+
+def test_metadata_has_units_versions_configuration_and_the_clock(whole: Path, config: Config) -> None:
+    with whole.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert found["tandem"]["clock"] == "Unix time of the machine that recorded"
+    assert found["tandem"]["log_time"] == "arrival at the recorder"
+    assert found["units"]["rdot"] == "1/s"
+    assert (found["seeds"], found["versions"]) == ({"seed": "7"}, {"python": "3.11"})
+    assert found["configuration"]["controller.keyframe_every"] == "20"
+    assert found["configuration"]["controller.solver.mode"] == config.controller.solver.mode
 
 
 def test_a_foreign_reader_reads_every_message(whole: Path, messages: list[Logged]) -> None:
@@ -154,7 +165,7 @@ def test_a_fast_loop_has_all_its_bytes_in_the_log_and_100_views_a_second(
                 run_id="p", seq=i, t=i / rate, x=[0.0] * 4, applied=None, source="hold", command_seq=-1
             )
             writer.write("plant/state", codec.encode(state), i * 1_000_000_000 // rate)
-            # Of topics without such a limit nothing is left out.
+            # Topics without such a limit are complete.
             writer.write("controller/output_weights", codec.encode(weights), i * 1_000_000_000 // rate)
     with path.open("rb") as stream:
         found = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
@@ -172,7 +183,7 @@ def test_a_simulation_saves_the_same_log_twice(
     assert logged(tmp_path / "a.mcap") == payloads(messages)
 
 
-# -- a disk that does not take it ------------------------------------------------------------------------
+# -- a full disk -----------------------------------------------------------------------------------------
 
 
 def test_nothing_is_ever_overwritten(tmp_path: Path, config: Config) -> None:
@@ -201,7 +212,7 @@ def test_an_unwritable_place_is_an_error_or_is_waited_for(tmp_path: Path, config
 
 @contextmanager
 def file_size_limit(limit: int) -> Iterator[None]:
-    """No file of this process may grow beyond `limit` bytes: what a full disk is to a writer."""
+    """Limit files of this process to `limit` bytes, which a writer sees as a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:

@@ -1,4 +1,4 @@
-"""A run in figures and pictures, from its log alone."""
+"""Figures and pictures of a run from its log alone."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_summary_of_a_known_run(config: Config, messages: list[Logged]) -> None:
 
 
 def moved(messages: list[Logged], **changes: Any) -> list[Logged]:
-    """With fields of every plant state replaced by functions of it."""
+    """Return the messages with fields of every plant state replaced by functions of the state."""
     return [
         (topic, msgspec.structs.replace(message, **{k: f(message) for k, f in changes.items()}), t)
         if topic is topics.PLANT_STATE
@@ -109,7 +109,7 @@ def test_summary_counts_after_the_hold_and_ignores_strangers(
 
 
 def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: list[Logged]) -> None:
-    """Half of the run, then a plant of another name that is held for a while and goes the same way."""
+    """Half of the run, then a plant with another run id that is held for a while and then moves in the same way."""
     middle = STEPS // 2
     first = [one for one in messages if one[0] is not topics.PLANT_STATE or one[1].seq <= middle]
     states = [message for topic, message, _ in messages if topic is topics.PLANT_STATE]
@@ -133,7 +133,7 @@ def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: 
     assert (summary.J, summary.constraint_violations) == (one.J, 2 * one.constraint_violations)
     motion = trajectory(run, PLANT)
     assert motion.starts == (0, middle + 1)
-    # The clock goes on; the hold at the second start is no motion.
+    # The clock continues; the hold at the second start is no motion.
     assert motion.t[motion.starts[1]] == pytest.approx(100.0 + 3 * 0.05)
     assert motion.x[motion.starts[1]] == pytest.approx(PLANT.x0)
     line = plots.pictures(traces(run))["states"]().axes[0].lines[0]
@@ -166,9 +166,9 @@ def test_summary_of_applied_input_and_settled_states(config: Config, messages: l
     at_rest = moved(messages, x=lambda s: PLANT.x_e.tolist(), applied=lambda s: [2.1547 + 5e-7])
     summary = summarise(gather(config, at_rest))
     assert (summary.settled_s, summary.constraint_violations, summary.deviation) == (0.0, 0, 0.0)
-    # Who begins settled has no deviation of which an overshoot could be a share.
+    # A state that begins at its target has no initial deviation, so its overshoot is undefined.
     assert summary.overshoot == {"z": None, "y": None}
-    # The equilibrium is none under that input.
+    # With that input the state is not an equilibrium.
     assert summary.excess_between_samples is None
     outside = moved(at_rest, applied=lambda s: [2.1547 + 2e-6] if s.seq == 9 else None)
     assert summarise(gather(config, outside)).constraint_violations == 1
@@ -195,7 +195,7 @@ def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged
 
 
 def test_the_first_and_last_predictions_of_a_slow_plant_count(config: Config, messages: list[Logged]) -> None:
-    """At a period of 4 s, no second has a prediction in it."""
+    """At a period of 4 s, no single second contains a prediction."""
     spread = [
         (topic, msgspec.structs.replace(said, t=80.0 * said.t) if isinstance(said, Tick) else said, t)
         for topic, said, t in messages
@@ -295,17 +295,17 @@ def test_reading_needs_neither_torch_nor_a_display() -> None:
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
 def test_a_picture_replaces_files_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
-    (tmp_path / "elsewhere").write_text("somebody else's")
+    (tmp_path / "elsewhere").write_text("another file")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode
     with pytest.raises(LogError, match=r"run\.png: cannot be written: it is a (pipe|link|folder)"):
         save(Figure, tmp_path / "run.png")
     assert (tmp_path / "run.png").lstat().st_mode == kind
-    assert (tmp_path / "elsewhere").read_text() == "somebody else's"
+    assert (tmp_path / "elsewhere").read_text() == "another file"
 
 
 def test_a_picture_of_an_unknown_kind_is_refused_with_those_that_are_known(
     whole: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(LogError, match=r"no picture has that ending.*png.*svg"):
+    with pytest.raises(LogError, match=r"not a picture format.*png.*svg"):
         picture(read_run(whole), tmp_path / "run.picture")

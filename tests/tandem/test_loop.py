@@ -1,4 +1,4 @@
-"""`tandem.Loop`: the lock-step in Python, at once or one step at a time, with a plant that moves elsewhere too."""
+"""`tandem.Loop`: lock-step runs in Python, complete or step by step, also with an external plant."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ STEPS = 30
 
 
 class Simulator:
-    """Somebody's own, of the same plant."""
+    """A user's own simulator of the same plant."""
 
     def __init__(self, fails_after: int = 10_000):
         self.motion, self.left = Truth(PLANT), fails_after
@@ -55,7 +55,7 @@ class Simulator:
 
 
 def payloads(run: Run) -> dict[str, list[bytes]]:
-    """All that does not depend on the clock."""
+    """Return the payloads that do not depend on the clock."""
     return {
         topic.name: [entry.payload for entry in run.entries(topic)]
         for topic in topics.ALL
@@ -108,7 +108,7 @@ def test_a_plant_that_moves_elsewhere_gets_the_same_inputs_and_labels(simulated:
         u = loop.control(x)
         x = truth.step(x, u, 0.05)
     ours, theirs = payloads(loop.result.run), payloads(simulated)
-    # Where the last input led nobody has said yet.
+    # The state after the last input is not reported yet.
     theirs[topics.PLANT_STATE.name].pop()
     assert ours == theirs
 
@@ -118,7 +118,7 @@ def test_an_invalid_state_changes_nothing() -> None:
     loop.control(PLANT.x0)
     for bad in ([1.0, 2.0], [np.nan, 0, 0, 0], 3.0):
         with pytest.raises(
-            ValueError, match=r"is no state of moore_greitzer: 4 finite numbers \(z, y, r, rdot\)"
+            ValueError, match=r"is not a state of moore_greitzer: give 4 finite numbers \(z, y, r, rdot\)"
         ):
             loop.control(bad)
     other.control(PLANT.x0)
@@ -134,7 +134,7 @@ def test_another_episode_begins_with_the_memory_and_without_a_label() -> None:
     np.testing.assert_array_equal(step.x, PLANT.x0)
     assert step.result.h is None
     np.testing.assert_array_equal(loop.result.run.output_weights[-1].K.numpy(), learned)
-    # By hand too, from wherever it is.
+    # Manual control too, from any state.
     loop.start_again()
     loop.control(PLANT.x_e + 0.01)
     assert loop.result.run.results[-1].h is None
@@ -144,7 +144,7 @@ def test_another_episode_begins_with_the_memory_and_without_a_label() -> None:
 @pytest.mark.parametrize("truth", [Simulator(), PLANT])
 def test_objects_are_true_as_well(truth: object, simulated: Run) -> None:
     ours, theirs = payloads(Loop(truth=truth, **QUICK).run(STEPS).run), payloads(simulated)
-    # What the controller says of itself has the name of its truth.
+    # The controller's run info contains the name of its truth.
     del ours[topics.RUN_INFO["controller"].name], theirs[topics.RUN_INFO["controller"].name]
     assert ours == theirs
 

@@ -1,4 +1,4 @@
-"""Set-points as a person writes them: words, tables, and what `tandem set-point` and `tandem simulate` say to them."""
+"""Set-points as arguments and tables, and the answers of `tandem set-point` and `tandem simulate`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def test_a_table_is_a_sequence(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "its first line names the columns"),
-        ("y,time\n1,2\n", "its first line names the columns"),
+        ("", "the first line must name the columns"),
+        ("y,time\n1,2\n", "the first line must name the columns"),
         ("time;y\n1;2\n", "and it is 'time;y'"),
         ("time,y,y\n0,1,1\n", "each once"),
         ("time,y\n", "0 rows"),
@@ -56,7 +56,7 @@ def test_words_are_names_and_numbers() -> None:
     [
         (["y=3"], "y=3: y = 3 is outside X: 1.1875 to 2.1875"),
         (["x=1"], "'x' is no state of moore_greitzer: z, y, r, rdot"),
-        ([], "one of NAME=VALUE, --file and --configured is needed"),
+        ([], "give exactly one of NAME=VALUE, --file and --configured"),
         (["y=1.7", "--configured"], "one of NAME=VALUE"),
         (["y=1.7", "--over", "-1"], "--over"),
         (["y=1.7", "--for", "61"], "--for"),
@@ -79,7 +79,7 @@ def test_the_controllers_answer_is_printed_in_words() -> None:
     )  # fmt: skip
     assert (
         words(result)
-        == "taken in tick 7: y 2.18 now, out of reach: the nearest rest is off by 9.17 % of a half-width"
+        == "taken in tick 7: y 2.18 now, out of reach: the nearest steady state differs by 9.17 % of a half-width"
     )
 
 

@@ -1,4 +1,4 @@
-"""Commands whose output nobody reads, or whose terminal writes little: they end well, and their exit code is honest."""
+"""Commands with a closed or blocked output end without a traceback, and their exit code is right."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def test_a_stopped_suite_removes_its_processes_and_mounts(tmp_path: Path) -> Non
         finally:
             process.kill()
     assert process.returncode == 130
-    assert "goes on from" in said
+    assert "continues from" in said
     assert "Traceback" not in said
     assert of_runs_in(tmp_path) == []
 

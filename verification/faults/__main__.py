@@ -44,7 +44,7 @@ class Suite:
     """Run real processes with one fault at a random moment of each run. An interrupted suite continues."""
 
     runs: int = 20
-    """Of each fault."""
+    """Number of runs with each fault."""
     jobs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
     """Runs at a time. Each run uses up to one core, and simultaneous runs affect each other's figures."""
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
@@ -104,7 +104,7 @@ def main(settings: Suite) -> int:
         console.print(str(error), markup=False)
         return 2
     except KeyboardInterrupt:
-        console.print(f"interrupted; the same command goes on from {settings.out}")
+        console.print(f"interrupted; the same command continues from {settings.out}")
         return 130
     return int(any(pair.outcome.not_held for found in pairs.values() for pair in found))
 
@@ -139,7 +139,7 @@ def _measure(
 ) -> dict[str, list[Pair]]:
     plan = list(_plan(faults, settings.runs))
     duration = minutes(total(faults, settings.runs) / settings.jobs)
-    console.print(f"{len(plan)} runs, about {duration}; Ctrl-C and the same command go on")
+    console.print(f"{len(plan)} runs, about {duration}; after Ctrl-C the same command continues")
     pairs: dict[str, list[Pair]] = {}
     calm: dict[str, Outcome] = {}
     columns = (

@@ -34,7 +34,7 @@ class Facts(msgspec.Struct, kw_only=True):
     late_by_machine: int
     """Of these, the number during which an idle loop of the highest priority was late too."""
     tick_p99_ms: float | None
-    """Of the ticks during which the machine itself did not stall."""
+    """99th percentile over the ticks during which the machine itself did not stall."""
     sources: list[str]
     """Sources of the input after the fault, in order."""
     plan_s: float

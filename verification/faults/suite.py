@@ -106,7 +106,7 @@ def _hurt(rig: Rig, stage: Stage, fault: Fault | None, at: float) -> dict[str, f
         if stage.set_points:
             times, values = zip(*stage.set_points, strict=True)
             if not ask(rig.config, trajectory(times, {"y": values}), LED_S):
-                raise RigError("nobody took the reference")
+                raise RigError("no controller took the reference")
         if fault is not None:
             rig.run_until(rig.first_command + at)
             extra = fault.inflict(rig, rig.config.seed) or {}

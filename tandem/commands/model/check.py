@@ -104,7 +104,7 @@ class ModelCheck(Configured):
         sampled = bound = None
         # For matrices that are their own truth, h is zero.
         if not isinstance(true, Known):
-            with self.console.status("asking the true motion for h"):
+            with self.console.status("sampling h of the true motion"):
                 rng = np.random.default_rng(0)
                 sampled = sample_disturbance(model, step, SAMPLES, rng)
         if self.prove:
@@ -112,7 +112,7 @@ class ModelCheck(Configured):
         moved = reach(model, horizon)
         self.say(
             "",
-            f"moved: by full inputs in {horizon * model.period:.3g} s, the horizon, half-widths; W, h: per second",
+            f"moved: by full inputs over the horizon ({horizon * model.period:.3g} s), half-widths; W, h: per second",
         )
         self.console.print(_state_table(known, x0, moved, W, sampled, bound))
         self.console.print(_input_table(known))
@@ -226,7 +226,7 @@ def _input_table(known: Known) -> Table:
     from tandem.model_tables import plain
 
     limited = bool(np.isfinite(known.input_rates).any())
-    names = ("half-width", "u_e", "u_min", "u_max", "safe input", *("most a second",) * limited)
+    names = ("half-width", "u_e", "u_min", "u_max", "safe input", *("max per second",) * limited)
     shown = plain(Column("", style="bold"), *(Column(name, justify="right") for name in names))
     for i, name in enumerate(known.inputs):
         values, scale = (known.u_e[i], known.u_min[i], known.u_max[i], known.safe_input[i]), known.u_scale[i]

@@ -65,7 +65,7 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
     yield Finding(
         "ok", "feedback K", f"poles of A + BK, 1/s: {poles_text(poles(model.closed_loop, model.period))}"
     )
-    yield Finding("ok", "terminal cost", "P pays for every stage after the horizon")
+    yield Finding("ok", "terminal cost", "P is the cost of all stages after the horizon")
     yield _start(model, x0)
     yield from _safe(model, horizon, x0, step)
 
@@ -73,7 +73,7 @@ def findings(model: Model, horizon: int, x0: np.ndarray, step: Step) -> Iterator
 def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) -> Finding:
     """W, (d,) per second, against the h that was found."""
     lost = (
-        f"; from {found.lost} of {found.samples} states the motion cannot be followed" if found.lost else ""
+        f"; from {found.lost} of {found.samples} states the motion cannot be computed" if found.lost else ""
     )
     above = [
         f"{plant.states[i]} by a factor of {_factor(found.largest[i], W[i])}"
@@ -81,11 +81,12 @@ def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) 
     ]
     if not above:
         verdict: Verdict = "note" if found.lost else "ok"
-        return Finding(verdict, "W", f"holds h at {found.samples} points of X and U{lost}")
+        return Finding(verdict, "W", f"contains h at all {found.samples} sampled points of X and U{lost}")
     return Finding(
         "note",
         "W",
-        f"h is larger somewhere in X and U: {', '.join(above)}. What tightening promises holds where h is in W{lost}",
+        f"h exceeds W somewhere in X and U: {', '.join(above)}. Tightening guarantees "
+        f"nothing where h is outside W{lost}",
     )
 
 
@@ -101,8 +102,8 @@ def weights_finding(model: Model) -> Finding | None:
     if not cheap:
         return None
     text = (
-        f"a half-width costs, per second: {', '.join(cheap)}; {plant.inputs[most]} {inputs[most]:.2g}. The input "
-        "will hardly be used. controller.Q and R count squares of the plant's own units"
+        f"cost of one half-width, per second: {', '.join(cheap)}; {plant.inputs[most]} {inputs[most]:.2g}. The input "
+        "will hardly be used. controller.Q and R multiply squares in the plant's units"
     )
     return Finding("note", "weights", text)
 
@@ -116,10 +117,12 @@ def _stability(model: Model) -> Finding:
     found = poles(model.A, model.period)
     text = f"poles, 1/s: {poles_text(found)}"
     if found[0].real > 1e-9 * abs(found).max():
-        return Finding("ok", "unstable", f"{text}; by itself it grows e-fold in {1.0 / found[0].real:.3g} s")
+        return Finding(
+            "ok", "unstable", f"{text}; without input it grows e-fold in {1.0 / found[0].real:.3g} s"
+        )
     if found[0].real >= -1e-9 * abs(found).max():
-        return Finding("ok", "marginally stable", f"{text}; by itself it does not come back")
-    return Finding("ok", "stable", f"{text}; by itself it comes back")
+        return Finding("ok", "marginally stable", f"{text}; without input it does not return")
+    return Finding("ok", "stable", f"{text}; without input it returns")
 
 
 def _inputs(model: Model, horizon: int) -> Finding:
@@ -129,7 +132,7 @@ def _inputs(model: Model, horizon: int) -> Finding:
         for mode in unmoved_modes(plant.A, plant.B, plant.x_scale, plant.u_scale)
     ]
     if unmoved:
-        text = f"no input moves {', nor '.join(unmoved)}, which decays by itself"
+        text = f"no input moves {' or '.join(unmoved)}; it decays without input"
         return Finding("note", "controllability", text)
     weak = [
         f"{state} by {percent(moved)}"
@@ -140,7 +143,7 @@ def _inputs(model: Model, horizon: int) -> Finding:
         return Finding(
             "note",
             "controllability",
-            f"full inputs hardly move {', '.join(weak)} of a half-width within the horizon: a longer one would help",
+            f"full inputs move {', '.join(weak)} of a half-width only within the horizon; use a longer horizon",
         )
     return Finding("ok", "controllability", "the inputs move every state")
 
@@ -154,11 +157,11 @@ def _horizon(model: Model, horizon: int) -> Finding:
     grown, most = growth(model, horizon), longest_horizon(model)
     text = f"{horizon} steps ({seconds:.3g} s)"
     if grown > 1.0 + 1e-6:
-        limit = "" if most is None else f", and {most} steps are the most"
+        limit = "" if most is None else f"; the limit is {most} steps"
         text += f", in which a prediction grows by {_power(grown)}{limit}"
     text += (
-        f"; advised: {advised} steps ({advised * model.period:.3g} s), in which K brings all of X to within "
-        f"{SETTLED:g} half-widths"
+        f"; advised: {advised} steps ({advised * model.period:.3g} s), within which K brings all of X to "
+        f"within {SETTLED:g} half-widths of x_e"
     )
     return Finding("note" if 3 * horizon < advised else "ok", "horizon", text)
 
@@ -166,9 +169,9 @@ def _horizon(model: Model, horizon: int) -> Finding:
 def _dead_time(model: Model) -> Finding:
     seconds, periods = model.plant.dead_time, model.plant.dead_time / model.period
     grown = growth(model, math.ceil(periods))
-    text = f"{seconds:.3g} s, {periods:.3g} periods: the state is predicted to when an input acts"
+    text = f"{seconds:.3g} s, {periods:.3g} periods: the state is predicted over the dead time"
     if grown > DOUBLED:
-        text += f", and what is not known of it grows by a factor of {_power(grown)} until then"
+        text += f", and its error grows by a factor of {_power(grown)} meanwhile"
     return Finding("note" if grown > DOUBLED else "ok", "dead time", text)
 
 
@@ -178,7 +181,7 @@ def _power(factor: float) -> str:
 
 def _rows(plant: Known) -> Finding:
     listed = [
-        f"{name} = {value:.4g} at rest, of {low:g} to {high:g}"
+        f"{name} = {value:.4g} at x_e, u_e; limits {low:g} to {high:g}"
         for rows, rest in ((plant.state_rows, plant.x_e), (plant.input_rows, plant.u_e))
         for name, value, low, high in zip(
             rows.names, (rows.F @ rest).tolist(), rows.lower.tolist(), rows.upper.tolist(), strict=True
@@ -199,7 +202,7 @@ def _start(model: Model, x0: np.ndarray) -> Finding:
         for i in np.flatnonzero(rows.beyond(x0) > 0.0)
     ]
     if outside:
-        return Finding("note", "x0", f"outside of X: {'; '.join(outside)}")
+        return Finding("note", "x0", f"outside X: {'; '.join(outside)}")
     return Finding("ok", "x0", "in X")
 
 

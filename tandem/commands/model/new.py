@@ -29,8 +29,8 @@ class ModelNew(Command):
         plain = name.isprintable() and '"' not in name and "\\" not in name
         write_new(self.file, text.replace("THIS_FILE", name if plain else "FILE.py"))
         self.say(
-            f"{self.file}: PLANT by its equations, and MATRICES by numbers; keep one",
-            f"look at it: tandem model check {self.file}:PLANT",
+            f"{self.file}: PLANT has equations and MATRICES has matrices; keep one of them",
+            f"check it:   tandem model check {self.file}:PLANT",
             f"run it:     tandem run --set plant.model={self.file}:PLANT",
         )
         self.emit({"file": str(self.file), "names": ["PLANT", "MATRICES"]})

@@ -101,7 +101,7 @@ class ByHand(Configured):
             heard = commander.hear(min(said + every - now, end - now, LOOK_S))
             why = "" if heard is None else follower.take(heard)
             if not why and not follower.begun and now - began > limit:
-                why = "nobody took it"
+                why = "neither the plant nor a controller accepted it"
             if why:
                 return self._reason(commander, follower, why)
             if follower.state is not None and now - shown >= 1.0:
@@ -121,7 +121,7 @@ class ByHand(Configured):
         return follower.told or why if follower.mine else why
 
     def _ended(self, why: str, what: str) -> int:
-        self.say(f"no longer {what}: {why}" if why else "given back", style="yellow" if why else None)
+        self.say(f"{what} ended: {why}" if why else f"{what} ended", style="yellow" if why else None)
         self.emit({"ended": why or "given back"})
         return ENDED if why else 0
 
@@ -161,17 +161,17 @@ class Manual(ByHand):
 
         commander.hear_until(seen, patience(config))
         if follower.state is None:
-            raise terminal.Refused(f"no plant of {config.name} says anything at {config.bus.endpoint}")
+            raise terminal.Refused(f"no messages of a plant {config.name} at {config.bus.endpoint}")
         u = completed(named, plant, follower.state.acting)
         word = Override(
             run_id=commander.run_id, seq=0, mode="manual", u=u.tolist(), lease=lease_of(config.period)
         )
-        self.say(f"by hand: {figures(plant.inputs, u)}{clipped(u, plant)}; Ctrl-C gives it back")
+        self.say(f"manual control: {figures(plant.inputs, u)}{clipped(u, plant)}; Ctrl-C ends it")
         follower.told = ""
         why = self._stay(config, plant, commander, stopping, word, follower)
         if not (why and follower.begun):
             commander.say_last(Override(run_id=commander.run_id, seq=0, mode="auto"))
-        return self._ended(why, "by hand")
+        return self._ended(why, "manual control")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,12 +187,12 @@ class Pause(ByHand):
 
         word = Reference(run_id=commander.run_id, seq=0, kind="hold", lease=lease_of(config.period))
         follower = Follower(commander.run_id, Reference)
-        self.say("paused; Ctrl-C goes on")
+        self.say("paused; Ctrl-C ends the pause")
         why = self._stay(config, plant, commander, stopping, word, follower)
         # If another person gives a reference, that counts; `auto` is handled here.
         if not follower.elsewhere:
             commander.say_last(Reference(run_id=commander.run_id, seq=0, kind="configured"))
-        return self._ended(why, "paused")
+        return self._ended(why, "pause")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +216,7 @@ class Auto(Configured):
                     follower.take(heard)
                     source = "" if follower.state is None else follower.state.source
         if source in ("", "manual"):
-            why = "the plant is still driven by hand" if source else "no plant says anything"
+            why = "the plant is still under manual control" if source else "no messages of a plant"
             terminal.complain(f"{why} at {config.bus.endpoint}", self.json)
             return ENDED
         self.say(f"driven by: {source}")

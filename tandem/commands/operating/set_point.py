@@ -54,11 +54,11 @@ class SetPoint(Configured):
         results = ask(config, asked, self.seconds)
         if not results:
             text = f"no answer from a controller of {config.name} within {self.seconds:g} s"
-            terminal.complain(f"{text}: is it running?", self.json)
+            terminal.complain(f"{text}; check that it is running (`tandem health`)", self.json)
             return 1
         verdict, _, why = results[0].reference_verdict.partition(": ")
         if verdict != "taken":
-            terminal.complain(f"the controller refused it: {why}", self.json)
+            terminal.complain(f"the controller refused the reference: {why}", self.json)
             return 1
         self.say(words(results[-1]))
         self.emit(answer(results[-1]))
@@ -69,7 +69,7 @@ class SetPoint(Configured):
         from tandem.operating import set_points
 
         if (bool(self.values), self.file is not None, self.configured).count(True) != 1:
-            raise Refused("one of NAME=VALUE, --file and --configured is needed")
+            raise Refused("give exactly one of NAME=VALUE, --file and --configured")
         if self.configured:
             return m.Reference(run_id=set_points.UNSAID, seq=0, kind="configured")
         if self.file is not None:
@@ -91,11 +91,11 @@ def words(result: m.TickResult) -> str:
     """For a person."""
     now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
     if not now:
-        return f"taken in tick {result.seq}: plans lead to the equilibrium again"
+        return f"taken in tick {result.seq}: the target is the equilibrium again"
     rest = {
-        "reached": "the plant can rest there",
-        "nearest": f"out of reach: the nearest rest is off by {100.0 * (result.target_distance or 0.0):.3g} % of a "
-        "half-width",
-        "no rest": "no rest was found inside X and U",
+        "reached": "the plant has a steady state there",
+        "nearest": f"out of reach: the nearest steady state differs by {100.0 * (result.target_distance or 0.0):.3g} % "
+        "of a half-width",
+        "no rest": "no steady state was found inside X and U",
     }
     return f"taken in tick {result.seq}: {now} now, {rest.get(result.target_status, result.target_status)}"

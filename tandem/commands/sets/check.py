@@ -52,7 +52,7 @@ class SetsCheck(Configured):
             text = (
                 f"{len(sets.facets)} sets ({sets.certificate.kind}), {result['facets']} facets, {result['vertices']} "
                 f"vertices confirmed; margin {result['invariance_margin']:.2g} of X's half-widths\n"
-                f"h stays in W: {result['W']}\n"
+                f"h is in W: {result['W']}\n"
                 f"sha256 {sets.sha256}"
             )
             self.say(text)
@@ -74,14 +74,12 @@ class SetsCheck(Configured):
             if not verdict.ok:
                 return f"the claim does not hold: {verdict.reason}"
             if model.equations is None:
-                result["W"] = (
-                    "not looked at: the plant is numbers alone, without equations to hold it against"
-                )
+                result["W"] = "not checked: the plant has matrices only, and no equations to compare with"
                 return ""
             found = sample(certificate, model, self.samples)
             result |= {"samples": found.samples, "largest_excess_over_W": found.excess}
             if found.excess > HAIR:
-                return f"its W does not hold for the true plant: {found.where}"
+                return f"its W does not contain h of the true plant: {found.where}"
             result["W"] = f"sampled at {found.samples} states and inputs, not proved"
             if certificate.source_of_W == "given":
                 result["W"] += " (it is given)"
@@ -96,7 +94,7 @@ class SetsCheck(Configured):
             return f"its W is not proved for the true plant: {proof.reason}"
         # The checker's scales are half-widths rounded to powers of two.
         if 2 * proof.beyond >= verdict.margin:
-            return f"its W is proved to {proof.beyond:.2g} of X's half-widths, for a margin of {verdict.margin:.2g}"
+            return f"W is proved only to {proof.beyond:.2g} of X's half-widths, and the margin is {verdict.margin:.2g}"
         result["W"] = (
             f"proved by interval arithmetic on {proof.boxes} boxes, to {proof.beyond:.1g} of X's half-widths"
         )

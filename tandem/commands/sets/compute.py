@@ -54,7 +54,7 @@ class SetsCompute(Configured):
         from node_runtime.whole_file import require_regular
 
         if not 0.0 < self.slack < 1.0:
-            raise Refused(f"--slack {self.slack:g}: a share between 0 and 1")
+            raise Refused(f"--slack {self.slack:g}: choose a share between 0 and 1")
         try:
             require_regular(self.out)
         except OSError as error:
@@ -115,14 +115,14 @@ class SetsCompute(Configured):
         doubt = why_not_trusted(work)
         saved: Saved = SavedArrays(work.folder) if doubt is None else {}
         if doubt is not None:
-            self.say(f"{doubt}; computed without it", style="yellow")
+            self.say(f"{doubt}; computing without it", style="yellow")
         elif self.fresh:
             saved.clear()
         elif work.sets.exists():
             try:
                 return read_sets(work.sets), True
             except CertificateError as error:
-                self.say(f"{error}; computed again", style="yellow")
+                self.say(f"{error}; computing again", style="yellow")
         began = time.monotonic()
         tasks: dict[str, TaskID] = {}
         with terminal.share_bar(self.console) as bar:
@@ -137,14 +137,14 @@ class SetsCompute(Configured):
             try:
                 certificate = construct(model, kind, start, W, self.slack, saved=saved, report=report)
             except KeyboardInterrupt:
-                kept = f"is kept in {work.folder}: the same command goes on from there"
-                self.say(f"interrupted; what was done {kept if doubt is None else 'is lost'}")
+                kept = f"is kept in {work.folder}; the same command continues from there"
+                self.say(f"interrupted; the finished part {kept if doubt is None else 'is lost'}")
                 raise
             seconds = time.monotonic() - began
             proving = bar.add_task(f"{kind}: proving the claim", total=1.0)
             verdict = check(certificate, progress=lambda done: bar.update(proving, completed=done))
         if not verdict.ok:
-            raise SetError(f"constructed, but the checker refuses it: {verdict.reason}")
+            raise SetError(f"the sets were constructed, but the checker refuses them: {verdict.reason}")
         contains = Guard(certificate).first_inputs(start).piece >= 0
         found = Found(volume_fraction(certificate), verdict.margin, contains, seconds)
         sets = CertifiedSets.of(certificate, found)
@@ -207,14 +207,14 @@ def _meaning(sets: CertifiedSets, model: Model) -> str:
     given = certificate.source_of_W == "given"
     text = (
         f"From every state of {'this set' if count == 1 else f'these {count} sets'} the inputs of U can keep the plant "
-        f"in {'it' if count == 1 else 'them'}, and so in X, for ever: {certificate.model.plant} at "
+        f"in {'it' if count == 1 else 'them'}, and so in X, at all times: {certificate.model.plant} at "
         f"{1 / certificate.model.period:g} Hz, "
     )
     if not given:
-        return text + "whatever the true h does within its proved bound."
+        return text + "for every h within its proved bound."
     text += "as long as h stays in the W that was given."
     if model.equations is None:
-        return text + " There are no equations to hold it against."
+        return text + " The plant has no equations with which to check this."
     found = sample(certificate, model, WARNING_SAMPLES)
     if found.excess > HAIR:
         text += f"\nWarning: the plant's own equations leave that W: {found.where}."

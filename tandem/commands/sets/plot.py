@@ -56,7 +56,7 @@ class SetsPlot(Configured):
             if plant.name != sets.certificate.model.plant:
                 whose = self.config or "this configuration" if log is None else log
                 raise Refused(
-                    f"{whose}: is about {plant.name}, and the sets are of {sets.certificate.model.plant}"
+                    f"{whose}: has the plant {plant.name}, and the sets belong to {sets.certificate.model.plant}"
                 )
             model = build_model(plant, sets.certificate.model.period)
             require_match(sets.certificate, model)

@@ -33,7 +33,7 @@ PATIENCE_S = 300.0
 """How long a sweep waits for a scheduler that is gone, or for a worker."""
 LOOK_S = 1.0
 """How often the workers are counted."""
-KEPT = "the finished runs are kept: the same command goes on from there"
+KEPT = "the finished runs are kept; the same command continues from there"
 
 
 class Cluster:
@@ -61,6 +61,8 @@ class Cluster:
         self._address, self._bundle, self._notice, self._patience = address, bundle, notice, patience
         self._accepted: dict[str, int] = {}
         """Threads by address."""
+        self._folders: dict[str, str] = {}
+        """Each known worker's own folder by address: another one means that the worker was started again."""
         self._preparing: dict[str, DaskFuture] = {}
         self._refused: dict[str, str] = {}
         self._under_way: dict[DaskFuture, tuple[Future[Answer], set[str]]] = {}
@@ -112,9 +114,10 @@ class Cluster:
 
     def close(self) -> None:
         """Cancel what is under way, and leave the cluster as it was."""
-        with contextlib.suppress(OSError, asyncio.TimeoutError, asyncio.CancelledError):
-            self._client.cancel(list(self._under_way), force=True)
-        self._client.close(timeout=5)
+        with contextlib.suppress(OSError, RuntimeError, asyncio.CancelledError):
+            if self._client.status == "running":
+                self._client.cancel(list(self._under_way), force=True)
+            self._client.close(timeout=5)
 
     def _done(self, sent: DaskFuture) -> None:
         """In a thread of Dask's."""
@@ -124,7 +127,7 @@ class Cluster:
         try:
             answer = sent.result(timeout=60)
             future.set_result(answer if isinstance(answer, Failure) else pickle.loads(answer))
-        except asyncio.CancelledError as error:
+        except (asyncio.CancelledError, TimeoutError) as error:
             future.set_exception(Lost(str(error)))
         except Exception as error:  # noqa: BLE001 - of Dask, a worker or what either could not unpickle
             future.set_result(Failure(kind="crash", text=f"{type(error).__name__}: {error}", traceback=""))
@@ -134,12 +137,15 @@ class Cluster:
     def _look(self) -> None:
         """Find out which workers there are, have new ones prepared, and forget those that are gone."""
         there = self._workers()
-        for address in [address for address in self._accepted if address not in there]:
+        folders = {address: info["local_directory"] for address, info in there.items()}
+        new = {address for address in folders if folders[address] != self._folders.get(address)}
+        for address in [address for address in self._accepted if address not in there or address in new]:
             del self._accepted[address]
             self._notice(f"worker {address} is gone; {len(self._accepted)} left")
         for known in (self._refused, self._preparing):
-            for address in [address for address in known if address not in there]:
+            for address in [address for address in known if address not in there or address in new]:
                 del known[address]
+        self._folders = folders
         for address in there.keys() - self._accepted.keys() - self._refused.keys() - self._preparing.keys():
             self._preparing[address] = self._client.submit(
                 prepare, self._bundle, pure=False, workers=[address], allow_other_workers=False
@@ -169,6 +175,8 @@ class Cluster:
         """The workers as the scheduler says now; None where it does not answer."""
         try:
             # A client tries to connect again for some seconds, and then closes itself.
+            if self._client.status != "running":
+                self._lose_all()
             if self._client.status == "closed":
                 self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False)
             if self._client.status != "running":
@@ -179,6 +187,14 @@ class Cluster:
         except (OSError, RuntimeError):
             return None
         return workers
+
+    def _lose_all(self) -> None:
+        """Have all runs handed over again."""
+        for sent in list(self._under_way):
+            future, _workers = self._under_way.pop(sent, (None, None))
+            if future is not None:
+                future.set_exception(Lost("the scheduler is gone"))
+        self._folders = {}
 
     def _decide(self, address: str, info: dict[str, Any], future: DaskFuture) -> None:
         name = f"worker {info['name']}" if info["name"] == address else f"worker {info['name']} ({address})"
@@ -208,7 +224,7 @@ def why_not(facts: Facts | Failure) -> str | None:
         return f"Tandem does not run there: {facts.text}"
     ours = provenance.versions(PACKAGES)
     other = [
-        f"{name} {facts.versions.get(name) or 'is missing'}, here {ours.get(name) or 'is none'}"
+        f"{name} {facts.versions.get(name) or 'is missing'}, here {ours.get(name) or 'none'}"
         for name in sorted(ours.keys() | facts.versions.keys())
         if facts.versions.get(name) != ours.get(name)
     ]

@@ -43,7 +43,7 @@ def _state(results: list[CaseResult], plant: Description, i: int) -> Chart:
 
 
 def _whole(result: CaseResult) -> list[Traces]:
-    """Of the runs in which the plant was not lost."""
+    """Return the traces of the runs in which the plant was not lost."""
     return [r.traces for r in result.records if r.traces is not None and r.lost is None]
 
 

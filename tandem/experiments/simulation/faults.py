@@ -23,7 +23,7 @@ class Drift(Section, frozen=True):
     def plants(self, plant: Known | Plant | TrueMotion) -> list[tuple[float, Plant]]:
         """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
         if not isinstance(plant, Plant):
-            raise KeyError("the true plant has no equations, and so there is nothing that drifts")
+            raise KeyError("the true plant has no equations, and so no parameter can drift")
         pieces = RAMP_PIECES if self.over > 0 else 1
         made = []
         for share in (np.arange(1, pieces + 1) / pieces).tolist():

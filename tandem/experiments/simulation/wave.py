@@ -32,7 +32,7 @@ def require_fit(values: Values, plant: Description, where: str) -> None:
         or not all(values.values())
     ):
         raise ConfigError(
-            f"{where}: give as many states as the plant has inputs ({plant.m}), each with as many values as the others"
+            f"{where}: give as many states as the plant has inputs ({plant.m}), each with the same number of values"
         )
     for name, every in values.items():
         i = states.index(name)
@@ -80,6 +80,6 @@ def _rest(
     found = root(off, np.zeros(plant.d + plant.m), tol=1e-12)
     if not np.abs(off(found.x)).max() < CLOSE:
         raise PlantError(
-            f"the true plant has no rest with {', '.join(plant.states[i] for i in own)} at {r.tolist()}"
+            f"the true plant has no steady state with {', '.join(plant.states[i] for i in own)} at {r.tolist()}"
         )
     return plant.x_e + found.x[: plant.d] * x_scale, plant.u_e + found.x[plant.d :] * u_scale

@@ -142,7 +142,7 @@ def run_all(
             continue
         record = read(folder / f"{key}.json", want.detail)
         if record is None:
-            raise RunnerError(f"{folder}: {key}.json was there and is gone or cannot be read; run again")
+            raise RunnerError(f"{folder}: {key}.json was deleted or damaged during the run; run again")
         records[key] = record
     return Made(records, sweep.failures)
 

@@ -1,4 +1,4 @@
-"""What a log lacks is said, and what is behind a gap is replayed all the same."""
+"""Replay reports the messages that a log lacks, and replays the ticks after a gap."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_replay_continues_after_a_gap_and_says_so(run: Run, first: int, count: i
     (note,) = (note for note in found.notes if "gap" in note)
     ticks = "1 tick" if count == 1 else f"{count} ticks"
     assert note.startswith(f"gap of {ticks} at tick {first} of ")
-    assert note.endswith(f"the recorder lost them; replay goes on at tick {again}, behind the next keyframe")
+    assert note.endswith(f"the recorder lost them; replay continues at tick {again}, after the next keyframe")
 
 
 def test_a_difference_behind_a_gap_is_found(run: Run) -> None:
@@ -50,7 +50,7 @@ def test_a_difference_behind_a_gap_is_found(run: Run) -> None:
 def test_the_last_tick_of_a_whole_run_may_be_lost_too(run: Run) -> None:
     found = replay(edited(run, topics.TICK, STEPS - 1, lambda _: None))
     assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS - 1, 1)
-    assert any("no keyframe behind it" in note for note in found.notes)
+    assert any("no later keyframe" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,16 @@ def test_the_last_tick_of_a_whole_run_may_be_lost_too(run: Run) -> None:
 def test_missing_messages_of_a_tick_are_named(run: Run, topic: Topic, seq: int, name: str) -> None:
     found = replay(edited(run, topic, seq, lambda _: None))
     assert (found.equal, found.ticks, found.lost_ticks) == (True, STEPS, 1)
-    assert any(f"not compared, the recorder lost them: {name} of tick {seq} " in note for note in found.notes)
+    assert any(
+        f"not compared because the recorder lost them: {name} of tick {seq} " in note for note in found.notes
+    )
 
 
 def test_many_gaps_and_unreadable_ticks_are_named(run: Run) -> None:
     run.streams[topics.TICK.name] = [e for e in run.entries(topics.TICK) if e.message.seq % 2]
     run.bad["controller/tick: malformed"] = 45
     found = replay(run)
-    # One tick behind the keyframes of 24 and 74; there is none behind that of 49.
+    # One tick after the keyframes of 24 and 74; none after that of 49.
     assert (found.equal, found.ticks, found.lost_ticks) == (True, 2, STEPS - 2)
     gaps = [note for note in found.notes if note.startswith("gap of 1 tick at tick ")]
     assert len(gaps) == 3
@@ -101,7 +103,7 @@ def test_a_log_that_begins_late_names_its_first_replayable_tick(run: Run) -> Non
 
 
 def test_a_run_without_a_keyframe_does_not_keep_the_others_from_being_replayed(run: Run) -> None:
-    """A controller came back while its router was away, and died again before its next keyframe."""
+    """A controller restarted while its router was down, and died again before its next keyframe."""
     second, sums = "controller-second", {}
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.RUN_INFO["controller"]):
         for entry in run.entries(topic)[:10]:
@@ -136,7 +138,7 @@ def test_a_cut_log_and_its_recovered_copy_replay_up_to_the_cut(log: Path, tmp_pa
 
 
 def test_a_killed_controller_may_leave_an_incomplete_tick(run: Run) -> None:
-    """Its last health is not "stopping"; then the last tick may lack what was still in the queue."""
+    """Its last health is not "stopping", so messages of the last tick may have been lost in the queue."""
     health = m.Health(run_id=RUN, seq=0, process="controller", status="running", counters={}, note="")
     died = edited(run, topics.RESULT, STEPS - 1, lambda _: None)
     assert any("result of tick 89" in note for note in replay(died).notes)

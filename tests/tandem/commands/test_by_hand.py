@@ -1,4 +1,4 @@
-"""`tandem manual` and `tandem auto` at a gateway on a router; and what a session makes of what it hears."""
+"""`tandem manual` and `tandem auto` at a gateway on a router, and the messages that end a session."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ U = float(PLANT.u_e[0])
 
 
 class Machine:
-    """Stands still, whatever it is given."""
+    """A machine that does not move for any input."""
 
     def __init__(self) -> None:
         self.written: list[float] = []
@@ -45,7 +45,7 @@ class Machine:
 
 @contextmanager
 def served(config: Config) -> Iterator[Machine]:
-    """A gateway behind a router, nobody commands it."""
+    """Serve a gateway at a router, without a controller."""
     machine, stop = Machine(), threading.Event()
     thread = threading.Thread(target=Gateway(None, config).serve, args=(machine.read, machine.write, stop))
     with open_router(config):
@@ -59,7 +59,7 @@ def served(config: Config) -> Iterator[Machine]:
 
 @contextmanager
 def by_hand(*arguments: str) -> Iterator[list[int]]:
-    """`tandem manual` beside the block, which ends with it; its exit code, once there is one."""
+    """Run `tandem manual` during the block; yield a list that gets its exit code."""
     code: list[int] = []
     session = threading.Thread(target=lambda: code.append(main(["manual", *arguments])))
     session.start()
@@ -82,24 +82,24 @@ def test_manual_control_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert "given back" in said
         assert "manual" in said
         assert U + 0.02 in machine.written
-        # Where there is no way back from such an input, it never acts: the plant says which state and when.
+        # An input from which X could not be kept never acts: the plant names the state and the time.
         machine.x = PLANT.x0
         assert main(["manual", "u=99", "--seconds", "9", *at]) == 1
         assert "would leave X within" in capsys.readouterr().out
         assert PLANT.u_max[0] not in machine.written
         machine.x = PLANT.x_e
-        # From elsewhere.
+        # From another sender.
         with by_hand(f"u={U + 0.03}", "--seconds", "30", *at) as code:
             wait_for(lambda: machine.written[-1] == U + 0.03)
             assert main(["auto", *at]) == 0
         assert code == [1]
-        assert "gave it back to the controller" in capsys.readouterr().out
+        assert "returned the plant to the controller" in capsys.readouterr().out
         states = ear.of(topics.PLANT_STATE)
         notes = {one.note for name, one in ear.heard if name == topics.HEALTH["plant"].name}
     assert {state.source for state in states} - {"hold"} == {"safe", "manual"}
-    # On a busy machine many periods are no whole ones.
+    # On a busy machine many periods are incomplete.
     assert [U + 0.02] in [state.applied for state in states if state.source == "manual"]
-    assert any(note.startswith("driven by hand (commander-") for note in notes)
+    assert any(note.startswith("under manual control (commander-") for note in notes)
 
 
 @pytest.mark.live
@@ -125,7 +125,7 @@ def test_manual_control_needs_a_commander_certificate_and_ends_with_it(
         issue(keys, "brief", "commander.jet1", 4.0 / 86400.0)
         with by_hand(f"u={U + 0.02}", "--seconds", "5", *far("brief")):
             wait_for(lambda: U + 0.02 in machine.written)
-            # The session goes on saying it, and nobody hears it: the lease is over.
+            # The session repeats its message, but the expired certificate cuts the link: the lease ends.
             wait_for(lambda: machine.written[-1] != U + 0.02)
 
 
@@ -136,7 +136,7 @@ def state(seq: int, source: str = "command", run_id: str = "plant-1") -> m.Plant
 
 
 def begun() -> Follower:
-    """Of somebody who drives by hand."""
+    """Return the follower of a manual session that the plant has accepted."""
     follower = Follower("me", m.Override)
     follower.take(state(7))
     follower.said()
@@ -152,9 +152,9 @@ def word(mode: str, seq: int, run_id: str) -> m.Override:
 
 def test_events_that_end_a_manual_session() -> None:
     assert begun().take(word("manual", 0, "other")) == "other took over"
-    assert begun().take(word("auto", 0, "other")) == "other gave it back to the controller"
-    assert begun().take(state(10)) == "the plant is not driven by hand any more"
-    assert begun().take(state(0, "safe", "plant-2")) == "the gateway was started again"
+    assert begun().take(word("auto", 0, "other")) == "other returned the plant to the controller"
+    assert begun().take(state(10)) == "the plant is no longer under manual control"
+    assert begun().take(state(0, "safe", "plant-2")) == "the gateway was restarted"
     for none in (word("manual", 5, "other"), word("auto", 3, "me"), state(10, "manual")):
         assert begun().take(none) == ""
 
@@ -171,8 +171,8 @@ def test_an_earlier_manual_session_is_not_taken_for_ones_own() -> None:
 
 def test_events_that_end_a_pause() -> None:
     for message, why in (
-        (word("auto", 0, "other"), "other gave it back to the controller"),
-        (m.Reference(run_id="other", seq=3), "other said where to go"),
+        (word("auto", 0, "other"), "other returned the plant to the controller"),
+        (m.Reference(run_id="other", seq=3), "other gave another reference"),
         (word("manual", 0, "other"), ""),
         (m.Reference(run_id="me", seq=3), ""),
     ):
@@ -183,7 +183,7 @@ def test_events_that_end_a_pause() -> None:
 
 def test_inputs_are_named_and_the_others_stay() -> None:
     assert assignments(["u=1.2"], PLANT) == {"u": 1.2}
-    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a number"), ("u=inf", "finite")):
+    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a finite number"), ("u=inf", "finite")):
         with pytest.raises(Refused, match=says):
             assignments([text], PLANT)
     scale = {"x1": 1.0, "a": 1.0, "b": 1.0}

@@ -1,4 +1,4 @@
-"""`tandem health`: what it says and its exit code for each way a process can be."""
+"""`tandem health`: its text and exit code for every status of a process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.live
 
 @pytest.fixture(scope="module")
 def config() -> Iterator[Config]:
-    """Of a bus with a router on it and nobody else."""
+    """The configuration of a bus with a router and no other process."""
     config = live_config()
     with open_router(config):
         yield config
@@ -46,7 +46,7 @@ def test_the_exit_code_follows_the_status(
     ):
         ear = BusListener(other)
         said.set(status, "held at x0")
-        # What it said before is on nobody's way any more.
+        # After that no older message is still on its way.
         ear.until(health_of("plant", status=status, note="held at x0"))
         assert health.answer(config, "plant", HANG_S, as_json=False) == code
         assert capsys.readouterr().out == f"plant: {status}: held at x0\n"
@@ -62,7 +62,7 @@ def test_another_process_does_not_answer_for_it(config: Config, capsys: pytest.C
     ):
         said.set("running")
         assert health.answer(config, "trainer", 1.0, as_json=False) == 1
-    assert "trainer: not heard of for 1 s at tcp/127.0.0.1:" in capsys.readouterr().out
+    assert "trainer: no message for 1 s at tcp/127.0.0.1:" in capsys.readouterr().out
 
 
 def test_garbage_is_not_health(config: Config) -> None:
@@ -120,7 +120,7 @@ def test_one_health_thread_lets_many_speak_until_they_leave(config: Config) -> N
         runs = {bus.run_id for bus in buses}
 
         def spoke(at_least: int, among: set[str]) -> bool:
-            """Each says what it is, and how it is more than once."""
+            """Each process sends its run info, and its health more than once."""
             infos = {message.run_id for message in ear.of(topics.RUN_INFO["plant"])}
             healths = [(message.run_id, message.seq) for message in ear.of(topics.HEALTH["plant"])]
             return among <= infos and all((run, at_least) in healths for run in among)

@@ -1,4 +1,4 @@
-"""`tandem model check`: a look at a plant that names all that is wrong with it, and what is worth a look."""
+"""`tandem model check` reports all faults of a plant, and notes on unusual properties."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def a_small_terminal_in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 @pytest.fixture
 def mine(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Make a plant known as "mine"."""
+    """Register a plant under the name "mine"."""
     return lambda plant: monkeypatch.setitem(PLANTS, "mine", plant)
 
 
@@ -43,13 +43,13 @@ def checked(capsys: Capture, *words: str) -> tuple[int, dict[str, Any]]:
 
 
 def refused(capsys: Capture, plant: str) -> str:
-    """The faults, without the time that parsing a command line takes."""
+    """Return the faults, without parsing a command line."""
     assert ModelCheck(plant=plant, json=True).run() == 2
     return " ".join(json.loads(capsys.readouterr().out)["faults"])
 
 
 def said(capsys: Capture, *words: str) -> tuple[int, str]:
-    """As one line, for a table breaks its sentences."""
+    """Return the output as one line, because a table breaks its sentences."""
     code = main(["model", "check", *words])
     seen = capsys.readouterr()
     assert all(len(line) <= 80 for line in seen.out.splitlines())
@@ -65,10 +65,10 @@ def test_a_plant_without_faults_is_shown_with_its_numbers(mine: Any, capsys: Cap
     code, text = said(capsys, "mine", "--rate", "0.2", *slow)
     assert code == 0
     assert "tanks: equations, linearised at (x_e, u_e); a sample every 5 s" in text
-    assert "poles, 1/s: -0.0125, -0.0221; by itself it comes back" in text
+    assert "poles, 1/s: -0.0125, -0.0221; without input it returns" in text
     assert "the inputs move every state" in text
     assert "24 steps (120 s); advised:" in text
-    assert "holds h at 500 points of X and U" in text
+    assert "contains h at all 500 sampled points of X and U" in text
     assert "the safe input keeps it in X for 240 s" in text
     for word in ("wrong", "look"):
         assert word not in text
@@ -79,7 +79,7 @@ def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys:
     rows = {"stop": {"x1": 1.0, "x2": 0.5, "max": 0.7, "priority": 1}}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], rows=rows, **limits))
     code, text = said(capsys, "mine")
-    assert "stop = 0 at rest, of -inf to 0.7" in text
+    assert "stop = 0 at x_e, u_e; limits -inf to 0.7" in text
     code, text = said(capsys, "mine", "--set", "plant.x0=[0.5,0.5]")
     assert "stop = 0.75, the row is [-inf, 0.7]" in text
     code, found = checked(capsys, "mine", "--set", "plant.rows.stop={x1=1.0,max=-0.1}")
@@ -90,7 +90,7 @@ def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys:
 def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
-    assert "poles, 1/s: 0, 0; by itself it does not come back" in said(capsys, "mine")[1]
+    assert "poles, 1/s: 0, 0; without input it does not return" in said(capsys, "mine")[1]
 
 
 def test_a_state_that_no_sensor_determines_is_a_fault(mine: Any, capsys: Capture) -> None:
@@ -144,7 +144,7 @@ def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, caps
     code, found = checked(capsys, "mine")
     assert (code, found["period"]) == (0, 0.02)
     assert found["A"] == A.tolist()
-    # Of numbers that are their own truth h is zero, and no figure.
+    # For matrices that are their own truth, h is zero and not shown.
     assert found["h_sampled"] is None
     code, found = checked(capsys, "mine", "--rate", "10")
     assert code == 2
@@ -155,7 +155,7 @@ def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, caps
 
 
 def beside(**extra: Any) -> Plant:
-    """A pendulum beside a temperature that cools down by itself."""
+    """A pendulum, and a temperature that decays without input."""
     fields: dict[str, Any] = {
         "states": ("angle", "rate", "heat"),
         "units": {**PENDULUM.units, "heat": "K"},
@@ -172,19 +172,19 @@ def beside(**extra: Any) -> Plant:
 
 
 NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
-    "W that h exceeds": (PENDULUM, TEN, "W", r"h is larger somewhere in X and U: .*rate by a factor of \d"),
+    "W that h exceeds": (PENDULUM, TEN, "W", r"h exceeds W somewhere in X and U: .*rate by a factor of \d"),
     "W that h exceeds by far": (
         replace(PENDULUM, W=np.array([0.01, 0.001])),
         TEN,
         "W",
-        r"rate by a factor of \d\d0\. What",
+        r"rate by a factor of \d\d0\. Tightening",
     ),
     "W of zero": (beside(), TEN, "W", r"angle by a factor of infinity \(W is 0\)"),
-    "x0 outside of X": (
+    "x0 outside X": (
         replace(PENDULUM, x0=np.array([1.5, 0.0])),
         TEN,
         "x0",
-        r"outside of X: angle = 1.5, X is \[-1, 1\]",
+        r"outside X: angle = 1.5, X is \[-1, 1\]",
     ),
     "a safe input that does not keep it": (
         PENDULUM,
@@ -208,13 +208,13 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         beside(),
         TEN,
         "controllability",
-        "no input moves heat, which decays by itself",
+        "no input moves heat; it decays without input",
     ),
     "a state that is hardly moved": (
         replace(TANKS, u_min=TANKS.u_e - 0.1, u_max=TANKS.u_e + 0.1),
         ("--rate", "0.2", "--set", "controller.horizon=2"),
         "controllability",
-        "full inputs hardly move h1 by .* h2 by .* a longer one would help",
+        "full inputs move h1 by .* h2 by .* only within the horizon; use a longer horizon",
     ),
     "a short horizon": (
         TANKS,
@@ -226,7 +226,7 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         PENDULUM,
         (*TEN, "--set", "controller.Q=[1e-4, 1]"),
         "weights",
-        r"per second: angle 0.0001; torque 9\. .* squares of the plant's own units",
+        r"per second: angle 0.0001; torque 9\. .* squares in the plant's units",
     ),
     "a dead time in which an unstable plant runs away": (
         replace(PENDULUM, dead_time=0.6),
@@ -238,7 +238,7 @@ NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
         replace(TANKS, x_min=np.array([-9.0, 1.0])),
         ("--rate", "0.2"),
         "W",
-        r"from \d+ of 500 states the motion cannot be followed",
+        r"from \d+ of 500 states the motion cannot be computed",
     ),
 }
 

@@ -1,4 +1,4 @@
-"""Whose sets are believed: files that were edited or made up, caches that others may write, and outputs."""
+"""Which sets are trusted: edited and forged files, caches that others can write, and outputs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("known_pendulum")
 
 
 def test_a_w_that_h_leaves_only_between_samples_is_refused(cached: Path, capsys: pytest.CaptureFixture[str]):
-    """A few states in a corner of X are enough, which none of 100 samples met."""
+    """A few states in a corner of X suffice, although none of 100 samples is there."""
     sets = read_sets(cached / "sets.json")
     base = sets.certificate.pieces[0]
     W = np.array(base.W)
@@ -106,7 +106,7 @@ def test_the_cache_is_written_for_its_owner_alone_whatever_the_umask(cached: Pat
 
 
 def spoil(cached: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cache as somebody else could have written it, or may."""
+    """Change the cache so that another user could have written it, or can write it."""
     folder = cached / "cache" / "tandem" / "sets"
     (file,) = folder.glob("*.json")
     if how == "folder":
@@ -145,7 +145,7 @@ def test_sets_that_another_user_could_have_written_are_not_used(
     monkeypatch.setattr(construction, "predecessor_iteration", _none)
     assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 3
     assert "not trusted" in (shown := " ".join(capsys.readouterr().out.split()))
-    assert "computed without it" in shown
+    assert "computing without it" in shown
     assert sorted((cached / "cache").rglob("*")) == before
 
 
@@ -169,7 +169,7 @@ def test_installed_sets_are_used_if_the_cache_is_not_trusted(
     write_sets(read_sets(SHIPPED / "moore_greitzer-20Hz-regions.json.gz"), work.sets, 0o666)
     work.sets.chmod(0o666)
     assert find_sets(config, model, tmp_path).certificate.model.plant == "moore_greitzer"
-    # Somebody's own plant may have the same name and matrices, and another h.
+    # A user's plant may have the same name and matrices, and another h.
     theirs = model.require_equations("this test")
     cubic = replace(theirs, rhs=lambda x, u: [dx + (x[0] - theirs.x_e[0]) ** 3 for dx in theirs.rhs(x, u)])
     for own in (replace(model, equations=cubic), replace(model, equations=None)):

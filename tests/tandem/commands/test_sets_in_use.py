@@ -1,4 +1,4 @@
-"""`tandem sets` as a person meets it, and runs with the tightening `invariant`, on a plant with quick sets."""
+"""`tandem sets` at the command line, and runs with the tightening `invariant`, on a plant with quick sets."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_ctrl_c_loses_nothing_and_names_the_command_to_continue(
     with monkeypatch.context() as patch:
         patch.setattr(construction, "controllable_sets", interrupted)
         assert main(["sets", "compute", *OPTIONS, "--out", "again.json"]) == 130
-    assert "the same command goes on from there" in capsys.readouterr().out
+    assert "the same command continues from there" in capsys.readouterr().out
     assert not (cached / "again.json").exists()
 
     iterate = construction.predecessor_iteration
@@ -91,7 +91,7 @@ def test_a_given_w_that_the_plant_leaves_is_reported(cached: Path, capsys: pytes
     assert main(["sets", "compute", *options, "--kind", "given", "--out", "given.json"]) == 0
     assert "Warning: the plant's own equations leave that W" in capsys.readouterr().out
     assert main(["sets", "check", "given.json", *OPTIONS]) == 3
-    assert "its W does not hold for the true plant: in piece C, from x =" in capsys.readouterr().err
+    assert "its W does not contain h of the true plant: in piece C, from x =" in capsys.readouterr().err
 
 
 def test_a_plant_of_numbers_has_sets_of_a_given_w(
@@ -102,10 +102,10 @@ def test_a_plant_of_numbers_has_sets_of_a_given_w(
     assert main(["sets", "compute", *options, "--out", "box.json", "--kind", "box"]) == 3
     assert "numbers alone" in capsys.readouterr().err
     assert main(["sets", "compute", *options, "--out", "given.json", "--kind", "given"]) == 0
-    assert "There are no equations to hold it against." in capsys.readouterr().out
+    assert "The plant has no equations with which to check this." in capsys.readouterr().out
     assert main(["sets", "check", "given.json", *options, "--json"]) == 0
-    assert told(capsys)["W"].startswith("not looked at: the plant is numbers alone")
-    # In force, with the pendulum's equations as the truth, replayed from numbers.
+    assert told(capsys)["W"].startswith("not checked: the plant has matrices only")
+    # The sets are in use, the pendulum's equations are the truth, and the replay has numbers only.
     monkeypatch.setitem(PLANTS, "rod", replace(PENDULUM, name="rod"))
     config = invariant("controller.sets=given.json", "plant.truth=rod", "plant.x0=[0.3,0.0]")
     ran = follow(config, 30, Faults(command_seconds=0.03)).run
@@ -122,7 +122,7 @@ def test_a_whole_file_passes(cached: Path, capsys: pytest.CaptureFixture[str]):
     assert result["invariance_margin"] > 0
     assert result["W"].startswith("proved by interval arithmetic on")
     assert main(["sets", "check", "sets.json", *OPTIONS, "--no-prove"]) == 0
-    assert "h stays in W: sampled at" in (shown := capsys.readouterr().out)
+    assert "h is in W: sampled at" in (shown := capsys.readouterr().out)
     assert "not proved" in shown
 
 
@@ -147,7 +147,7 @@ def test_a_run_is_replayed_from_its_log_alone(cached: Path):
     again = replay(read_run(log))
     assert again.equal
     assert again.ticks == 30
-    # Proof that the sets matter: without them the commands differ.
+    # The sets have an effect: without them the commands differ.
     assert not replay(read_run(log), overrides=["controller.tightening=first_step"]).equal
 
 

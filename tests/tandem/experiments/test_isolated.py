@@ -1,4 +1,4 @@
-"""A call in a process of its own: whatever it does ends that process, and the caller goes on."""
+"""A call in a separate process: any failure ends only that process, and the caller continues."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the monitor of a run makes of messages: counts, events, and who is silent."""
+"""The monitor of a run: counts, events, and silent processes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_process_without_messages_is_shown_as_silent(monitor: Monitor):
     "bad",
     [
         Delivery(topics.PLANT_STATE.key(CONFIG.name), b"\xff", 0),
-        Delivery("tandem/jet1/nobody/knows", b"", 0),
+        Delivery("tandem/jet1/not/known", b"", 0),
         delivery(topics.PLANT_STATE, state(60, float("nan")), START + 2.5),
         delivery(topics.PLANT_STATE, state(3), START + 2.5),
     ],
@@ -58,6 +58,14 @@ def test_bad_messages_are_counted_and_not_shown(monitor: Monitor, bad: Delivery)
     after = monitor.snapshot(START + 2.5)
     assert after.states == before.states
     assert after.bad_messages == before.bad_messages + 1
+
+
+def test_a_users_own_topic_is_no_bad_message(monitor: Monitor) -> None:
+    before = monitor.snapshot(START + 2.5).bad_messages
+    monitor.feed(Delivery("tandem/jet1/user/weather/wind", b"\xff", 0))
+    assert monitor.snapshot(START + 2.5).bad_messages == before
+    monitor.feed(Delivery("tandem/jet2/user/weather/wind", b"\xff", 0))
+    assert monitor.snapshot(START + 2.5).bad_messages == before + 1
 
 
 def test_of_simultaneous_messages_every_tick_counts_and_only_the_newest_state_is_read() -> None:
@@ -94,16 +102,16 @@ def plant_row(now: Snapshot) -> tuple[str, str]:
 
 def test_a_plant_that_publishes_only_states_counts_as_running() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
-    assert plant_row(seen.snapshot(START)) == ("not heard of", "")
+    assert plant_row(seen.snapshot(START)) == ("no message", "")
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
-    assert plant_row(seen.snapshot(START + 1.0)) == ("running", "says only its states")
+    assert plant_row(seen.snapshot(START + 1.0)) == ("running", "publishes only states")
     assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "")
-    # One that was chatty may be followed by one that is not.
+    # A plant that sends health may be followed by one that does not.
     seen.feed(delivery(topics.HEALTH["plant"], health("plant", {}, "as usual"), START + 3.0))
     assert plant_row(seen.snapshot(START + 3.0)) == ("running", "as usual")
     assert plant_row(seen.snapshot(START + 6.0)) == ("silent", "as usual")
     seen.feed(delivery(topics.PLANT_STATE, state(99), START + 6.0))
-    assert plant_row(seen.snapshot(START + 6.0)) == ("running", "says only its states")
+    assert plant_row(seen.snapshot(START + 6.0)) == ("running", "publishes only states")
 
 
 def test_a_slow_plant_is_not_silent_between_two_samples() -> None:
@@ -121,7 +129,7 @@ def test_a_bad_message_is_reported_once() -> None:
     for _ in range(3):
         seen.feed(Delivery(topics.PLANT_STATE.key(CONFIG.name), msgspec.msgpack.encode(fields), 0))
     (event,) = seen.new_events()
-    assert event.text == "plant/state: malformed: Object missing required field `source`; not obeyed"
+    assert event.text == "plant/state: malformed: Object missing required field `source`; ignored"
     assert seen.bad.total == 3
 
 
@@ -132,9 +140,9 @@ def test_begin_and_end_of_manual_control_are_reported() -> None:
         seen.feed(delivery(topics.PLANT_STATE, driven, START + k))
         seen.feed(delivery(topics.COMMAND, command(k), START + k))
         now = seen.snapshot(START + k)
-        # What is shown of the input is what acts.
+        # The display shows the acting input.
         assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
-    assert [event.text for event in now.events if "hand" in event.text] == [
-        "the plant is driven by hand",
-        "the plant is no longer driven by hand: plan",
+    assert [event.text for event in now.events if "manual" in event.text] == [
+        "the plant is under manual control",
+        "the plant is no longer under manual control: plan",
     ]

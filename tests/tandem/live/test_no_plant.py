@@ -1,4 +1,4 @@
-"""`tandem run --no-plant`: it waits for a plant, takes one that uses none of its code, and another after that."""
+"""`tandem run --no-plant` waits for a plant, accepts one without Tandem's code, and then another one."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def test_a_plant_of_others_comes_and_goes_and_another_one_comes(tmp_path: Path) 
     at = config.bus.endpoint
     there = ("--set", f"bus.endpoint={at}")
     with launched(tmp_path, "--no-plant", "--oracle", "constant", *there, *small()) as run:
-        run.hears(f"waiting for the plant: its router is at {at}")
-        run.hears("it publishes 4 states (z, y, r, rdot) at 20 Hz as tandem/jet1/plant/state")
+        run.hears(f"waiting for a plant to connect to the router at {at}")
+        run.hears("the plant must publish 4 states (z, y, r, rdot) at 20 Hz as tandem/jet1/plant/state")
         with running("examples/gateway_without_tandem.py", at) as gateway:
             run.hears(" ticks, ", times=2)
             with Bus(config, "controller", "hostile") as bus:
@@ -60,13 +60,13 @@ def test_a_plant_of_others_comes_and_goes_and_another_one_comes(tmp_path: Path) 
                 wait_for(lambda: matched(bus, topics.COMMAND))
                 bus.publish(topics.COMMAND, attack)
                 bus.publish(topics.COMMAND, msgspec.structs.replace(attack, plan=[[float("nan")]]))
-                run.hears("plant: bad controller command foreign; not obeyed")
-                run.hears("plant: bad controller command not finite; not obeyed")
+                run.hears("plant: bad controller command foreign; ignored")
+                run.hears("plant: bad controller command not finite; ignored")
             gateway.send_signal(signal.SIGKILL)
             run.hears("the plant is silent: no state for")
         with running("-m", "tandem", "plant", *there):
-            run.hears("the plant was started again after")
-            run.hears(" ticks, ", times=2, after="the plant was started again after")
+            run.hears("the plant was restarted after")
+            run.hears(" ticks, ", times=2, after="the plant was restarted after")
             run.signal(signal.SIGINT)
             code, result = run.ends()
     assert code == 0, run.said

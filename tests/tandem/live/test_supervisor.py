@@ -1,4 +1,4 @@
-"""`tandem run` with its real processes: what it leaves, what it survives, and that nothing is left running."""
+"""`tandem run` with its real processes: its files, the failures that it survives, and that no process remains."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.live
 
 
 def live() -> list[str]:
-    """Arguments for a run that browsers can look at."""
+    """Return the arguments for a run with a live view in the browser."""
     pytest.importorskip("websockets", reason="pip install 'tandem-control[live]'")
     return ["--live", "--set", f"live.port={free_endpoint().rpartition(':')[2]}"]
 
@@ -42,7 +42,7 @@ def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path:
     with launched(tmp_path, *small()) as run:
         run.hears("hidden weights 1 adopted")
         run.kill("trainer")
-        run.hears("the trainer died (killed by SIGKILL); started again in 0.5 s")
+        run.hears("the trainer died (killed by SIGKILL); it restarts in 0.5 s")
         wait_for(lambda: len(trainers()) == 2, PATIENCE_S, every=0.2)
         run.signal(signal.SIGINT)
         code, result = run.ends()
@@ -67,7 +67,7 @@ def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path:
 
 def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
     with socket.socket() as other:
-        # A live view that finds its port taken is no reason not to run.
+        # A run starts even if the port of the live view is in use.
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
@@ -91,7 +91,7 @@ def test_a_closed_terminal_ends_the_display_and_not_the_loop(tmp_path: Path, out
     done = subprocess.run(
         ["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
-    # A full disk is said by the exit code: the figures are lost. A reader may leave.
+    # The exit code reports a full disk, because the figures are lost. A closed pipe is not an error.
     assert done.returncode == (1 if "full" in output else 0), done.stderr
     assert done.stderr == ""
     ran = read_run(log)
@@ -126,7 +126,7 @@ def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
         time.sleep(0.5)  # sooner it would count as the same Ctrl-C
         run.signal(signal.SIGINT)
         code, result = run.ends()
-    # Had it waited for them to stop, as after a first Ctrl-C, it would have ended otherwise.
+    # After a first Ctrl-C it would have waited for them to stop, with another exit code.
     assert code == 130, run.said
     assert "tandem recover" in result["error"]
 
@@ -152,11 +152,11 @@ def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
 
 
 def test_a_dead_recorder_or_live_view_is_reported_and_the_loop_continues(tmp_path: Path):
-    loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop goes on"
+    loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop continues"
     with launched(tmp_path, "--oracle", "linear", *live()) as run:
         run.hears("the first command")
         run.kill("live")
-        run.hears("the live-view died (killed by SIGKILL); the run goes on without it")
+        run.hears("the live-view died (killed by SIGKILL); the run continues without it")
         run.kill("record")
         run.hears(" ticks, ", times=3, after=loudly)
         run.signal(signal.SIGINT)
@@ -167,7 +167,7 @@ def test_a_dead_recorder_or_live_view_is_reported_and_the_loop_continues(tmp_pat
     ]
     assert ticks[-1] > ticks[0]
     assert code == 1
-    assert "the recorder did not end well" in result["error"]
+    assert "the recorder ended early" in result["error"]
 
 
 def test_a_process_that_cannot_start_is_named_with_its_own_message(tmp_path: Path):
@@ -178,7 +178,7 @@ def test_a_process_that_cannot_start_is_named_with_its_own_message(tmp_path: Pat
         with launched(tmp_path, "--set", f'bus.endpoint="tcp/127.0.0.1:{port}"') as run:
             code, result = run.ends()
     assert code == 1
-    assert "the router did not get ready" in result["error"]
+    assert "the router was not ready" in result["error"]
     assert f"127.0.0.1:{port} is taken" in result["error"]
 
 
@@ -187,7 +187,7 @@ def test_a_configuration_that_admits_no_controller_is_a_configuration_error(tmp_
     with launched(tmp_path, *arguments) as run:
         code, result = run.ends()
     assert code == 2, result
-    assert "the controller did not get ready" in result["error"]
+    assert "the controller was not ready" in result["error"]
 
 
 def test_files_are_moved_aside_together_and_two_runs_do_not_meet(tmp_path: Path):
@@ -205,7 +205,7 @@ def test_files_are_moved_aside_together_and_two_runs_do_not_meet(tmp_path: Path)
         assert (tmp_path / "a.2.png").read_text() == "a.png"
         assert (tmp_path / "a.1.png").read_text() == "a.1.png"
         log.write_text("growing")
-        with pytest.raises(Refused, match="another run is writing it"), claimed(log):
+        with pytest.raises(Refused, match="another run is writing this log"), claimed(log):
             pass
         assert log.read_text() == "growing"
     with claimed(log) as (_, moved):
@@ -243,7 +243,7 @@ def test_any_name_of_a_log_is_moved_aside_again_and_again(tmp_path: Path, name: 
 def test_a_pipe_or_a_link_with_the_name_of_a_runs_file_keeps_its_place(
     tmp_path: Path, taken: str, make: Callable[[Path], None]
 ):
-    (tmp_path / "elsewhere").write_text("somebody else's")
+    (tmp_path / "elsewhere").write_text("another file")
     if taken != "a.mcap":
         (tmp_path / "a.mcap").write_text("an older run")
     make(tmp_path / taken)

@@ -1,4 +1,4 @@
-"""What the live view shows of what the monitor knows, and that it fits every terminal."""
+"""The live view shows the monitor's data and fits every terminal."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def test_a_sensor_fault_is_reported_once_and_shown(monitor: Monitor) -> None:
         if k == 51:
             now = monitor.snapshot(START + 2.6)
             assert "sensor y is stuck since 2.5 s; what it measures is estimated" in view.line(now)
-            assert "not believed" in "\n".join(drawn(now, 120, 40))
+            assert "not trusted" in "\n".join(drawn(now, 120, 40))
     said = [event.text for event in monitor.snapshot(START + 2.7).events if "sensor" in event.text]
     assert said == [
         "tick 50: sensor y is stuck since 2.5 s; what it measures is estimated from the others",
-        "tick 52: sensor y is believed again",
+        "tick 52: sensor y is trusted again",
     ]
 
 
@@ -104,7 +104,7 @@ def test_events_report_when_learning_adds_nothing_and_when_it_counts_again() -> 
     panel, line, events = after(63, 0.0, 0.3)
     assert "counts 30%" in panel
     assert "nothing" not in line
-    assert "learning counts again" in events
+    assert "learning has an effect again" in events
 
 
 def test_noise_that_was_found_is_shown_of_the_states_that_are_measured() -> None:
@@ -166,7 +166,7 @@ def test_a_silent_plant_and_its_return_are_reported() -> None:
     )
     seen.miss_plant(START + 7.0)
     seen.feed(delivery(topics.PLANT_STATE, again, START + 8.0))
-    assert said()[-1] == "the plant was started again after 5.0 s, as q: a new episode"
+    assert said()[-1] == "the plant was restarted after 5.0 s as q: a new episode"
 
 
 def test_a_state_without_bounds_has_an_axis_as_long_as_its_scale() -> None:

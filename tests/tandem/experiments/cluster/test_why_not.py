@@ -1,4 +1,4 @@
-"""Which workers are refused, and what is said of them."""
+"""The workers that are refused, and the reasons that are reported."""
 
 from __future__ import annotations
 
