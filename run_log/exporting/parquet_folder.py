@@ -29,7 +29,7 @@ class ParquetFolder:
 
     Args:
         folder: an existing, empty folder.
-        about: facts about the log: configuration, versions, units. NAME becomes the key "tandem.NAME", a JSON text.
+        about: facts about the log: configuration, versions, units. NAME becomes the key "tandem.NAME" (JSON).
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any]):

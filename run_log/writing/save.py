@@ -1,4 +1,4 @@
-"""Puts a run that only exists in memory (a simulation's) into a log like that of a live run."""
+"""Writes a run that is only in memory, such as a simulation, into a log like that of a live run."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class LogWriter:
         continued: the part in which the log continues; None: it is the last.
 
         Raises:
-            LogError: the file does not hold everything; `tandem recover` saves what it holds.
+            LogError: the file is incomplete; `tandem recover` saves its messages.
         """
         if continued is not None:
             self._mcap.add_metadata(CONTINUED, {"in": readable(continued.name)})
