@@ -129,7 +129,7 @@ class Experiment(Command):
         return 1 if made.failed else 0
 
     def _workplace(self) -> Callable[[Iterable[Config]], Workplace]:
-        """What makes the place where the runs are made."""
+        """Return the function that opens the workplace of the runs."""
         from tandem.experiments.study.runner import Processes
 
         if self.cluster is None:
