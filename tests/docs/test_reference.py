@@ -56,6 +56,13 @@ def test_a_help_text_is_read_by_its_boxes() -> None:
     assert dict(read.options)["--architecture FILE:NAME"].endswith("(default: none)")
 
 
+def test_every_role_is_on_the_page_with_what_it_publishes() -> None:
+    page = messages.page()
+    assert "| viewer |  | everything |" in page
+    assert "| user | `user/**` |" in page
+    assert "| commander | `operator/reference`, `operator/override` | everything |" in page
+
+
 @pytest.mark.parametrize("topic", topics.ALL, ids=lambda topic: topic.name)
 def test_every_topic_and_its_message_is_on_the_page(topic: topics.Topic) -> None:
     page = messages.page()

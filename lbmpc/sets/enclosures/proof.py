@@ -82,7 +82,7 @@ def prove(
         found = _rows(np.array(piece.W), model.plant.x_scale)
         if found is None:
             return Proved(
-                f"in piece {piece.name},    W is flat in a direction that is not a state's axis", np.inf, 0
+                f"in piece {piece.name}, W is flat in a direction that is not a state's axis", np.inf, 0
             )
         rows.append(found)
     work = _Work(_of_certificate(model, certificate.model), certificate, rows)

@@ -47,7 +47,7 @@ def sample(certificate: Certificate, model: Model, samples: int, seed: int = 0) 
             worst, at = float(excess.max()), int(excess.argmax())
             state, given = x[at] + model.plant.x_e, u[at] + model.plant.u_e
             where = (
-                f"in piece {piece.name},    from x = {np.array2string(state, precision=6)} with u = "
-                f"{np.array2string(given, precision=6)}, h is outside of W by {worst:.3g} of X's half-widths"
+                f"in piece {piece.name}, from x = {np.array2string(state, precision=6)} with u = "
+                f"{np.array2string(given, precision=6)}, h is outside W by {worst:.3g} of X's half-widths"
             )
     return Sampled(asked, worst, where)
