@@ -51,7 +51,7 @@ def gather(configs: Iterable[Config]) -> Bundle:
             total += path.stat().st_size
             if total > LARGEST:
                 raise ConfigError(
-                    f"{folder}: its files would travel to the workers, and they are more than {LARGEST >> 20} MiB; "
+                    f"{folder}: its files must be sent to the workers, and they exceed {LARGEST >> 20} MiB; "
                     f"{REMEDY}"
                 )
             files[path.name] = _read(path)

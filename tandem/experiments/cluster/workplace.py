@@ -141,7 +141,7 @@ class Cluster:
         new = {address for address in folders if folders[address] != self._folders.get(address)}
         for address in [address for address in self._accepted if address not in there or address in new]:
             del self._accepted[address]
-            self._notice(f"worker {address} is gone; {len(self._accepted)} left")
+            self._notice(f"worker {address} is lost; {len(self._accepted)} left")
         for known in (self._refused, self._preparing):
             for address in [address for address in known if address not in there or address in new]:
                 del known[address]
@@ -167,9 +167,9 @@ class Cluster:
                 return found
             if not said:
                 said = True
-                self._notice(f"the scheduler at {self._address} is gone; waiting for it")
+                self._notice(f"the scheduler at {self._address} is lost; waiting for it")
             sleep(LOOK_S)
-        raise RunnerError(f"the scheduler at {self._address} was gone for {self._patience:.0f} s; {KEPT}")
+        raise RunnerError(f"the scheduler at {self._address} was lost for {self._patience:.0f} s; {KEPT}")
 
     def _ask(self) -> dict[str, dict[str, Any]] | None:
         """Return the workers that the scheduler reports now; None if it does not answer."""
@@ -203,7 +203,7 @@ class Cluster:
         except asyncio.CancelledError:
             return
         except Exception as error:  # noqa: BLE001 - of a worker that lacks Tandem or is otherwise not like this process
-            why = f"Tandem does not run there: {type(error).__name__}: {error}"
+            why = f"Tandem does not run on it: {type(error).__name__}: {error}"
         if why is None:
             self._accepted[address] = info["nthreads"]
             self._notice(f"{name} has joined, {info['nthreads']} runs at a time")
@@ -221,7 +221,7 @@ class Cluster:
 def why_not(facts: Facts | Failure) -> str | None:
     """Return why a worker must not make runs; None if it has the code and the packages of this process."""
     if isinstance(facts, Failure):
-        return f"Tandem does not run there: {facts.text}"
+        return f"Tandem does not run on it: {facts.text}"
     ours = provenance.versions(PACKAGES)
     other = [
         f"{name} {facts.versions.get(name) or 'is missing'}, here {ours.get(name) or 'none'}"

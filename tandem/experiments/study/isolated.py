@@ -95,11 +95,11 @@ class Child:
             while not self._channel.poll(POLL_S):
                 if self._memory() > limits.memory_gib * GIB:
                     self.kill()
-                    text = f"stopped: it held more than {limits.memory_gib:g} GiB of memory"
+                    text = f"stopped: it used more than {limits.memory_gib:g} GiB of memory"
                     return Failure(kind="memory", text=text, traceback="")
                 if monotonic() > ends:
                     self.kill()
-                    text = f"stopped: it had not ended after {limits.seconds:g} s"
+                    text = f"stopped: it did not end within {limits.seconds:g} s"
                     return Failure(kind="time", text=text, traceback="")
                 if not wanted():
                     self.kill()
@@ -137,8 +137,8 @@ class Child:
             return "its process closed the connection"
         if code >= 0:
             return f"its process ended with exit code {code}"
-        hint = ", perhaps by the system for want of memory" if -code == signal.SIGKILL else ""
-        return f"its process was ended by {signal.Signals(-code).name}{hint}"
+        hint = ", perhaps by the system because memory ran out" if -code == signal.SIGKILL else ""
+        return f"its process was killed by {signal.Signals(-code).name}{hint}"
 
 
 class Children:
