@@ -57,7 +57,7 @@ def test_an_exception_is_told_with_its_traceback_and_the_process_goes_on(child: 
     [
         ((os._exit, 3), "ended with exit code 3"),
         ((os.abort,), "ended by SIGABRT"),
-        ((exec, "import os; os.kill(os.getpid(), 9)"), "killed by SIGKILL, perhaps by the system because memory ran out"),
+        ((exec, "import os; os.kill(os.getpid(), 9)"), "killed by SIGKILL, perhaps by the system because memory"),
     ],
     ids=["exit", "abort", "kill"],
 )  # fmt: skip
