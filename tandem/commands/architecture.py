@@ -20,7 +20,7 @@ class ArchitectureCheck(Command):
     EXTRAS = "trainer"
 
     name: Annotated[Positional[str], arg(metavar="FILE:NAME")]
-    """As for network.architecture: gru.py:GRU, or a shipped one."""
+    """The architecture, as in network.architecture: gru.py:GRU, or a shipped one."""
 
     def run(self) -> int:
         """Return 0 if they agree on networks of random sizes, as far as the architecture accepts them, else 1."""

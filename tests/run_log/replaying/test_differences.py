@@ -195,7 +195,7 @@ def test_a_log_has_the_facts_on_which_its_arithmetic_depends(run: Run) -> None:
             1e-12,
             True,
             None,
-            "the log does not contain its processor, blas: ",
+            "the log does not contain its processor, blas, so ",
         ),
         ({}, 1e-12, True, False, ""),
     ],

@@ -70,7 +70,7 @@ def test_packages_and_shipped_plants_stay_as_they_are(folder: Path, tmp_path: Pa
 
 def test_a_folder_that_is_too_large_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bundle, "LARGEST", 10)
-    with pytest.raises(ConfigError, match=f"{folder}: its files would travel .* folder of its own"):
+    with pytest.raises(ConfigError, match=f"{folder}: its files must be sent .* folder of its own"):
         gather([config(folder, plant={"model": "tanks.py:TANKS"})])
 
 
