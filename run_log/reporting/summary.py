@@ -72,8 +72,8 @@ class Summary(Performance, frozen=True, kw_only=True):
     constant_weight: dict[str, float] | None
     """Weight of the constant beside it, likewise."""
     noise: dict[str, float] | None
-    """Standard deviation of the measurement of each state as estimated at the end, plant units; null if it is configured
-    or there is no estimator."""
+    """Standard deviation of the measurement of each state as estimated at the end, plant units; null if it is
+    configured or there is no estimator."""
     outside_ticks: int | None
     """Ticks in a state outside the certified sets, where nothing is guaranteed; null without sets."""
     smallest_set_margin: float | None
