@@ -78,7 +78,7 @@ class SetPoint(Configured):
 
 
 def answer(result: m.TickResult) -> dict[str, object]:
-    """What `--json` prints."""
+    """Return the object that `--json` prints."""
     return {
         "tick": result.seq,
         "reference": result.reference,
@@ -88,7 +88,7 @@ def answer(result: m.TickResult) -> dict[str, object]:
 
 
 def words(result: m.TickResult) -> str:
-    """For a person."""
+    """Return the answer as text for a person."""
     now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
     if not now:
         return f"taken in tick {result.seq}: the target is the equilibrium again"
