@@ -140,4 +140,6 @@ def _layout(plant: Description) -> rrb.Blueprint:
 
 def _plot(plant: Description, name: str, series: Sequence[str], what: str = "") -> rrb.TimeSeriesView:
     title = Column(what + name, "number", plant.units.get(name, "")).title
-    return rrb.TimeSeriesView(name=title, origin="/", contents=[f"/{one}/{name}" for one in series])
+    # Names are escaped as those of the series are.
+    contents = [rr.new_entity_path([*one.split("/"), *name.split(".")]) for one in series]
+    return rrb.TimeSeriesView(name=title, origin="/", contents=contents)

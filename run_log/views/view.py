@@ -79,15 +79,24 @@ def _of_samples(samples: m.Samples) -> Json:
 
 def _of_output_weights(weights: m.OutputWeights) -> Json:
     K = weights.K.numpy()
-    # If K is not a matrix, the norm along its first axis is one number, which has the wrong size.
-    columns = np.atleast_1d(np.linalg.norm(K, axis=0))
-    return {"norm": float(np.linalg.norm(K)), "column_norms": columns.tolist()}
+    if K.ndim != 2:
+        raise ValueError(f"K is {K.shape}, not a matrix")
+    return {"norm": float(_norm(K)), "column_norms": _norm(K, axis=0).tolist()}
 
 
 def _of_hidden_weights(weights: m.HiddenWeights) -> Json:
-    norms = [float(np.linalg.norm(layer.numpy())) for layer in weights.layers]
+    norms = [float(_norm(layer.numpy())) for layer in weights.layers]
     newest = None if weights.newest is msgspec.UNSET else weights.newest
     return {"newest": newest, "layer_norms": norms}
+
+
+def _norm(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Norms, at most the largest float: JSON has no infinity."""
+    with np.errstate(over="ignore"):
+        found = np.linalg.norm(values, axis=axis)
+        if not np.isfinite(found).all():
+            found = np.minimum(np.linalg.norm(values.astype(float), axis=axis), np.finfo(float).max)
+    return found
 
 
 def _of_reference(reference: m.Reference) -> Json:

@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
 from lbmpc.plants import get_plant
@@ -22,6 +23,7 @@ from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
 from run_log.exporting import tables
 from run_log.exporting.export import Exported, export
+from run_log.exporting.rerun_file import _plot
 from run_log.file_format import READABLE
 from run_log.reading.reader import read_run
 from run_log.run import Run
@@ -178,6 +180,12 @@ def test_rerun_has_series_events_and_a_layout(exported: Exported, out: Path, run
         if "SeriesLines:names" in chunk.to_record_batch().schema.names
     }
     assert names["/plant/state/x/rdot"] == [["x.rdot [1/s]"]]
+
+
+def test_the_plots_of_rerun_name_the_series_as_they_are_written() -> None:
+    plant = get_plant("moore_greitzer")
+    (path,) = _plot(plant, "mass flow", ["plant/state/x"]).contents
+    assert path == rr.new_entity_path(["plant", "state", "x", "mass flow"])
 
 
 def series(path: Path) -> dict[str, tuple[list[int], list[Any]]]:

@@ -106,3 +106,18 @@ def test_weights_of_the_wrong_shape_have_no_view(shape: tuple[int, ...]) -> None
     weights = m.OutputWeights(run_id="c", seq=0, hidden_version=0, hidden_sha256="", K=K)
     with pytest.raises(codec.BadMessage, match="wrong size"):
         VIEWS[topics.OUTPUT_WEIGHTS.name].render(weights)
+
+
+def test_norms_beyond_the_largest_float_are_numbers_and_K_is_a_matrix() -> None:
+    huge = m.Array.of(np.full((3, 4), 1e200))
+    weights = m.OutputWeights(run_id="c-1", seq=0, hidden_version=0, hidden_sha256="", K=huge)
+    shown = json.loads(VIEWS["controller/output_weights"].render(weights).data)
+    assert {shown["norm"], *shown["column_norms"].values()} == {np.finfo(float).max}
+    hidden = next(message for _, message in messages() if isinstance(message, m.HiddenWeights))
+    hidden = msgspec.structs.replace(hidden, layers=[huge, m.Array.of(np.full((2, 2), 1e30), "<f4")])
+    norms = json.loads(VIEWS["trainer/hidden_weights"].render(hidden).data)["layer_norms"]
+    assert norms == pytest.approx([np.finfo(float).max, 2e30])
+    for shape in ((4,), (3, 4, 2), ()):
+        strange = msgspec.structs.replace(weights, K=m.Array.of(np.ones(shape)))
+        with pytest.raises(codec.BadMessage, match="not a matrix"):
+            VIEWS["controller/output_weights"].render(strange)
