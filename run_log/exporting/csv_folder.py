@@ -11,7 +11,18 @@ from typing import Any
 from run_log.exporting.table import Batch, Kind, Table
 
 ABOUT = "about.json"
-TEXTS: dict[Kind, Callable[[Any], str]] = {"boolean": json.dumps, "numbers": json.dumps}
+
+
+def _with_newlines(text: str) -> str:
+    """Carriage returns as newlines: Python does not quote a lone one, and readers end the row there."""
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+TEXTS: dict[Kind, Callable[[Any], str]] = {
+    "boolean": json.dumps,
+    "numbers": json.dumps,
+    "string": _with_newlines,
+}
 """Texts for values that Python writes in another way."""
 
 
@@ -63,7 +74,7 @@ class CsvFolder:
 
 
 def _titles(table: Table) -> list[str]:
-    return [column.title for column in table.columns]
+    return [_with_newlines(column.title) for column in table.columns]
 
 
 def _write(path: Path, mode: str, rows: Iterable[list[Any]]) -> None:

@@ -15,6 +15,8 @@ from run_log.views.channel import VIEW, Channel, Json, Shown
 ROWS = 8192
 """Number of rows of a table that are written together."""
 LONGEST_STEM = 120
+LARGEST = 2**63 - 1
+"""Tables hold signed 64-bit integers. Only a forged message has a larger one."""
 CLOCKS = {("plant/state", "t"): "plant_time", ("controller/tick", "t"): "loop_time"}
 """Names of time columns with their clock, by table and field."""
 KINDS: dict[str, Kind] = {"number": "number", "integer": "integer", "boolean": "boolean", "string": "string"}
@@ -130,6 +132,8 @@ def _value(values: Any, field: _Field) -> Any:
     match field.column.kind:
         case "number":
             return float(values)
+        case "integer":
+            return values if abs(values) <= LARGEST else None
         case "numbers":
             return [float(value) for value in values]
         case "json":

@@ -94,8 +94,12 @@ class Room:
     def __init__(self, taken: int):
         self._free, self.used = MOST_LEAVES - taken, 0
 
+    @property
+    def full(self) -> bool:
+        return self.used >= self._free
+
     def take(self) -> bool:
-        if self.used >= self._free:
+        if self.full:
             return False
         self.used += 1
         return True
@@ -124,7 +128,7 @@ class _Object:
             known = self._fields.get(name)
             if isinstance(value, dict):
                 inner = known if isinstance(known, _Object) else None
-                if inner is None and (known is not None or deep <= 1):
+                if inner is None and (known is not None or deep <= 1 or new.full):
                     continue
                 inner = inner or _Object()
                 if found := inner.take(value, new, deep - 1):
@@ -164,8 +168,11 @@ def _plain(value: Any) -> tuple[str, Any]:
     if isinstance(value, dict):
         return "", value
     if isinstance(value, list):
-        entries = [_plain(one) for one in value[:MOST_ENTRIES]]
-        if entries and all(kind == "number" for kind, _ in entries):
-            return "numbers", [one for _, one in entries]
-        return "", {f"item_{i}": one for i, one in enumerate(value[:MOST_ENTRIES])}
+        entries = value[:MOST_ENTRIES]
+        # Lists within lists are looked at one level at a time: a message may have hundreds of levels.
+        if entries and all(type(one) in (int, float) for one in entries):
+            plain = [_plain(one) for one in entries]
+            if all(kind == "number" for kind, _ in plain):
+                return "numbers", [one for _, one in plain]
+        return "", {f"item_{i}": one for i, one in enumerate(entries)}
     return "", None

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from lbmpc.plants import Description
 from node_runtime.config.sections import Config
 from protocol import codec, topics
-from protocol.messages import TickResult
+from protocol.messages import Health, RunInfo, TickResult
 from run_log.views.arrival import COUNTED, LostTicks, SendTimes
 from run_log.views.channel import Channel, Shown
 from run_log.views.events import Events
@@ -17,6 +17,8 @@ from run_log.views.user_topics import UserView
 from run_log.views.view import views
 
 MOST_USER_TOPICS = 64
+RARE = (Health, RunInfo)
+"""Types of messages that all have a view, whatever the rate."""
 
 
 class Seen(NamedTuple):
@@ -52,8 +54,10 @@ class Views:
         self._lost = LostTicks(config.bus.follow_silence)
         self._times = SendTimes()
         self._users: dict[str, UserView] = {}
+        # Of messages that are rare the newest counts, and their events need all of them.
         self._every_ns: dict[str, int] = {
-            name: int(1e9 / (most_hz or view.topic.view_hz)) for name, view in self._views.items()
+            name: 0 if view.topic.type in RARE else int(1e9 / (most_hz or view.topic.view_hz))
+            for name, view in self._views.items()
         }
         self._user_every_ns = int(1e9 / (most_hz or topics.VIEW_HZ))
         self._due: dict[str, int] = {}
@@ -123,7 +127,7 @@ class Views:
         return []
 
     def _of_user(self, name: str, payload: bytes, time_ns: int) -> list[Shown]:
-        if time_ns < self._due.get(name, 0):
+        if len(payload) > topics.USER_MAX_BYTES or time_ns < self._due.get(name, 0):
             return []
         view = self._users.get(name)
         if view is None:

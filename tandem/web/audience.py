@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from run_log.views.channel import Channel
 from tandem.web import foxglove_protocol as protocol
 
+WAITING_REFUSALS = 100
+"""Text frames that may wait for one viewer. Beyond that a refusal is not sent."""
 WAITING_BYTES = 2 * 1024 * 1024
 """Bytes of messages that may wait for one viewer. Beyond that the oldest message is dropped."""
 
@@ -31,6 +33,11 @@ class Viewer:
         """Send a text frame, before all messages that wait."""
         self._words.append(text)
         self._something.set()
+
+    def refuse(self, text: str) -> None:
+        """Tell the viewer that a request is not granted, unless it reads no answers."""
+        if len(self._words) < WAITING_REFUSALS:
+            self.say(protocol.refusal(text))
 
     def show(self, channel: int, time_ns: int, payload: bytes) -> None:
         """Send a message of a channel if the viewer has subscribed to it."""
@@ -123,33 +130,28 @@ class Audience:
     def obey(self, viewer: Viewer, text: str | bytes) -> None:
         """Carry out a request of a viewer, or answer that it is not offered."""
         if isinstance(text, bytes):
-            viewer.say(
-                protocol.refusal("this server accepts no messages: it shows a bus and publishes nothing")
-            )
+            viewer.refuse("this server accepts no messages: it shows a bus and publishes nothing")
             return
         try:
             request = protocol.request_of(text)
         except ValueError as error:
-            viewer.say(protocol.refusal(f"invalid request: {error}"))
+            viewer.refuse(f"invalid request: {error}")
             return
         match request:
             case protocol.Subscribe(subscriptions=wanted):
                 self._subscribe(viewer, wanted)
             case protocol.Unsubscribe(subscriptionIds=ids):
-                kept = {c: s for c, s in viewer.subscriptions.items() if s not in ids}
+                gone = set(ids)
+                kept = {c: s for c, s in viewer.subscriptions.items() if s not in gone}
                 viewer.subscriptions = kept
             case protocol.Unknown(op=op):
-                viewer.say(
-                    protocol.refusal(
-                        f"{op[:40]!r} is not offered: this server shows a bus and publishes nothing"
-                    )
-                )
+                viewer.refuse(f"{op[:40]!r} is not offered: this server shows a bus and publishes nothing")
 
     def _subscribe(self, viewer: Viewer, wanted: Iterable[protocol.Subscription]) -> None:
         for one in wanted:
             advertised = self._by_id.get(one.channelId)
             if advertised is None or not 0 <= one.id < 2**32 or one.channelId in viewer.subscriptions:
-                viewer.say(protocol.refusal(f"no subscription {one.id} to channel {one.channelId}"))
+                viewer.refuse(f"no subscription {one.id} to channel {one.channelId}")
                 continue
             viewer.subscriptions[one.channelId] = one.id
             for time_ns, payload in advertised.kept:

@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 MOST_VIEWERS = 32
 MOST_NAMED = 20
 """Origins that are named in the log when they are refused."""
+CLOSE_S = 0.5
+"""How long the server waits, at its end, for viewers that do not read."""
 LARGEST_REQUEST = 256 * 1024
 """Bytes of one request of a viewer: it names channels."""
 
@@ -89,7 +91,12 @@ async def serving(audience: Audience, documents: Mapping[str, Document], port: i
         # Broken handshakes are no events of the system.
         logger=_quiet(),
     ) as server:
-        yield next(iter(server.sockets)).getsockname()[1]
+        try:
+            yield next(iter(server.sockets)).getsockname()[1]
+        finally:
+            for connection in server.connections:
+                # Its transport would wait for room until a ping is overdue.
+                asyncio.get_running_loop().call_later(CLOSE_S, connection.transport.abort)
 
 
 async def _send(connection: ServerConnection, viewer: Viewer) -> None:

@@ -20,12 +20,12 @@ def checked(address: str) -> str:
     full = address if "://" in address else f"tcp://{address}"
     try:
         parts = urlsplit(full)
-        host, port = parts.hostname, parts.port
+        scheme, host, port, path = parts.scheme, parts.hostname, parts.port, parts.path
     except ValueError:
-        host = port = None
-    if parts.scheme not in ("tcp", "tls") or not host or not port or parts.path.strip("/"):
+        scheme, host, port, path = "", None, None, ""
+    if scheme not in ("tcp", "tls") or not host or not port or path.strip("/"):
         raise ConfigError(f"--cluster {address}: not the address of a Dask scheduler; for example {EXAMPLES}")
-    if parts.scheme == "tcp" and not _is_loopback(host, address):
+    if scheme == "tcp" and not _is_loopback(host, address):
         raise ConfigError(
             f"--cluster {address}: leaves this machine without TLS. Anyone who reaches such a scheduler can run code "
             f"on its workers. Start it with certificates and write tls://{host}:{port}, or reach it through a tunnel "

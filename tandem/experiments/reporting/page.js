@@ -50,7 +50,8 @@
 
   function rangeOfY(chart) {
     return (u, low, high) => {
-      if (low == null || high == null) return [0, 1];
+      // No line to show, as when a person has switched off all. A logarithmic axis cannot begin at 0.
+      if (low == null || high == null) return chart.scale === "log" ? [0.1, 10] : [0, 1];
       if (chart.scale === "log") {
         const levels = (chart.levels || []).map((level) => level.y).filter((y) => y > 0);
         return [Math.min(low, ...levels) / 1.3, Math.max(high, ...levels) * 1.8];

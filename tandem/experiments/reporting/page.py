@@ -152,6 +152,8 @@ def _part(group: Group, results: list[CaseResult], plant: Description, command: 
 def _drawn(picture: pictures.Picture) -> Drawn:
     shown = picture.drawn
     if isinstance(shown, Chart):
+        if not shown.lines:
+            return Drawn("", "", b"", f"{picture.caption} There is no line to draw.", picture.alt)
         return Drawn(_json(to_page(shown)), "", style.png(chart_figure(shown)), picture.caption, picture.alt)
     png = style.png(shown)
     # The layout is known; computing it again would take as long as drawing.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -46,8 +47,17 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def key(self) -> str:
         """Hash of everything that the result depends on: settings, code, and the user's own files."""
-        files = msgspec.json.encode(files_of(self.config))
+        files = msgspec.json.encode(files_read(self.config))
         return hashlib.sha256(msgspec.json.encode(self) + files + code_version().encode()).hexdigest()[:24]
+
+
+def files_read(config: Config) -> dict[str, str]:
+    """Return the sha256 of the files that a run of this configuration reads, by key: code, and certified sets."""
+    found, sets = files_of(config), config.controller.sets
+    if config.controller.tightening == "invariant" and sets is not None:
+        with suppress(OSError):
+            found["controller.sets"] = hashlib.sha256(Path(sets).read_bytes()).hexdigest()
+    return found
 
 
 class RowPlan(NamedTuple):

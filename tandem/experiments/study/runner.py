@@ -13,10 +13,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, as_c
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from node_runtime.config.plant import files_of
 from node_runtime.whole_file import write_whole
 from tandem.experiments.study.isolated import ORDINARY, Children, Failure, Limits
-from tandem.experiments.study.plan import Job, RowPlan, code_version
+from tandem.experiments.study.plan import Job, RowPlan, code_version, files_read
 from tandem.experiments.study.work import Done, Record, Task, read, work
 
 Progress = Callable[[int, int], None]
@@ -188,11 +187,16 @@ class _Sweep:
 
     def _task(self, key: str) -> Task:
         want = self.wants[key]
+        if want.job.key != key:
+            raise RunnerError(
+                "a file that the configuration names was changed while the experiment ran; the finished runs are kept, "
+                "and the same command makes those again that depend on it"
+            )
         return Task(
             job=want.job,
             detail=want.detail,
             log=bool(want.logs),
-            files=files_of(want.job.config),
+            files=files_read(want.job.config),
             limits=self.limits,
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 from controller_node.build import build_model, build_network_oracle, build_plant
 from lbmpc.plants import PlantError, get_plant, get_truth, true_motion
 from node_runtime.config.loading import to_json
-from node_runtime.config.plant import files_of, true_plant_of
+from node_runtime.config.plant import true_plant_of
 from node_runtime.config.sections import Config
 from node_runtime.config.strict import ConfigError
 from node_runtime.realtime.scheduling import one_blas_thread
@@ -26,7 +26,7 @@ from tandem.experiments.simulation import wave
 from tandem.experiments.simulation.lockstep import Outcome, follow
 from tandem.experiments.study.isolated import ORDINARY, Limits
 from tandem.experiments.study.lemma import Lemma, measure
-from tandem.experiments.study.plan import Job, code_version
+from tandem.experiments.study.plan import Job, code_version, files_read
 
 Rests = tuple[np.ndarray, np.ndarray]
 """Equilibria of the true plant at the set-points of each tick of a cycle, from `wave.rests`."""
@@ -80,7 +80,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     log: bool
     """Whether to return the MCAP log."""
     files: dict[str, str]
-    """The sha256 of the files that its configuration names, by key, as `files_of` finds them."""
+    """The sha256 of the files that its configuration names, by key, as `files_read` finds them."""
     limits: Limits = ORDINARY
 
 
@@ -108,7 +108,7 @@ def work(task: Task, config: Config | None = None) -> Done:
     with one_blas_thread():
         rests = None if here.set_points is None else _rests(here, here.set_points)
         outcome = _outcome(here)
-        found = files_of(here.config)
+        found = files_read(here.config)
         for key, sha256 in task.files.items():
             if found.get(key) != sha256:
                 raise ConfigError(f"{key}: the file that it names is another one here, or is gone")

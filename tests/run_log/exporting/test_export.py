@@ -18,6 +18,7 @@ from lbmpc.plants import get_plant
 from node_runtime.config.loading import override, to_json
 from node_runtime.config.sections import Config
 from protocol import codec, topics
+from protocol import messages as m
 from run_log.errors import LogError, LogExistsError
 from run_log.exporting import tables
 from run_log.exporting.export import Exported, export
@@ -232,6 +233,26 @@ def test_fields_that_come_late_are_empty_before(exported: Exported, out: Path) -
     assert not list(out.rglob("*.old"))
 
 
+def test_texts_with_carriage_returns_and_numbers_beyond_a_table_are_exported(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "run.mcap", Config(), get_plant("moore_greitzer")) as writer:
+        for i in range(3):
+            note = {"note": f"valve\ropened {i}", **({"late\r": 1} if i == 2 else {})}
+            writer.write("user/note", json.dumps(note).encode(), i * 10**9)
+        forged = m.Health(
+            run_id="p-1", seq=0, process="plant", status="running", counters={"n": 2**64 - 1}, note=""
+        )
+        writer.write("plant/health", codec.encode(forged), 10**9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tables, "ROWS", 1)
+        done = export(tmp_path / "run.mcap", csv=tmp_path / "csv", parquet=tmp_path / "parquet")
+    assert done.tables["user/note"] == 3
+    rows = read_csv(tmp_path / "csv", "user/note")
+    assert [row["note"] for row in rows] == [f"valve\nopened {i}" for i in range(3)]
+    assert [row["late\n"] for row in rows] == ["", "", "1.0"]
+    assert read_parquet(tmp_path / "parquet", "user/note")["note"].to_pylist()[0] == "valve\ropened 0"
+    assert read_parquet(tmp_path / "parquet", "plant/health")["counters.n"].to_pylist() == [None]
+
+
 def test_messages_without_a_row_are_counted(exported: Exported) -> None:
     assert exported.bad == {"plant/state: malformed": 1}
     assert exported.strangers == {"plant/unheard_of": 1}
@@ -278,7 +299,7 @@ def test_a_log_in_parts_is_exported_as_one(
     for name in ("plant/state", "controller/result", "controller/run_info", "bounds"):
         assert read_csv(tmp_path / "parts", name) == read_csv(tmp_path / "whole", name)
     parts[1].unlink()
-    assert "not beside it" in export(first, csv=tmp_path / "one").notes[0]
+    assert "not in the same folder" in export(first, csv=tmp_path / "one").notes[0]
 
 
 def test_a_cut_log_is_exported_up_to_the_cut(log: Path, tmp_path: Path) -> None:
@@ -314,7 +335,7 @@ def test_the_command_writes_and_refuses_in_words(
     code, _, error = said("--csv", str(tmp_path / "csv"))
     assert (code, "is not empty" in error) == (2, True)
     code, _, error = said("--rrd", str(log))
-    assert (code, "is there already" in error) == (2, True)
+    assert (code, "exists already" in error) == (2, True)
     code, _, error = said("--parquet", str(log))
     assert (code, "cannot be used as a folder" in error) == (2, True)
     with pytest.raises(LogExistsError):

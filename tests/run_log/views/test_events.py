@@ -47,6 +47,15 @@ class Told:
         return [json.loads(event.data) for event in events]
 
 
+def test_a_status_that_follows_at_once_is_told_however_few_views_are_made() -> None:
+    views = Views(Config(), get_plant("moore_greitzer"), most_hz=100.0)
+    for seq, status in enumerate(("starting", "ready", "running")):
+        payload = codec.encode(msgspec.structs.replace(HEALTH, seq=seq, status=status))
+        shown = views.show("plant/health", payload, seq * MS).shown
+        assert [one.channel.topic for one in shown] == ["view/events", "view/plant/health"]
+        assert json.loads(shown[1].data)["status"] == status
+
+
 def test_each_change_of_a_result_is_told_once_and_with_its_level() -> None:
     told = Told()
     assert told.by(topics.RESULT, RESULT) == []

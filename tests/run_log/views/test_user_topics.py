@@ -17,7 +17,7 @@ from protocol import topics
 from run_log.reading.reader import read_run
 from run_log.views.channel import MOST_SCHEMAS
 from run_log.views.user_topics import MOST_LEAVES, UserView
-from run_log.views.views import MOST_USER_TOPICS
+from run_log.views.views import MOST_USER_TOPICS, Views
 from run_log.writing import user_budget
 from run_log.writing.writer import LogWriter
 from tests.run_log.samples import Config, synthetic, write
@@ -97,8 +97,26 @@ def test_fields_and_schemas_are_bounded() -> None:
     assert len(channels) <= MOST_SCHEMAS
     wide = UserView("user/x")
     assert len(shown(wide, json.dumps({f"f{i}": i for i in range(10 * MOST_LEAVES)}).encode())) == MOST_LEAVES
-    deep = b'{"a":' * 500 + b"1" + b"}" * 500
-    assert shown(UserView("user/x"), deep) is None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"a":' * 500 + b"1" + b"}" * 500,
+        b"[" * 900 + b"1" + b"]" * 900,
+        b"\x91" * 500 + b"\x01",
+    ],
+    ids=["objects", "lists", "msgpack"],
+)
+def test_a_deep_message_has_no_view(payload: bytes) -> None:
+    assert shown(UserView("user/x"), payload) is None
+
+
+def test_a_message_beyond_the_limit_has_no_view() -> None:
+    views = Views(Config(), PLANT)
+    largest = b"1" * topics.USER_MAX_BYTES
+    assert views.show("user/x", largest, 0).shown
+    assert not views.show("user/y", largest + b"1", 0).shown
 
 
 def test_they_are_in_the_log_and_a_viewer_has_no_alert(tmp_path: Path) -> None:

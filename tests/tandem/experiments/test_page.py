@@ -123,6 +123,17 @@ def test_the_page_needs_no_other_file_and_no_name_ends_its_script(quick: Parsed)
     assert STRANGE in quick.text
 
 
+def test_a_plot_without_a_line_is_words_and_the_others_are_drawn() -> None:
+    result = a_result("linear MPC", [30.0], oracle="linear", traces=TRACES, solve_ms=[1.0] * 40, lost="left X")
+    declared = load(SHIPPED)
+    base = experiment.settings(declared, str(SHIPPED))
+    found = Parsed(
+        page(declared, [of_group(result, "comparison")], PLANT, base, "tandem", "f" * 64, False).html
+    )
+    assert [chart["title"] for chart in found.charts] == ["Solve time"]
+    assert found.text.count("There is no line to draw.") == 2
+
+
 def a_line(n: int) -> Line:
     y = np.sin(np.linspace(0, 40, n))
     y[n // 3] = 9.0

@@ -20,7 +20,7 @@ from tandem.experiments import experiment
 from tandem.experiments.experiment import Finished
 from tandem.experiments.study.declaration import load
 from tandem.experiments.study.plan import code_version, rows
-from tandem.experiments.study.runner import Made, Processes, Progress, Want, run_all, wanted
+from tandem.experiments.study.runner import Made, Processes, Progress, RunnerError, Want, run_all, wanted
 from tandem.experiments.study.work import read
 from tests.helpers.interpreter import python
 from tests.helpers.paths import write_namesakes
@@ -172,6 +172,40 @@ def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: P
     done = python("-c", program, *arguments, cwd=here)
     assert done.returncode == 0, done.stderr
     assert (here / "out" / "report.html").exists()
+
+
+def test_a_plant_that_is_edited_during_the_experiment_ends_it(tmp_path: Path) -> None:
+    path, truth = tmp_path / "small.toml", tmp_path / "truth.py"
+    truth.write_text("from lbmpc.plants import get_plant\nTRUE = get_plant('moore_greitzer')\n")
+    path.write_text(SMALL)
+    plan = next(plan for plan in rows(cases(path)) if plan.case.name == "linear")
+    plant = msgspec.structs.replace(plan.job.config.plant, truth=f"{truth}:TRUE")
+    config = msgspec.structs.replace(plan.job.config, plant=plant)
+    jobs = [msgspec.structs.replace(plan.job, config=config, steps=steps) for steps in (2, 3, 4, 5)]
+    wants = {job.key: Want(job, False, ()) for job in jobs}
+
+    def edit(done: int, total: int) -> None:
+        if done == 1:
+            truth.write_text(truth.read_text() + "# another\n")
+
+    with pytest.raises(RunnerError, match="was changed while the experiment ran"):
+        run_here(wants, tmp_path / "runs", 1, edit)
+    kept = {path.stem for path in (tmp_path / "runs").iterdir()}
+    assert len(kept) == 1
+    assert not kept & {job.key for job in jobs}
+
+
+def test_other_certified_sets_in_the_same_file_are_another_run(tmp_path: Path) -> None:
+    path, sets = tmp_path / "small.toml", tmp_path / "sets.npz"
+    path.write_text(SMALL)
+    job = next(iter(rows(cases(path)))).job
+    controller = msgspec.structs.replace(job.config.controller, tightening="invariant", sets=str(sets))
+    job = msgspec.structs.replace(job, config=msgspec.structs.replace(job.config, controller=controller))
+    keys = set()
+    for content in (b"one", b"another"):
+        sets.write_bytes(content)
+        keys.add(job.key)
+    assert len(keys) == 2
 
 
 def test_something_else_than_a_file_in_the_folder_is_not_replaced(tmp_path: Path) -> None:

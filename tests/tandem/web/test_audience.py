@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from run_log.views.channel import Channel, document, leaf
-from tandem.web.audience import WAITING_BYTES, Audience, Viewer
+from tandem.web.audience import WAITING_BYTES, WAITING_REFUSALS, Audience, Viewer
 from tandem.web.foxglove_protocol import HEADER, MESSAGE_DATA
 
 
@@ -179,6 +179,15 @@ def test_a_second_subscription_to_a_channel_is_refused_and_the_first_stays(audie
     subscribe(audience, viewer, (1, 1), (2, 1))
     assert [said["op"] for said in frames(viewer)] == ["status"]
     assert viewer.subscriptions == {1: 1}
+
+
+def test_refusals_that_a_viewer_does_not_read_take_bounded_memory(audience: Audience):
+    viewer = audience.enter()
+    subscribe(audience, viewer, *((1, 99) for _ in range(10_000)))
+    for _ in range(1000):
+        audience.obey(viewer, b"")
+        audience.obey(viewer, "{}")
+    assert len(frames(viewer)) == WAITING_REFUSALS
 
 
 def test_who_has_left_costs_nothing(audience: Audience):

@@ -131,6 +131,22 @@ def test_a_client_that_does_not_read_delays_no_other():
     asyncio.run(run())
 
 
+def test_a_client_that_does_not_read_does_not_delay_the_end():
+    async def scenario() -> None:
+        async with served() as (audience, at):
+            stuck = await client(at, max_queue=1)
+            await subscribed(stuck, audience)
+            stuck.transport.pause_reading()
+            for time_ns in range(2000):
+                audience.publish(STATE, time_ns, b" " * 10_000)
+                await asyncio.sleep(0)
+            began = asyncio.get_running_loop().time()
+        assert asyncio.get_running_loop().time() - began < 8.0
+        stuck.transport.abort()
+
+    asyncio.run(scenario())
+
+
 def test_too_large_a_request_closes_its_own_connection_only():
     async def run() -> None:
         async with served() as (audience, at), client(at) as socket, client(at) as large:
