@@ -209,7 +209,7 @@ def test_every_topic_has_exactly_one_role_that_may_publish_it():
         assert may == [topic.writer], topic.name
 
 
-def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
+def test_only_a_controller_sends_commands_and_only_a_trainer_sends_weights():
     publishes = {role: set(rights.rights_of(role).publish_keys("jet1")) for role in rights.ROLES}
     assert [role for role in rights.ROLES if "tandem/jet1/controller/command" in publishes[role]] == [
         "controller"
