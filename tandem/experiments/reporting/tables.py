@@ -228,7 +228,7 @@ def terms(plant: Description) -> list[tuple[str, str]]:
         ("deviation", f"Integral of {squares}. With several episodes, the mean from the second one on."),
         (
             "overshoot",
-            f"How far {state} goes beyond its equilibrium, as a share of its initial deviation. Of several episodes, "
+            f"How far {state} goes beyond its equilibrium, as a share of its initial deviation. With several episodes, "
             "the worst from the second one on.",
         ),
         (
