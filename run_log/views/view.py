@@ -1,8 +1,9 @@
 """The plottable view of each message: JSON with a JSON schema, vectors under the plant's own names.
 
-A view contains fields of the message by name, and values computed from other fields. Its JSON and schema follow from
-the message's Struct. Weights are summarised by their norms, and a keyframe has no view. A missing value (no input was
-applied, no estimate yet) is left out and not null, because plotting tools skip absent fields and fail on null.
+A view contains fields of the message by name, and values computed from other fields. Its JSON and its schema follow
+from the message's Struct. Weights are summarised by their norms, and a keyframe has no view. A missing value (no
+input was applied, no estimate yet) is left out and not null, because plotting tools skip absent fields and fail on
+null.
 """
 
 from __future__ import annotations
