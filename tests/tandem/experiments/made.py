@@ -9,7 +9,7 @@ import msgspec
 from run_log.reporting.performance import Performance
 from tandem.experiments.study import results
 from tandem.experiments.study.plan import Job, rows
-from tandem.experiments.study.runner import Timing
+from tandem.experiments.study.timing import Timing
 from tandem.experiments.study.work import Record
 from tests.tandem.experiments.small import PLANT, SHIPPED, cases
 
@@ -73,5 +73,5 @@ def a_result(
         plan.job.key: a_record(cost, overshoot, violations, **changes)
         for plan, cost in zip(plans, costs, strict=True)
     }
-    timings = {} if solve_ms is None else {name: Timing([solve_ms])}
+    timings = {} if solve_ms is None else {name: Timing([solve_ms], "a processor")}
     return results.collect(plans, records, timings, PLANT)[0]
