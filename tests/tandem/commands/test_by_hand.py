@@ -189,7 +189,7 @@ def test_inputs_are_named_and_the_others_stay() -> None:
     scale = {"x1": 1.0, "a": 1.0, "b": 1.0}
     two = Known.from_matrices([[-1.0]], [[1.0, 1.0]], W=[0.0], inputs=("a", "b"), scale=scale)
     assert completed({"b": 3.0}, two, [1.0, 2.0]).tolist() == [1.0, 3.0]
-    with pytest.raises(Refused, match="name a too"):
+    with pytest.raises(Refused, match="give values for a too"):
         completed({"b": 3.0}, two, None)
 
 

@@ -109,7 +109,7 @@ def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: p
     elsewhere.mkdir()
     authority = str(folder / "authority")
     assert main(["keys", "renew", str(elsewhere), "--role", "viewer", "--authority", authority]) == 2
-    assert "no certificate.pem in it" in capsys.readouterr().err
+    assert "contains a certificate.pem" in capsys.readouterr().err
     assert list(elsewhere.iterdir()) == []
 
 
@@ -117,7 +117,7 @@ def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: p
     ("arguments", "says"),
     [
         (["create", "--plant", "jet 1", "--out", "new"], "letters"),
-        (["create", "--plant", "jet1", "--out", "new", "--host", "10.0.0.5:7448"], "no port"),
+        (["create", "--plant", "jet1", "--out", "new", "--host", "10.0.0.5:7448"], "omit port"),
         (["create", "--plant", "jet1", "--out", "new", "--days", "4000"], "--days 4000"),
         (["renew", "nowhere", "--role", "boss"], "one of router"),
         (["renew", "nowhere", "--role", "trainer"], "nowhere"),
