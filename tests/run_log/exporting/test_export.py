@@ -314,7 +314,7 @@ def test_the_command_writes_and_refuses_in_words(
     code, _, error = said("--csv", str(tmp_path / "csv"))
     assert (code, "is not empty" in error) == (2, True)
     code, _, error = said("--rrd", str(log))
-    assert (code, "is there already" in error) == (2, True)
+    assert (code, "exists already" in error) == (2, True)
     code, _, error = said("--parquet", str(log))
     assert (code, "cannot be used as a folder" in error) == (2, True)
     with pytest.raises(LogExistsError):

@@ -79,7 +79,7 @@ def test_manual_control_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixtu
         ear = BusListener(bus)
         assert main(["manual", f"u={U + 0.02}", "--seconds", "1.5", *at]) == 0
         said = capsys.readouterr().out
-        assert "given back" in said
+        assert "manual control ended" in said
         assert "manual" in said
         assert U + 0.02 in machine.written
         # An input from which X could not be kept never acts: the plant names the state and the time.
