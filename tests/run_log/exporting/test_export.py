@@ -278,7 +278,7 @@ def test_a_log_in_parts_is_exported_as_one(
     for name in ("plant/state", "controller/result", "controller/run_info", "bounds"):
         assert read_csv(tmp_path / "parts", name) == read_csv(tmp_path / "whole", name)
     parts[1].unlink()
-    assert "not beside it" in export(first, csv=tmp_path / "one").notes[0]
+    assert "not in the same folder" in export(first, csv=tmp_path / "one").notes[0]
 
 
 def test_a_cut_log_is_exported_up_to_the_cut(log: Path, tmp_path: Path) -> None:
