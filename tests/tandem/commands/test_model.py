@@ -87,7 +87,7 @@ def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys:
     assert "row stop is 0 at x_e" in found["faults"][0]
 
 
-def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
+def test_a_plant_whose_poles_are_all_zero_does_not_return(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
     assert "poles, 1/s: 0, 0; without input it does not return" in said(capsys, "mine")[1]
