@@ -124,7 +124,9 @@ def test_the_page_needs_no_other_file_and_no_name_ends_its_script(quick: Parsed)
 
 
 def test_a_plot_without_a_line_is_words_and_the_others_are_drawn() -> None:
-    result = a_result("linear MPC", [30.0], oracle="linear", traces=TRACES, solve_ms=[1.0] * 40, lost="left X")
+    result = a_result(
+        "linear MPC", [30.0], oracle="linear", traces=TRACES, solve_ms=[1.0] * 40, lost="left X"
+    )
     declared = load(SHIPPED)
     base = experiment.settings(declared, str(SHIPPED))
     found = Parsed(

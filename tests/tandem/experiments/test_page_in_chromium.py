@@ -35,7 +35,9 @@ def a_page(chart: Chart) -> str:
 
 
 @pytest.mark.parametrize("y", [np.zeros(5), np.arange(1.0, 6.0)], ids=["nothing above 0", "switched off"])
-def test_a_logarithmic_chart_with_nothing_to_show_does_not_stop_the_page(tmp_path: Path, y: np.ndarray) -> None:
+def test_a_logarithmic_chart_with_nothing_to_show_does_not_stop_the_page(
+    tmp_path: Path, y: np.ndarray
+) -> None:
     file = tmp_path / "page.html"
     line = Line("a", {"color": "#000000", "linestyle": "-"}, np.arange(5.0), y)
     file.write_text(a_page(Chart("t", "x", "y", [line], scale="log")))
