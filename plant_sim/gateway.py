@@ -106,7 +106,7 @@ class Gateway:
         """Serve as the plant until `stop` is set or a signal ends the process. Waits for the router first.
 
         Both functions are called from this thread, one at a time. Their exceptions are counted, logged and reported in
-        health, and the loop goes on: a state that could not be measured is not published, and an input that could not
+        health, and the loop continues: a state that could not be measured is not published, and an input that could not
         be written counts as unknown. `read` is also called between samples if the backup policy or the safe input
         depends on the state.
 
@@ -119,7 +119,7 @@ class Gateway:
 
         Raises:
             ConfigError: this process may not use the configured core, or its certificate is not valid.
-            PlantError: raised by one of the functions if the machine cannot go on.
+            PlantError: raised by one of the functions if the machine cannot continue.
         """
         config, run_id = self.config, new_run_id("plant")
         place = core_for(config, "plant", os.sched_getaffinity(0))

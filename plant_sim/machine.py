@@ -1,4 +1,4 @@
-"""A user's two functions as a `Machine`. Whatever they do, the loop that calls them goes on and reports it."""
+"""A user's two functions as a `Machine`. The loop that calls them continues after failures, and reports them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The log of a run: written as MCAP while it happens; read, replayed, summarised and drawn afterwards."""
+"""The log of a run: written as MCAP during the run; read, replayed, summarised and drawn afterwards."""

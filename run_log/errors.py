@@ -1,4 +1,4 @@
-"""What can be wrong with a log, in words for the person who has it."""
+"""Errors of logs, with messages for a person."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ class LogError(Exception):
 
 
 class LogExistsError(LogError):
-    """The path is taken; a log never overwrites anything."""
+    """The path exists already; a log never overwrites a file."""

@@ -10,11 +10,11 @@ import msgspec
 from lbmpc.plants import Known, Plant, PlantDefinitionError
 
 LARGEST = 1_000_000
-"""Bytes; enough for two hundred states."""
+"""Largest size in bytes; sufficient for two hundred states."""
 
 
 class PlantRecordError(ValueError):
-    """An attachment that describes no plant; the text says why."""
+    """An attachment that does not describe a plant; the text gives the reason."""
 
 
 class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -23,7 +23,10 @@ class _Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def encode(plant: Known | Plant, files: Mapping[str, str]) -> str:
-    """plant: the known numbers; files: the sha256 of the files that the configuration names, by key."""
+    """Encode a plant and the files of its configuration.
+
+    plant: the known numbers; files: the sha256 of the files that the configuration names, by key.
+    """
     known = plant if isinstance(plant, Known) else plant.known()
     content = _Content(known.to_builtins(), dict(files))
     return msgspec.json.format(msgspec.json.encode(content)).decode()

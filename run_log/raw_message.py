@@ -14,14 +14,14 @@ SCHEMA_NAME = "tandem_log.Raw"
 ENCODING = "protobuf"
 """The encoding of the channel and of its schema."""
 _TAG = b"\x0a"
-"""Field 1, of a length that follows."""
+"""Tag of field 1, whose length follows."""
 _CONTINUES = 0x80
 _TYPE_BYTES, _LABEL_OPTIONAL = 12, 1
 _LONGEST_VARINT = 5
 
 
 class NotRaw(ValueError):
-    """Bytes that are no `tandem_log.Raw`."""
+    """Bytes that are not a `tandem_log.Raw`."""
 
 
 def wrap(payload: bytes) -> bytes:
@@ -39,7 +39,7 @@ def unwrap(data: bytes) -> bytes:
             if data[:1] == _TAG and len(data) - i == length:
                 return data[i:]
             break
-    raise NotRaw(f"{len(data)} bytes that are no message of {SCHEMA_NAME}")
+    raise NotRaw(f"{len(data)} bytes that are not a message of {SCHEMA_NAME}")
 
 
 def payload_of(encoding: str, data: bytes) -> bytes:

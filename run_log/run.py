@@ -1,4 +1,4 @@
-"""A run in memory: every message decoded, beside its exact bytes. Read from a log, or made without a file."""
+"""A run in memory: every message decoded, with its exact bytes. It is read from a log, or made without a file."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ class Run:
     streams: dict[str, list[Entry[Any]]] = field(default_factory=dict)
     """By topic name."""
     bad: dict[str, int] = field(default_factory=dict)
-    """Logged payloads that are no valid messages, by topic and reason."""
+    """Number of logged payloads that are not valid messages, by topic and reason."""
     strangers: dict[str, int] = field(default_factory=dict)
-    """Messages on unknown keys, by key."""
+    """Number of messages on unknown keys, by key."""
     user: dict[str, list[tuple[int, bytes]]] = field(default_factory=dict)
-    """Messages on topics of users, by key: (log_time in ns, bytes). A controller never depends on them."""
+    """Messages on user topics, by key: (log_time in ns, bytes). A controller does not depend on them."""
     truncated: bool = False
     recovered: bool = False
     part: int = 1
@@ -74,7 +74,7 @@ class Run:
     files: dict[str, str] = field(default_factory=dict)
     """The sha256 of the files that its configuration named, by key."""
     truth: Known | Plant | TrueMotion | None = None
-    """The true motion of the plant; None: a log does not have it."""
+    """The true motion of the plant; None for a log, which does not contain it."""
     named: Known | Plant | None = None
     """The plant that the reader of the log named."""
 
@@ -99,7 +99,7 @@ class Run:
 
     @property
     def run_infos(self) -> list[m.RunInfo]:
-        """One entry for each process incarnation, the first that it sent."""
+        """The first entry of each process incarnation."""
         first: dict[str, m.RunInfo] = {}
         for info in self._all_run_infos:
             first.setdefault(info.run_id, info)
@@ -128,7 +128,7 @@ class Run:
 
     @property
     def unreadable(self) -> str:
-        """End of a sentence about something that the log lacks: it may exist as an invalid message."""
+        """End of a sentence about missing messages: they may be in the log as invalid ones."""
         found = ", ".join(f"{count} {what}" for what, count in self.bad.items())
         return f". In the log but not readable: {found}" if found else ""
 

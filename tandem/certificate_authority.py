@@ -1,7 +1,7 @@
 """A plant's private authority and one certificate for each role: created, renewed and loaded.
 
 keys/jet1/authority/   certificate.pem, key.pem     keep the key elsewhere: renewing needs it, running does not
-keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      everything that the trainer's machine gets
+keys/jet1/trainer/     certificate.pem, key.pem, authority.pem      all files for the trainer's machine
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tandem.terminal import Refused
 AUTHORITY_FOLDER = "authority"
 PEM = serialization.Encoding.PEM
 AUTHORITY_DAYS = 3650
-"""Longer than any certificate that it signs. Renewing a certificate means one folder to copy; a new authority, all."""
+"""Validity of the authority in days, longer than that of its certificates: a new authority replaces every folder."""
 LEAF_DAYS = 365
 EARLY = timedelta(days=1)
 """Clocks differ: a certificate is valid from a little before its creation."""
@@ -98,8 +98,8 @@ def renew(
 
     The old one is None for a role that these keys do not have: a later version may have more roles.
 
-    folder: the plant's; hosts: more names for the router, beside those that it has; drawer: where the authority is,
-    None: in the folder.
+    folder: the plant's folder; hosts: further names for the router; drawer: folder of the authority, None: within the
+    plant's folder.
     """
     place = drawer or folder / AUTHORITY_FOLDER
     try:

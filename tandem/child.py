@@ -18,7 +18,7 @@ GRACE_S = 5.0
 
 
 def end_with(parent: int, grace_s: float = GRACE_S) -> None:
-    """End this process, politely at first, when the process `parent` ends; at once if that is gone."""
+    """End this process when the process `parent` ends: first by SIGTERM, then by force."""
     try:
         handle = os.pidfd_open(parent)
     except ProcessLookupError:

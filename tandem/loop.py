@@ -72,7 +72,7 @@ class Loop:
         settings: changes of the configuration, as in the file: `rate=50, controller={"horizon": 40}`.
 
     Raises:
-        ConfigError: the arguments admit no controller; the text says why and what would be right.
+        ConfigError: the arguments do not give a controller; the message gives the reason and a remedy.
     """
 
     def __init__(
@@ -115,10 +115,10 @@ class Loop:
         return self._step(None)
 
     def control(self, x: ArrayLike) -> np.ndarray:
-        """Return the input, (m,), for a plant that moves elsewhere: in your simulator, or your own loop.
+        """Return the input, (m,), for an external plant: in your simulator, or your own loop.
 
-        One call is one period. The input acts from now until the next call; the label h of this period
-        is made from it.
+        One call is one period. The input acts from now until the next call, and the label h of this
+        period is computed from it.
 
         Args:
             x: its state now, (d,), in its own units.
@@ -135,7 +135,7 @@ class Loop:
         return self._step(state).u
 
     def manual(self, u: ArrayLike | Mapping[str, float]) -> None:
-        """Let this input act manually from the next step on, until `auto`; the controller goes on learning.
+        """Let this input act manually from the next step on, until `auto`; the controller continues to learn.
 
         It is clipped to U. If the plant would leave X, its controller takes over before that and stays in control.
 
@@ -209,7 +209,7 @@ class Loop:
         self._lost = None
 
     def run(self, steps: int) -> Result:
-        """Run so many more periods, or fewer if the plant is lost; return the result of all periods so far."""
+        """Run `steps` more periods, or fewer if the plant is lost; return the result of all periods so far."""
         if steps < 1:
             raise ValueError(f"steps = {steps}: must be at least 1")
         with one_blas_thread():
@@ -261,7 +261,7 @@ class Result:
 
     @property
     def x(self) -> np.ndarray:
-        """(n + 1, d) the plant's states, the last one after the last step; (n, d) of a plant that moves elsewhere."""
+        """(n + 1, d) the plant's states, the last one after the last step; (n, d) for an external plant."""
         return self.traces.motion.x
 
     @property

@@ -82,7 +82,7 @@ def never_failing() -> Iterator[Output]:
         return
     while (
         number := os.open(os.devnull, os.O_RDWR)
-    ) <= 2:  # no file of ours may get the number of a closed one
+    ) <= 2:  # no file of this process may get the number of a closed one
         pass
     os.close(number)
     for stream in own:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Refused(Exception):
-    """The request cannot be done; the text says why and what to do, and is all that is shown."""
+    """The request cannot be done. The message gives the reason and a remedy, and no traceback is shown."""
 
 
 def console(as_json: bool) -> Console:

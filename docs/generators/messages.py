@@ -77,13 +77,19 @@ def _roles() -> str:
         rows.append(
             [
                 role,
-                _names(topic.name for topic in rights.publishes),
+                _names(_published(role)),
                 reads,
                 _names(rights.asks),
                 _names(rights.answers),
             ]
         )
     return table(["role", "publishes", "reads", "asks", "answers"], rows)
+
+
+def _published(role: str) -> list[str]:
+    """Return the keys that a role publishes at, below the plant's; without those for a fast loop's direct messages."""
+    keys = [key.removeprefix(topics.below("-", "")) for key in rights_of(role).publish_keys("-")]
+    return [key for key in keys if not key.startswith(topics.DIRECT)]
 
 
 def _message(cls: type[msgspec.Struct]) -> str:

@@ -113,8 +113,8 @@ class PlantConfig(Section, frozen=True):
     )
     """How fast an input may change, by its name, instead of the plant's own limit."""
     rows: Annotated[dict[str, dict[str, float]], PLANT_UNITS] = msgspec.field(default_factory=dict)
-    """Constraints on several states, or on several inputs, each under a name of its own: coefficients by name, with
-    `min`, `max` or both. A row of states may have a `priority`: 0 is that of the bounds, and a higher number gives way
+    """Constraints on several states or several inputs, by their own names: coefficients by name, with `min`, `max` or
+    both. A row of states may have a `priority`: 0 is that of the bounds, and rows with a higher number are violated
     first. Rows of the plant that are not named here stay."""
     truth: dict[str, float] | str = msgspec.field(default_factory=dict)
     """How the true plant differs from the model: parameters of its equations by name, `dead_time` among them. Or a
@@ -408,7 +408,7 @@ class LogConfig(Section, frozen=True):
     flush_ms: Milliseconds = 500
     """Interval at which the recorder writes to disk: at most this much is lost when it is killed."""
     split_minutes: Annotated[float, msgspec.Meta(ge=0, le=1e6), unit("min")] = 60.0
-    """Length of a file, after which the log goes on in NAME.part2.mcap. The index of a file is in memory until the
+    """Length of a file, after which the log continues in NAME.part2.mcap. The index of a file is in memory until the
     file ends. 0: never."""
     keep: Annotated[int, msgspec.Meta(ge=0, le=1_000_000), unit("files")] = 0
     """How many of a run's files stay, the one being written included. Older ones are removed. 0: all."""

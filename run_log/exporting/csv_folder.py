@@ -1,4 +1,4 @@
-"""A log as a folder of CSV files, one a table, and one JSON file about them."""
+"""A log as a folder of CSV files, one per table, and one JSON file that describes them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from run_log.exporting.table import Batch, Kind, Table
 
 ABOUT = "about.json"
 TEXTS: dict[Kind, Callable[[Any], str]] = {"boolean": json.dumps, "numbers": json.dumps}
-"""What Python writes otherwise."""
+"""Texts for values that Python writes in another way."""
 
 
 class CsvFolder:
-    """Numbers are the shortest text that reads back to the same bits, flags are true and false, and lists are JSON.
+    """Writes CSV: numbers as the shortest text with the same bits, flags as true and false, lists as JSON.
 
     An absent value is empty.
 
     Args:
-        folder: is there, and empty.
-        about: facts on the whole log: configuration, versions, units.
+        folder: an existing, empty folder.
+        about: facts about the whole log: configuration, versions, units.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any]):

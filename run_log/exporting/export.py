@@ -19,11 +19,11 @@ from run_log.run import Run, plant_of
 from run_log.views.views import Views
 
 ABOUT = {"configuration": CONFIG, "plant": PLANT, "units": "units.json", "versions": "versions.json"}
-"""Facts on a log that go into each format, and the attachments that hold them."""
+"""Facts about a log that every format gets, and the attachments that contain them."""
 
 
 class Exported(msgspec.Struct, frozen=True, kw_only=True):
-    """What was written, and what could not be read."""
+    """Result of an export: the written tables, and the unreadable parts of the log."""
 
     log: list[str]
     """The parts that were read, in order."""
@@ -31,13 +31,13 @@ class Exported(msgspec.Struct, frozen=True, kw_only=True):
     """Rows of each table, by its name."""
     files: list[str]
     damage: list[str]
-    """Places of the log that do not fit their checksum; what was there is missing."""
+    """Damaged places of the log. The messages there are missing."""
     bad: dict[str, int]
-    """Messages that are not valid and have no row, by topic and reason."""
+    """Number of invalid messages, which have no row, by topic and reason."""
     strangers: dict[str, int]
-    """Messages on unknown keys, which have no table, by key."""
+    """Number of messages on unknown keys, which have no table, by key."""
     notes: list[str]
-    """What a person should know, such as where the log was cut."""
+    """Notes for a person, such as where the log was cut."""
 
 
 def export(
@@ -47,16 +47,16 @@ def export(
     parquet: str | Path | None = None,
     rrd: str | Path | None = None,
 ) -> Exported:
-    """Write a log in one or several formats, in one pass. The memory that it takes does not depend on the log's length.
+    """Write a log in one or several formats, in one pass. The memory use does not depend on the log's length.
 
     Args:
-        log: its file; of a log in parts the first one.
-        csv: a folder for one CSV file a table. It is made, or is empty.
-        parquet: a folder for one Parquet file a table, likewise.
+        log: the file, or the first part of a log in parts.
+        csv: a folder for one CSV file per table. It is created, or must be empty.
+        parquet: a folder for one Parquet file per table, likewise.
         rrd: a Rerun recording, a file that does not exist yet.
 
     Raises:
-        LogExistsError: something is at the place of the output.
+        LogExistsError: the output exists already.
         LogError: the log cannot be read, or the output cannot be written.
         ModuleNotFoundError: pyarrow (Parquet) or rerun (Rerun) is not installed.
     """
@@ -145,7 +145,7 @@ def _empty_folder(folder: str | Path) -> Path:
 def _new_file(path: str | Path) -> Path:
     path = Path(path)
     try:
-        # What is there at its place is never overwritten.
+        # An existing file is never overwritten.
         path.open("xb").close()
     except FileExistsError as error:
         raise LogExistsError(f"{path}: exists already; name a new file, or remove this one first") from error

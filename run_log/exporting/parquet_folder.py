@@ -1,4 +1,4 @@
-"""A log as a folder of Parquet files, one a table."""
+"""A log as a folder of Parquet files, one per table."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ COMPRESSION = "zstd"
 
 
 class ParquetFolder:
-    """Each column has its unit in its metadata; each file has the facts on the whole log in its own.
+    """Writes Parquet: the metadata of a column has its unit, and that of a file the facts about the whole log.
 
     Args:
-        folder: is there, and empty.
-        about: facts on the whole log: configuration, versions, units. NAME becomes the key "tandem.NAME", a JSON text.
+        folder: an existing, empty folder.
+        about: facts about the log: configuration, versions, units. NAME becomes the key "tandem.NAME" (JSON).
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any]):

@@ -1,4 +1,4 @@
-"""A log as one Rerun recording: numbers as series, texts as a text log, and a layout that opens on what matters."""
+"""A log as one Rerun recording: numbers as series, texts as a text log, and a layout of the main plots."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ ERROR = ("controller/result/h", "controller/result/h_hat")
 """The series of one plot, without the name of the state or the input."""
 EVENTS = "events"
 LEVELS = ("TRACE", "DEBUG", "INFO", "WARN", "ERROR", "CRITICAL")
-"""Of Rerun, for the levels 0 to 5 of foxglove.Log."""
+"""Rerun's levels for the levels 0 to 5 of foxglove.Log."""
 
 
 class RerunFile:
-    """Each number is a series at TABLE/FIELD/ENTRY. Each text is a text log that has its changes only.
+    """Writes Rerun: each number is a series at TABLE/FIELD/ENTRY, and each text a text log of its changes.
 
     Lists are left out. The timelines are the time columns of a table.
 
     Args:
-        path: does not exist yet.
-        about: what is to be known of the log: configuration, versions, units. Each entry is a document at about/NAME.
+        path: a file that does not exist yet.
+        about: facts about the log: configuration, versions, units. Each entry is a document at about/NAME.
         plant: its states and inputs are the plots of the layout.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any], plant: Description):
         self.files: list[Path] = []
-        # Rerun gives every file a recording of its own.
+        # Rerun needs a separate recording for every file.
         self._stream = rr.RecordingStream(APPLICATION)
         with _refused(path):
             self._stream.save(path, default_blueprint=_layout(plant))
         self.files.append(path)
         self._said: dict[str, str] = {}
-        """By entity, its newest text."""
+        """Newest text, by entity."""
         self._named: set[str] = set()
         for name, value in about.items():
             text = json.dumps(value, indent=2, ensure_ascii=False)
@@ -63,7 +63,7 @@ class RerunFile:
         with _refused(path):
             self._stream.flush()
             self._stream.disconnect()
-            # Rerun writes in a thread of its own, and a full disk is only a warning there: a whole file has an index.
+            # Rerun writes in its own thread and only warns of a full disk. A complete file has an index.
             RrdReader(path).store()
 
     def _write_events(self, table: Table, rows: Batch) -> None:
@@ -99,7 +99,7 @@ class RerunFile:
             self._stream.log(entity, rr.SeriesLines(names=column.title), static=True)
 
     def _changes(self, entity: str, texts: Sequence[str | None]) -> list[int]:
-        """The places of the texts that differ from the one before."""
+        """Return the indices of the texts that differ from the previous one."""
         found = []
         for i, text in enumerate(texts):
             if text is not None and text != self._said.get(entity):
@@ -110,7 +110,7 @@ class RerunFile:
 
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
-    """Errors of Rerun, which are `RuntimeError`, become the `OSError` that a `Writer` raises."""
+    """Convert Rerun's `RuntimeError` into the `OSError` that a `Writer` raises."""
     try:
         yield
     except RuntimeError as error:
@@ -126,7 +126,7 @@ def _times(stamps: Sequence[int], since: Sequence[float]) -> list[rr.TimeColumn]
 
 
 def _layout(plant: Description) -> rrb.Blueprint:
-    """States and inputs against bounds and targets, h against h_hat, times, and the events."""
+    """Return the layout: states and inputs with bounds and targets, h with h_hat, times, and events."""
     plots = [_plot(plant, name, STATE) for name in plant.states]
     plots += [_plot(plant, name, INPUT) for name in plant.inputs]
     plots += [_plot(plant, plant.states[i], ERROR, "h of ") for i in plant.performance]

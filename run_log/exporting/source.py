@@ -1,4 +1,4 @@
-"""Reads a log message by message, all its parts as one: memory does not grow with the log."""
+"""Reads a log message by message, all parts as one. The memory use does not grow with the log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RUN_INFO = frozenset(topic.name for topic in topics.RUN_INFO.values())
 
 
 class Logged(NamedTuple):
-    """One message of a log, as it travelled."""
+    """One encoded message of a log."""
 
     name: str
     """The key of its topic below `tandem/<plant>/`."""
@@ -38,32 +38,32 @@ class Source:
     """A log in one file or in several parts. Iterate over it once; afterwards the fields say what was read.
 
     Args:
-        path: the log, or its first part that is still there; the parts after it follow by themselves.
+        path: the log, or its first remaining part; the later parts are found from it.
 
     Raises:
-        LogError: the file cannot be opened, is no log of Tandem, or holds no usable configuration or plant.
+        LogError: the file cannot be opened, is not a log of Tandem, or contains no usable configuration or plant.
     """
 
     path: Path
     parts: list[Path] = field(default_factory=list)
     """The files that were read, in order."""
     strangers: dict[str, int] = field(default_factory=dict)
-    """Messages on keys that are no topic of ours, by key."""
+    """Number of messages on unknown keys, by key."""
     damage: list[str] = field(default_factory=list)
-    """What does not fit its checksum, and is missing in the export."""
+    """Records with a wrong checksum, which are missing in the export."""
     notes: list[str] = field(default_factory=list)
-    """What a person should know about the files, such as where one was cut."""
+    """Notes for a person about the files, such as where one was cut."""
 
     def __post_init__(self) -> None:
         self.run = _opening(self.path)
-        """Configuration, plant, attachments and number of the first part; it holds no messages."""
+        """Configuration, plant, attachments and number of the first part, without messages."""
         self._seen: set[tuple[str, int]] = set()
-        """Topic and checksum of the messages that each part begins with again."""
+        """Topic and checksum of messages that are repeated at the begin of each part."""
         self._newest: dict[tuple[str, str], int] = {}
-        """By topic and run, the newest log time so far. Two parts overlap; nothing newer is repeated."""
+        """Newest log time, by topic and run. Two parts overlap, and no newer message is repeated."""
 
     def __iter__(self) -> Iterator[Logged]:
-        """All messages in the order of the log. Raises `LogError`: a part cannot be opened."""
+        """Yield all messages in the order of the log. Raises `LogError` if a part cannot be opened."""
         path: Path | None = self.path
         while path is not None:
             self.parts.append(path)
@@ -127,7 +127,7 @@ class Source:
         return True
 
     def _next(self, part: Run) -> Path | None:
-        """The part after this one, as its last record says."""
+        """Return the next part, which the last record of this one names."""
         if part.continued is None:
             later = existing_parts(self.run.path)
             if part.truncated and later and later[-1] not in self.parts:
@@ -135,7 +135,7 @@ class Source:
                     f"{part.path} does not say whether it continues; {later[-1].name} is not exported"
                 )
             return None
-        # A log says a name, and no other folder.
+        # A log names a file in its own folder only.
         path = part.path.with_name(Path(part.continued).name or "?")
         if path in self.parts or not path.exists():
             self.notes.append(f"{part.path} continues in {part.continued}, which is not in the same folder")
@@ -144,7 +144,7 @@ class Source:
 
 
 def _opening(path: Path) -> Run:
-    """What stands before the first message. Where its configuration is lost, that of the first process is taken."""
+    """Read the records before the first message. If the configuration is lost, that of the first process is used."""
     run = Run(path, Config())
     header, names, encodings = False, dict[int, str](), dict[int, str]()
     for record in Scan(path, keep_going=True):

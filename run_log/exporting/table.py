@@ -1,4 +1,4 @@
-"""What a table of an exported log is: flat columns, each with a kind and a unit, and rows in batches."""
+"""A table of an exported log: flat columns with a kind and a unit, and rows in batches."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Column(NamedTuple):
     """The field, or field and entry: "x.z"."""
     kind: Kind
     unit: str = ""
-    """Empty where there is none, as of a text."""
+    """Empty if there is none, as for a text."""
 
     @property
     def title(self) -> str:
-        """Name and unit, as "x.z [1]"."""
+        """Name and unit, such as "x.z [1]"."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
@@ -37,24 +37,24 @@ class Table(NamedTuple):
     """One channel of the log's views."""
 
     name: str
-    """As "controller/result"."""
+    """Such as "controller/result"."""
     stem: str
-    """What its file is called, as "controller.result"."""
+    """Name of its file, such as "controller.result"."""
     columns: tuple[Column, ...]
 
 
 Batch = list[list[Any]]
-"""Rows of a table: one value a column, None where the message has no such value."""
+"""Rows of a table: one value per column, None if the message has no such value."""
 
 
 class Writer(Protocol):
-    """One format. Its files are whole after `close`."""
+    """Writer of one format. Its files are complete after `close`."""
 
     files: list[Path]
-    """Those that were begun."""
+    """Paths of the files that were begun."""
 
     def write(self, table: Table, rows: Batch) -> None:
-        """Add rows. A table may have more columns than before, behind those that it had. Raises `OSError`."""
+        """Add rows. A table may have new columns after its old ones. Raises `OSError`."""
 
     def close(self) -> None:
         """Finish all files. Raises `OSError`."""

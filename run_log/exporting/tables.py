@@ -1,4 +1,4 @@
-"""Views of messages as rows of tables: nested fields become columns, what a schema cannot name becomes JSON text."""
+"""Views of messages as rows of tables: nested fields become columns, and undeclared ones JSON text."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from run_log.exporting.table import TIMES, Batch, Column, Kind, Table, Writer
 from run_log.views.channel import VIEW, Channel, Json, Shown
 
 ROWS = 8192
-"""Rows of a table that wait in memory until they are written together."""
+"""Number of rows of a table that are written together."""
 LONGEST_STEM = 120
 CLOCKS = {("plant/state", "t"): "plant_time", ("controller/tick", "t"): "loop_time"}
-"""Names of time columns that say whose clock it is, by table and field."""
+"""Names of time columns with their clock, by table and field."""
 KINDS: dict[str, Kind] = {"number": "number", "integer": "integer", "boolean": "boolean", "string": "string"}
 
 
 class Tables:
-    """All tables of one log; hands their rows on in batches.
+    """All tables of one log; passes their rows to the writers in batches.
 
     Args:
         writers: the formats to write.
@@ -34,7 +34,7 @@ class Tables:
         """Number of rows written so far, by the name of the table."""
 
     def add(self, shown: Shown, log_time: int, since_start: float) -> None:
-        """A row more. Raises `OSError`: it cannot be written."""
+        """Add a row. Raises `OSError` if it cannot be written."""
         topic = shown.channel.topic
         rows = self._of.get(topic)
         if rows is None:
@@ -46,7 +46,7 @@ class Tables:
             self._write(rows)
 
     def finish(self) -> None:
-        """Write what still waits. Raises `OSError`."""
+        """Write the remaining rows. Raises `OSError`."""
         for rows in self._of.values():
             self._write(rows)
 
@@ -60,14 +60,14 @@ class Tables:
 
 
 class _Field(NamedTuple):
-    """Where the value of a column is in a view."""
+    """Path to the value of a column in a view."""
 
     path: tuple[str, ...]
     column: Column
 
 
 class _Rows:
-    """One table: its columns, and the rows that wait."""
+    """One table: its columns, and the rows that are not written yet."""
 
     def __init__(self, name: str, stem: str):
         self._name, self.stem = name, stem
@@ -88,11 +88,11 @@ class _Rows:
         )
 
     def take(self) -> tuple[Table, Batch]:
-        """The table and the rows that waited; these are no longer there then."""
+        """Return the table and its waiting rows, and forget these rows."""
         batch, self.batch = self.batch, []
         table = Table(self._name, self.stem, (*TIMES, *(field.column for field in self._fields.values())))
         for row in batch:
-            # Columns that the table did not have yet.
+            # Columns that the table does not have yet.
             row += [None] * (len(table.columns) - len(row))
         return table, batch
 
@@ -138,11 +138,11 @@ def _value(values: Any, field: _Field) -> Any:
 
 
 def _stem(name: str) -> str:
-    """A file's name that every file system takes; topics of a user may have any."""
+    """Return a name that every file system accepts; user topics may have any name."""
     return re.sub(r"[^a-z0-9_-]+", ".", name.lower()).strip(".")[:LONGEST_STEM] or "table"
 
 
 def _unlike(name: str, taken: Collection[str]) -> str:
-    """The name, with a number behind it where it is taken."""
+    """Return the name, with a number after it if it is in use."""
     candidates = chain([name], (f"{name}_{i}" for i in count(2)))
     return next(found for found in candidates if found not in taken)

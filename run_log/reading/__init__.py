@@ -1,1 +1,1 @@
-"""Reading a log, a damaged one too."""
+"""Reading a log, also a damaged one."""

@@ -12,9 +12,9 @@ EACH_TICK = (topics.TICK, topics.COMMAND, topics.RESULT)
 
 
 def holes(there: Iterable[int], first: int, last: int) -> list[tuple[int, int]]:
-    """(first, number) of every stretch of first..last that is missing.
+    """Yield (first, number) of every missing stretch of first..last.
 
-    As much work as there are numbers, not as many as there could be: a log says what its numbers are.
+    The work depends on how many numbers are present and not on their range, because a log may contain any number.
     """
     inside = sorted({number for number in there if first <= number <= last})
     between = zip([first - 1, *inside], [*inside, last + 1], strict=True)
@@ -22,7 +22,7 @@ def holes(there: Iterable[int], first: int, last: int) -> list[tuple[int, int]]:
 
 
 def lost_ticks(run: Run) -> list[tuple[str, int, int]]:
-    """(run id, first tick, number) of every gap between a controller's first and last tick in the log."""
+    """Yield (run id, first tick, number) of every gap between a controller's first and last tick in the log."""
     found = []
     for run_id in run.controllers:
         logged = [

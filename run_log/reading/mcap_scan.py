@@ -2,7 +2,7 @@
 
 Every byte is covered by a checksum of the format: chunks and attachments have their own, the data section
 and the summary have one each. A file that was cut short (power, kill -9) lacks the last two and ends in the
-middle of a record; all before that is good.
+middle of a record; all records before that are intact.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from run_log.errors import LogError
 PREFIX = struct.Struct("<BQ")
 FOOTER = struct.Struct("<BQQQI")
 UNPACKED_TIMES, UNPACKED_ALWAYS = 64, 64 * 1024 * 1024
-"""A log unpacks to at most so many times its size, or so many bytes: ours to two or three times. More would only
-exhaust the memory, which is what a file that unpacks to nearly nothing but zeros is made for."""
+"""Limits on the unpacked size: a multiple of the file's size, or a number of bytes. Logs of Tandem unpack to two or
+three times their size. A file that unpacks to much more is made to exhaust the memory."""
 UNREADABLE = (
     McapError,
     CRCValidationError,
@@ -46,7 +46,7 @@ Record: TypeAlias = Header | Attachment | Metadata | Schema | Channel | Message
 class Scan:
     """Iterate over it once; afterwards the attributes describe the file.
 
-    With `keep_going`, damage is noted and the reading goes on where that is possible; without, it raises.
+    With `keep_going`, damage is noted and reading continues after it if possible; without, it raises.
     """
 
     path: Path
@@ -59,7 +59,7 @@ class Scan:
     """Bytes of the chunks so far, uncompressed."""
 
     def __iter__(self) -> Iterator[Record]:
-        """Raises `LogError`: the file cannot be opened, is no MCAP file, or is damaged."""
+        """Raises `LogError` if the file cannot be opened, is not an MCAP file, or is damaged."""
         try:
             with open_regular(self.path) as stream:
                 self.size = stream.seek(0, 2)

@@ -1,4 +1,4 @@
-"""Reads the log of a run: every message decoded, its exact bytes kept."""
+"""Reads the log of a run: decodes every message, and keeps its exact bytes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from run_log.run import Entry, Run
 def read_run(path: str | Path) -> Run:
     """Read a whole log.
 
-    A file that was cut short (kill -9, power) is read up to the cut, and `truncated` is set. What is in the
-    log but is no valid message is counted in `bad`.
+    A file that was cut short (kill -9, power) is read up to the cut, and `truncated` is set. Invalid messages in the
+    log are counted in `bad`.
 
     Raises:
         LogError: unreadable, not MCAP, MCAP of something else, damaged or edited, no usable configuration or plant.
@@ -32,7 +32,7 @@ def read_run(path: str | Path) -> Run:
     scan = Scan(path)
     run = Run(path, Config())
     names: dict[int, tuple[str, str]] = {}
-    """By channel: the topic, and the encoding of its messages."""
+    """Topic, and encoding of the messages, by channel."""
     header: Header | None = None
     for record in scan:
         match record:
@@ -62,7 +62,7 @@ def read_run(path: str | Path) -> Run:
 
 
 def interpret(run: Run) -> None:
-    """Take the configuration and the plant from what was read so far.
+    """Take the configuration and the plant from the attachments and messages read so far.
 
     Raises:
         LogError: there is no usable configuration, or the plant's record cannot be used.
@@ -76,7 +76,7 @@ def interpret(run: Run) -> None:
 
 
 def take_metadata(run: Run, record: Metadata) -> None:
-    """Note in `run` what one metadata record says of its log."""
+    """Copy the facts of one metadata record into `run`."""
     if record.name == RECOVERED:
         run.recovered = True
     elif record.name == CONTINUED:
@@ -111,7 +111,7 @@ def _count_bad(run: Run, key: str) -> None:
 
 
 def _config(path: Path, run: Run) -> Config:
-    """The attached one; where the file was cut before it, that of any process."""
+    """Return the attached configuration; if the file was cut before it, that of any process."""
     attached = run.attachments.get(CONFIG)
     texts = (
         [info.config for info in run.run_infos] if attached is None else [attached.decode(errors="replace")]

@@ -22,10 +22,10 @@ class Recovery(msgspec.Struct, frozen=True, kw_only=True):
     source: str
     log: str | None
     messages: int
-    """Messages that travelled (their views are not counted)."""
+    """Number of messages (views are not counted)."""
     attachments: int
     seconds: float
-    """From the first to the last recovered message."""
+    """Duration from the first to the last recovered message."""
     cut_at: int | None
     """Byte at which the source was cut off; null if it was not."""
     lost_bytes: int
@@ -38,8 +38,8 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
     """Copy all intact records of `path` to the new file `out`, with an index.
 
     Raises:
-        LogExistsError: something is at `out` already.
-        LogError: `path` is unreadable, not a log of ours, or holds nothing; `out` cannot be written.
+        LogExistsError: `out` exists already.
+        LogError: `path` is unreadable, not a log of Tandem, or empty; `out` cannot be written.
     """
     path, out = Path(path), Path(out)
     probe = Scan(path, keep_going=True)

@@ -26,13 +26,13 @@ class Observed:
 def observed(run: Run, model: Model) -> Observed:
     """All labelled samples of a log.
 
-    A controller labels a pair of consecutive samples of one start of the plant, with the input that acted from one to
-    the next. So nothing here leads across an episode, a gap or a restart. Where several inputs acted within a period,
-    `u` is their mean, and `after` is where their mean would have led by the log's model: as h, whose rest is theirs.
+    A controller labels a pair of consecutive samples of one start of the plant, with the input that acted between them.
+    So no transition spans an episode, a gap or a restart. If several inputs acted within a period, `u` is their mean,
+    and `after` is the state to which this mean would have led: the log's model with the labelled h.
 
     Args:
         run: a log, as read.
-        model: that of the log's controllers, which h is of.
+        model: the model of the log's controllers, to which h refers.
 
     Raises:
         LogError: no samples, or samples of another plant.

@@ -40,7 +40,7 @@ class Comparison:
         """See `ReplayResult.largest_difference`."""
 
     def compare(self, entry: Entry[Any], replayed: m.Message | None, name: str) -> None:
-        """Compare byte for byte; `name` begins the name of a differing field. None: the replay made no such message."""
+        """Compare byte for byte; `name` is the prefix of differing fields. None: the replay gave no such message."""
         payload = b"" if replayed is None else codec.encode(replayed)
         if payload == entry.payload or _without_later_fields(payload, entry) == entry.payload:
             return
@@ -54,7 +54,7 @@ class Comparison:
             )
 
     def compare_keyframe(self, entry: Entry[m.Keyframe], replayed: m.Keyframe) -> None:
-        """As `compare`, and counted."""
+        """Compare a keyframe, and count it."""
         self.compare(entry, replayed, "keyframe")
         self.keyframes += 1
 
@@ -68,7 +68,7 @@ class Comparison:
 
 
 def first_difference(recorded: Any, replayed: Any, path: str) -> tuple[str, Shown, Shown] | None:
-    """(field, recorded, replayed) of the first differing field, or None; floats bit for bit."""
+    """Return (field, recorded, replayed) of the first differing field, or None; floats bit for bit."""
     if isinstance(recorded, Array) and isinstance(replayed, Array):
         return _arrays(recorded, replayed, path)
     if type(recorded) is not type(replayed):
@@ -97,8 +97,8 @@ def first_difference(recorded: Any, replayed: Any, path: str) -> tuple[str, Show
 
 
 def _without_later_fields(payload: bytes, entry: Entry[Any]) -> bytes:
-    """What was replayed without fields at their defaults that the recorded message has not: it may be of a version
-    before them."""
+    """Return the replayed message without default fields that the recorded one lacks, because an older version may have
+    recorded it."""
     if not payload:
         return payload
     written = msgspec.msgpack.decode(entry.payload)
@@ -112,7 +112,7 @@ def _without_later_fields(payload: bytes, entry: Entry[Any]) -> bytes:
 
 
 def first_byte(recorded: bytes, replayed: bytes, path: str) -> tuple[str, Shown, Shown]:
-    """For payloads that differ although their fields do not: the position of the first differing byte."""
+    """Return the position of the first differing byte, for payloads whose fields are equal."""
     shorter = min(len(recorded), len(replayed))
     at = next((i for i in range(shorter) if recorded[i] != replayed[i]), shorter)
     return f"{path} (byte {at})", recorded[at : at + 8].hex(" "), replayed[at : at + 8].hex(" ")

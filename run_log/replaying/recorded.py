@@ -19,7 +19,7 @@ from run_log.run import Entry, Run
 
 @dataclass(frozen=True)
 class RecordedController:
-    """One run of a controller. The dictionaries are by tick."""
+    """One run of a controller. The keys of the dictionaries are ticks."""
 
     run_id: str
     config: Config
@@ -35,17 +35,17 @@ class RecordedController:
     architecture: str
     """The network's file, name in it and hash of its text; empty for an architecture of Tandem."""
     complete: bool
-    """Whether the log holds the run to its end; if not, its last tick may lack some of its messages."""
+    """Whether the log contains the end of the run; if not, its last tick may lack some messages."""
 
     @property
     def last(self) -> int:
-        """The last tick; a log that ends early may have some of its messages only."""
+        """The last tick. A log that ends early may contain only some of its messages."""
         ends = [max(found, default=-1) for found in (self.ticks, self.commands, self.results)]
         return max(ends) if self.complete else min(ends)
 
 
 def recorded_controllers(run: Run) -> list[RecordedController]:
-    """In the order of the log, without strangers.
+    """Return the controllers of a log in the order of the log, without strangers.
 
     Raises:
         LogError: two different messages of one tick, a configuration or certified sets that cannot be read.
@@ -72,7 +72,7 @@ def _recorded(run: Run, run_id: str) -> RecordedController:
         sets=_sets(run, run_id),
         known=infos[0].versions.get("known plant", "") if infos else "",
         architecture=infos[0].versions.get("architecture", "") if infos else "",
-        # A simulation has no health; a live run that ended says so.
+        # A simulation has no health; the health of a finished live run is "stopping".
         complete=not run.ends_within and (not said or "stopping" in said),
     )
 

@@ -28,7 +28,7 @@ from run_log.run import Run
 ROUNDING = 1e-7
 """Units of u: largest difference of the inputs of a log from another machine or build."""
 SAID = ("machine", "processor", "kernels", "blas")
-"""Facts on the arithmetic of a log's machine, beside versions; a log may lack them."""
+"""Facts about the arithmetic of a log's machine, beside versions; a log may lack them."""
 Progress = Callable[[int, int], None]
 
 
@@ -36,22 +36,22 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a replay. Equal means: every command, backup, result, output weight and keyframe, every byte."""
 
     ticks: int
-    """Replayed and compared."""
+    """Number of replayed and compared ticks."""
     equal: bool
     first_difference: Difference | None
     differing_ticks: int
     largest_difference: float | None
     """Largest |recorded - replayed| among the inputs of all plans, in units of u; null if sizes differ."""
     keyframes: int
-    """Compared."""
+    """Number of compared keyframes."""
     first_tick: int
     """Start of the replay: the tick after a keyframe."""
     run_ids: list[str]
     rounding: bool
-    """Not equal, but no input of a plan differs by more than `ROUNDING`."""
+    """Whether the replay is not equal, but no input of a plan differs by more than `ROUNDING`."""
     elsewhere: bool | None
-    """Recorded with another processor, BLAS kernel, compiler or version than this replay has; None: a log does not say
-    all of that, and what it says is the same."""
+    """Whether the log was recorded with another processor, BLAS kernel, compiler or version; None if the log lacks some
+    of these facts and the others are equal."""
     lost_ticks: int
     """Ticks that could not be replayed or not be compared completely: the log lacks them, or their initial memory."""
     notes: list[str]
@@ -65,19 +65,18 @@ def replay(
     progress: Progress | None = None,
     architecture: OwnArchitecture | None = None,
 ) -> ReplayResult:
-    """Replay every controller run of a log from the log alone, and from an architecture of one's own where it has one.
+    """Replay every controller run of a log from the log alone, or with the user's architecture file.
 
     Args:
         run: a log, as read.
         from_tick: begin at the nearest keyframe before this tick; None: at the first tick.
-        overrides: `section.key=value`, to see what a change would have done.
+        overrides: `section.key=value`, to see the effect of a change.
         progress: called with (ticks done, ticks in all).
-        architecture: the file that the log's network was made with, as its user has it; nothing is loaded because a
-            log names it.
+        architecture: the user's file with the log's network; no file is loaded because a log names it.
 
     Raises:
-        LogError: there is nothing to begin with, messages are recorded twice or do not fit the plant; the log's
-            configuration admits no controller.
+        LogError: no tick can be replayed, messages are recorded twice or do not fit the plant, or the log's
+            configuration does not give a controller.
         ConfigError: an override cannot be applied.
     """
     recorded = recorded_controllers(run)

@@ -15,7 +15,7 @@ NAMED = 8
 
 @dataclass
 class Segments:
-    """(keyframe, last tick) of each segment in `ranges`, and a note on all gaps between them."""
+    """Segments as (keyframe, last tick) in `ranges`, and a note on every gap between them."""
 
     start: int
     """The keyframe at which the replay begins."""
@@ -26,7 +26,7 @@ class Segments:
 
 
 def replayable(run: Run, recorded: RecordedController, from_tick: int | None) -> Segments:
-    """The segments from the nearest keyframe before `from_tick` on; None: from the first keyframe of the log.
+    """Return the segments from the nearest keyframe before `from_tick`; None: from the first keyframe of the log.
 
     Raises:
         LogError: there is no keyframe before `from_tick`.
@@ -64,7 +64,7 @@ def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Seg
     if before:
         return Segments(max(before))
     inside = [seq for seq in recorded.keyframes if seq < recorded.last]
-    # Those with their next tick first: a recorder that comes late is sent some of ticks that it never heard.
+    # Prefer keyframes with a next tick: a late recorder also receives keyframes of ticks that it missed.
     later = min((seq for seq in inside if seq + 1 in recorded.ticks), default=min(inside, default=None))
     missing = f"no keyframe before tick {wanted} of {recorded.run_id} is in the log"
     unknown = f"{missing}: the controller's memory at that tick is not known"
@@ -72,7 +72,7 @@ def _begin(run: Run, recorded: RecordedController, from_tick: int | None) -> Seg
         way = "" if later is None else f"; the first one is after tick {later}: use --from-tick {later + 1}"
         raise LogError(f"{run.path}: {unknown}{way}{run.unreadable}")
     segments = Segments(recorded.last if later is None else later)
-    # What comes before the first keyframe of a part is in the part before this one as well.
+    # Ticks before the first keyframe of a part are also in the previous part.
     if run.part == 1 or later is None:
         way = "none of it can be replayed" if later is None else f"replay begins at tick {later + 1}"
         segments.lost = sum(seq <= segments.start for seq in recorded.ticks)

@@ -11,11 +11,11 @@ from lbmpc.plants.truth import dop853
 from run_log.reporting.motion import Pieces, Trajectory
 
 POINTS = 8
-"""Shares of a stretch under one input at which the motion is evaluated, its end included."""
+"""Shares of an interval with one input at which the motion is evaluated, including its end."""
 SAME = 1e-6
-"""Half-widths. A motion that ends this close to the next sample is the plant's own."""
+"""Tolerance in half-widths. A motion that ends this close to the next sample is the plant's."""
 AT_ONCE = 4096
-"""Periods in memory together."""
+"""Number of periods in memory at once."""
 
 
 def excess(motion: Trajectory, plant: Description, truth: object) -> float | None:

@@ -11,7 +11,7 @@ from run_log.run import Run, plant_of
 
 
 class Report(NamedTuple):
-    """The pictures that were drawn, and why others were not."""
+    """The pictures that were drawn, and the reasons why others were not."""
 
     pictures: list[Path]
     failed: list[PictureError]
@@ -21,7 +21,7 @@ def report(run: Run, out_dir: str | Path) -> Report:
     """Draw the log NAME.mcap into `out_dir`: NAME.png is the whole run, NAME-states.png etc. its parts.
 
     Raises:
-        LogError: the log holds nothing to draw.
+        LogError: the log contains nothing to draw.
     """
     path, out_dir = run.path, Path(out_dir)
     data = traces(run)
@@ -47,7 +47,7 @@ def picture(run: Run, path: str | Path) -> Path:
     """Draw the whole run on one page.
 
     Raises:
-        LogError: the run holds nothing to draw.
+        LogError: the run contains nothing to draw.
         PictureError: it cannot be drawn or written.
     """
     data = traces(run)

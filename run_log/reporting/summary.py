@@ -36,17 +36,17 @@ class PredictionError(msgspec.Struct, frozen=True):
 class Summary(Performance, frozen=True, kw_only=True):
     """Figures of the true plant (from its own states after the hold) and of the control loop.
 
-    Each start of the plant is an episode; those of the plant are of all of them, as `Performance` says.
+    Each start of the plant is an episode. The figures of the true plant cover all episodes, as in `Performance`.
     """
 
     episodes: list[Performance]
-    """Each by itself."""
+    """Cost of each episode."""
     ticks: int
     late_ticks: int
     """Ticks that began late, or ended after their period."""
     skipped_slots: int
     lost_ticks: int
-    """Incomplete ticks of the log: they never reached the recorder, and all figures lack them too."""
+    """Incomplete ticks of the log, which the recorder did not receive completely; no figure includes them."""
     weights_adopted: int
     weights_refused: int
     weights_rolled_back: int
@@ -67,13 +67,13 @@ class Summary(Performance, frozen=True, kw_only=True):
     tick_ms: Spread | None
     prediction_error: PredictionError
     weight: dict[str, float] | None
-    """What of the network counted in the prediction of each state, 0 to 1: the mean of the last second, or period if
-    longer; null where nothing weighs it."""
+    """Weight of the network in the prediction of each state, 0 to 1: the mean of the last second, or period if longer;
+    null without weights."""
     constant_weight: dict[str, float] | None
     """Weight of the constant beside it, likewise."""
     noise: dict[str, float] | None
-    """Standard deviation of what is measured of each state as the estimator had found it at the end, plant units; null
-    where it was told, or where there is no estimator."""
+    """Standard deviation of the measurement of each state as estimated at the end, plant units; null if it is
+    configured or there is no estimator."""
     outside_ticks: int | None
     """Ticks in a state outside the certified sets, where nothing is guaranteed; null without sets."""
     smallest_set_margin: float | None
@@ -82,7 +82,7 @@ class Summary(Performance, frozen=True, kw_only=True):
 
 
 def summarise(run: Run) -> Summary:
-    """Raises `LogError`: the plant is unknown here, or the log holds none of its states."""
+    """Raises `LogError` if the plant is unknown here, or the log contains none of its states."""
     plant, truth = plant_of(run), true_plant_of(run)
     controllers = set(run.controllers)
     ticks = [tick for tick in run.ticks if tick.run_id in controllers]

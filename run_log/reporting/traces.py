@@ -41,7 +41,7 @@ class Traces:
     fallback: np.ndarray
     """(n,) whether the input did not come from the solver."""
     version: np.ndarray
-    """(n,) hidden weights in force, -1 before the first."""
+    """(n,) version of the hidden weights in use, -1 before the first."""
     adopted: np.ndarray
     refused: np.ndarray
     rolled_back: np.ndarray
@@ -54,7 +54,7 @@ class Traces:
 
 
 def traces(run: Run) -> Traces:
-    """Raises `LogError`: the plant is unknown here, or the log holds none of its states or no tick."""
+    """Raises `LogError` if the plant is unknown here, or the log contains none of its states or no tick."""
     plant = plant_of(run)
     motion = trajectory(run, plant)
     controllers = set(run.controllers)
@@ -99,7 +99,7 @@ def traces(run: Run) -> Traces:
 
 
 def _tick_times(run: Run, motion: Trajectory) -> dict[tuple[str, int], float]:
-    """Slots are on the controller's clock; the states that ticks answer tie it to the plant's."""
+    """Return the time of each tick on the plant's clock. The answered states relate the controller's clock to it."""
     states = [s for s in run.plant_states if s.command_seq >= 0] or run.plant_states
     sampled = {(s.run_id, s.seq): s.t for s in run.plant_states}
     start = states[0].t - (motion.t[1] if len(motion.t) > 1 and states[0].command_seq >= 0 else 0.0)

@@ -1,4 +1,4 @@
-"""What people and other tools see of a run: channels of JSON with schemas.
+"""Views of a run for people and other tools: channels of JSON with schemas.
 
-The log, the live socket and exports share it. `run_log.views.views.Views` is the interface.
+The log, the live socket and exports share them. `run_log.views.views.Views` is the interface.
 """

@@ -1,4 +1,4 @@
-"""What the order and the times of messages say: which were lost on the way, and when each was sent."""
+"""Lost messages and sending times, from the order and the times of the messages."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from node_runtime.bus.inbox import Follower
 from protocol import topics
 
 COUNTED = (topics.TICK.name, topics.RESULT.name)
-"""Every tick has one of each, and both come in order: a number that is skipped is a message that was lost."""
+"""Every tick has one of each, and both arrive in order, so a skipped number is a lost message."""
 MOST_RUNS = 100
-"""That are remembered on each topic."""
+"""Number of runs that are remembered for each topic."""
 DRIFT = 1e-4
-"""Seconds per second, by which two clocks may drift apart: more than any quartz."""
+"""Largest drift between two clocks, seconds per second: more than that of any quartz."""
 LEAP_S = 1.0
-"""A sender whose clock leaps ahead by more is not followed: all later messages would seem old."""
+"""Largest forward step of a sender's clock that is followed; after a larger one all later messages would seem old."""
 OLDEST_S = 60.0
-"""A message that seems older than that has a sender whose clock was set."""
+"""Largest age of a message; if it seems older, the sender's clock was set."""
 
 
 class LostTicks:
-    """Ticks whose messages were made and never arrived here, because of cut links or full queues."""
+    """Counts ticks whose messages were lost because of cut links or full queues."""
 
     def __init__(self, follow_silence: float):
         self._followed = {name: Follower(follow_silence) for name in COUNTED}
         self._last: dict[tuple[str, str], int] = {}
-        """By topic and run."""
+        """Number of the last message, by topic and run."""
         self.count: dict[str, int] = {}
-        """By topic, the messages that are missing."""
+        """Number of lost messages, by topic."""
 
     def take(self, name: str, run_id: str, seq: int, time_ns: int) -> int:
-        """How many are missing just before this message.
+        """Return the number of lost messages just before this one.
 
-        A message out of order, or of another run than the one that is followed, was sent again or by a stranger.
+        A message out of order, or of another run than the followed one, is a repetition or comes from a stranger.
         """
         if self._followed[name].accept(run_id, seq, time_ns * 1e-9) != "ok":
             return 0
@@ -58,10 +58,10 @@ class SendTimes:
 
     def __init__(self) -> None:
         self._clocks: OrderedDict[tuple[str, str], tuple[float, float]] = OrderedDict()
-        """By topic and run: the smallest difference so far, and when it was last brought up to date; seconds."""
+        """Smallest difference so far, and the time of its last update, by topic and run; seconds."""
 
     def of(self, name: str, head: Any, time_ns: int) -> int:
-        """Return the time in ns, never after `time_ns`, that of the arrival; `time_ns` where the message has none."""
+        """Return the sending time in ns, at most the arrival time `time_ns`; `time_ns` if the message has no time."""
         if name == topics.PLANT_STATE.name:
             sent = head.t
         elif name == topics.TICK.name:
@@ -73,7 +73,7 @@ class SendTimes:
         if not math.isfinite(difference):
             return time_ns
         least, at = self._clocks.get(key, (difference, arrived))
-        # Two clocks drift apart, and not every message is a quick one from then on.
+        # Two clocks drift apart, and later messages may all be slower than the quickest one.
         least += DRIFT * max(0.0, arrived - at)
         if difference < least - LEAP_S:
             return time_ns

@@ -10,7 +10,7 @@ import msgspec
 
 Json = dict[str, Any]
 VIEW = "view/"
-"""What the names of these channels begin with."""
+"""Prefix of the names of these channels."""
 MOST_NAMES = 256
 """Fields of one object."""
 MOST_SCHEMAS = 32
@@ -18,16 +18,16 @@ MOST_SCHEMAS = 32
 
 
 class Channel:
-    """One channel with one schema. A channel whose fields become more is a new object of the same `topic`.
+    """One channel with one schema. If a channel gets more fields, a new object with the same `topic` replaces it.
 
     Attributes:
         topic: "view/plant/state".
-        schema_name: "tandem.view.plant.state"; a schema that other tools know has their name for it.
+        schema_name: "tandem.view.plant.state", or the name of a schema that other tools know.
         schema: a JSON schema of type object. Leaves with a unit have it as "unit", and in their "description".
     """
 
     def __init__(self, name: str, schema: Json, schema_name: str | None = None):
-        """name: of the channel below `view/`."""
+        """name: name of the channel below `view/`."""
         self.topic = VIEW + name
         self.schema_name = schema_name or f"tandem.view.{name.replace('/', '.')}"
         self.schema = schema
@@ -80,7 +80,7 @@ def leaf(kind: str, description: str = "", unit: str = "") -> Json:
 
 
 class Growing:
-    """An object whose fields are not known beforehand, such as counters: each is declared when it is first seen."""
+    """An object whose fields are not known in advance, such as counters. Each is declared when it first appears."""
 
     def __init__(self, kind: str, description: str):
         self._leaf = leaf(kind)
@@ -97,7 +97,7 @@ class Growing:
         return object_schema(dict.fromkeys(self._names, self._leaf)) | {"description": self._description}
 
     def grow(self, values: Mapping[str, Any]) -> bool:
-        """Declare what is new; whether the schema has changed."""
+        """Declare new fields; return whether the schema has changed."""
         if values.keys() <= self._names.keys() or self._grown >= MOST_SCHEMAS:
             return False
         before = len(self._names)
@@ -108,7 +108,7 @@ class Growing:
         return len(self._names) > before
 
     def declared(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Those of the values whose fields are declared."""
+        """Return the values whose fields are declared."""
         if values.keys() <= self._names.keys():
             return values
         return {name: value for name, value in values.items() if name in self._names}

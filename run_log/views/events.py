@@ -1,4 +1,4 @@
-"""What changes in a run, in words: messages of `foxglove.Log`, which Foxglove and Lichtblick show as a log."""
+"""Events of a run as messages of `foxglove.Log`, which Foxglove and Lichtblick show as a log."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from protocol import topics
 from run_log.views.channel import Channel, Json, Shown, leaf
 
 BURST = 10
-"""Events of one kind that come at once; after them one comes every `APART_NS`, and says how many did not."""
+"""Number of events of one kind that are shown at once. Then one is shown every `APART_NS`, with the omitted number."""
 APART_NS = 500_000_000
 MOST_SENDERS = 100
 
 
 class Level(IntEnum):
-    """As `foxglove.LogLevel`."""
+    """Levels of `foxglove.LogLevel`."""
 
     UNKNOWN = 0
     DEBUG = 1
@@ -65,17 +65,17 @@ def _log_schema() -> Json:
 
 @dataclass
 class _Kind:
-    """How many events of one kind came lately."""
+    """Recent events of one kind."""
 
     left: float = BURST
     at: int = 0
     withheld: int = 0
     newest: tuple[Level, str, str] | None = None
-    """The last one that was withheld."""
+    """The last withheld event."""
 
 
 def _calm_result(result: Any) -> tuple[object, ...] | None:
-    """All that could be an event in a result; None where it has an event of its own. Quick, for every tick is asked."""
+    """Return all fields of a result that could give an event; None if it has one for certain. Runs at every tick."""
     if result.weights_verdict != "none" or result.reference_verdict != "none" or result.weights_rolled_back:
         return None
     outside = result.set_margin is not None and result.set_margin < 0.0
@@ -83,20 +83,20 @@ def _calm_result(result: Any) -> tuple[object, ...] | None:
 
 
 class Events:
-    """Follows the messages of a run, and says what has changed."""
+    """Follows the messages of a run and reports changes."""
 
     def __init__(self) -> None:
         self.channel = Channel("events", _log_schema(), "foxglove.Log")
         self._was: dict[str, Any] = {}
-        """By kind, what was the case last."""
+        """Last value, by kind."""
         self._kinds: dict[str, _Kind] = {}
         self._calm: tuple[object, ...] | None = None
-        """The last result, where it had nothing to tell by itself."""
+        """The last result, if it had no event."""
         self._waiting = False
         self._now = 0
 
     def take(self, name: str, message: Any, time_ns: int) -> list[Shown]:
-        """The events of a message of topic `name`, or of its head (`run_log.views.heads`)."""
+        """Return the events of a message of topic `name`, or of its head (`run_log.views.heads`)."""
         self._now = time_ns
         shown = self._overdue() if self._waiting else []
         found: Iterator[Shown | None] | None = None
@@ -124,7 +124,7 @@ class Events:
         return [*shown, *(one for one in found if one is not None)] if found is not None else shown
 
     def lost(self, name: str, seq: int, missing: int, time_ns: int) -> list[Shown]:
-        """Messages of topic `name` are missing just before number `seq`."""
+        """Return the event for messages of topic `name` that are lost just before number `seq`."""
         self._now = time_ns
         what = (
             f"message {seq - 1} is missing"
@@ -181,7 +181,7 @@ class Events:
             text = f"{who}: hidden weights rolled back: {result.weights_rolled_back}"
             yield self._say("rolled back", Level.WARNING, "controller", text)
         yield from self._faults(result, who)
-        # A reference whose lease is renewed is the same one.
+        # A renewed lease does not make a new reference.
         renewed = result.reference_verdict == "taken" and result.reference_from == self._was.get("asked by")
         if result.reference_verdict != "none" and not renewed:
             level = Level.INFO if result.reference_verdict == "taken" else Level.WARNING
@@ -231,9 +231,9 @@ class Events:
             )
 
     def _change(self, kind: str, now: Any, usual: Any = None) -> Any:
-        """What was the case before, where that is something else; None where nothing has changed.
+        """Return the previous value if it differs; None if it has not changed.
 
-        usual: what counts as having been the case before the first message; None: nothing did.
+        usual: the value before the first message; None: there was none.
         """
         before = self._was.get(kind, usual)
         if before == now:

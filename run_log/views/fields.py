@@ -1,4 +1,4 @@
-"""What the fields of the views mean, and their units."""
+"""Meanings and units of the fields of the views."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 
 class Meaning(NamedTuple):
-    """Of one field."""
+    """Meaning of one field."""
 
     text: str
     unit: str = ""
-    """Empty: it has none, or its entries have those of the plant's states and inputs."""
+    """Empty if it has none, or if its entries have the units of the plant's states and inputs."""
 
 
 FIELDS: dict[str, Meaning] = {
@@ -115,7 +115,7 @@ FIELDS: dict[str, Meaning] = {
     "bounds.h_min": Meaning("Lower bounds of h: minus the half-widths of W for one period"),
     "bounds.h_max": Meaning("Upper bounds of h: the half-widths of W for one period"),
 }
-"""By the field's name; by "message.field" where one of a message is different."""
+"""By field name, or by "message.field" if the meaning differs in one message."""
 
 
 def meaning_of(message: str, field: str) -> Meaning:

@@ -1,4 +1,4 @@
-"""The parts of a message that events and counts need: decoded alone where the message gets no view."""
+"""The parts of a message that events and counts need, for messages without a view."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ HEADS: dict[str, type[Head]] = {
     topics.RESULT.name: ResultHead,
     topics.KEYFRAME.name: KeyframeHead,
 }
-"""By topic name; of all others `Head` is enough."""
+"""Heads by topic name; `Head` is sufficient for all others."""
 
 
 def head_of(name: str, payload: bytes) -> Any:
-    """Return the head of a message of topic `name`; None where it cannot be read."""
+    """Return the head of a message of topic `name`; None if it cannot be read."""
     try:
         return decode_as(HEADS.get(name, Head), payload)
     except UNREADABLE:

@@ -1,4 +1,4 @@
-"""Series that no message has by itself: the bounds of the plant, and what the plans aim at."""
+"""Series that are not in a message: the bounds of the plant, and the targets of the plans."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from run_log.views.fields import meaning_of
 from run_log.views.view import entry, named
 
 BOUNDS_EVERY_NS = 1_000_000_000
-"""Between two messages: enough that a line is drawn through any stretch of a run."""
+"""Interval between two messages, so short that every part of a run shows a line."""
 
 
 class Bounds:
-    """The bounds of X, U and W as a series, so that they can be drawn with the states, the inputs and h."""
+    """The bounds of X, U and W as a series, to be plotted with the states, the inputs and h."""
 
     def __init__(self, config: Config, plant: Description):
         given = config.controller.W
@@ -36,7 +36,7 @@ class Bounds:
         values: dict[str, dict[str, float]] = {}
         schemas: Json = {}
         for name, (names, numbers) in found.items():
-            # A bound that is infinite is no bound.
+            # An infinite bound is left out.
             finite = {
                 one: value for one, value in named(names, numbers.tolist()).items() if np.isfinite(value)
             }
@@ -50,8 +50,8 @@ class Bounds:
         self._next: int | None = None
 
     def show(self, time_ns: int) -> Shown | None:
-        """Once a second, beginning at once; None in between."""
-        # A clock that was set back, or another run's, does not silence it.
+        """Return the bounds at the first message and then once a second; else None."""
+        # A clock that was set back, or that of another run, does not stop the series.
         if self._next is not None and self._next - BOUNDS_EVERY_NS <= time_ns < self._next:
             return None
         self._next = time_ns + BOUNDS_EVERY_NS
@@ -59,7 +59,7 @@ class Bounds:
 
 
 class Targets:
-    """What the plans aim at: the target of the reference, or the equilibrium where there is no reference."""
+    """Targets of the plans: the target of the reference, or the equilibrium if there is no reference."""
 
     def __init__(self, plant: Description):
         self._plant = plant
@@ -74,7 +74,7 @@ class Targets:
         self.channel = Channel("targets", document("Targets of the plans", schemas, ("x", "u", "status")))
 
     def show(self, result: TickResult) -> Shown:
-        """Raises `ValueError`: a target is not of this plant."""
+        """Raises `ValueError` if a target does not fit this plant."""
         x, u = (result.target_x, result.target_u) if result.target_x else self._rest
         plant = self._plant
         shown: Json = {

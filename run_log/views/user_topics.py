@@ -1,7 +1,7 @@
-"""Views of topics that users publish themselves: JSON, msgpack or text, without a schema given by anyone.
+"""Views of user topics: JSON, msgpack or text without a schema.
 
-The schema of such a channel is what has been seen: a field is declared when it first comes, with the kind that it has
-then. A later value of another kind is left out of the view; the message's bytes are in the log whatever they are.
+The schema of such a channel follows from its messages. A field is declared with its kind when it first appears. A later
+value of another kind is left out of the view. The log contains the bytes of every message.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from run_log.views.channel import (
 )
 
 MOST_LEAVES = 256
-"""Declared numbers, texts and arrays of one topic."""
+"""Largest number of declared numbers, texts and arrays of one topic."""
 MOST_ENTRIES = 256
-"""Entries of an array that are shown."""
+"""Largest number of entries of an array that are shown."""
 DEEPEST = 8
-"""Objects within each other."""
+"""Largest depth of nested objects."""
 LONGEST_TEXT = 1000
 LONGEST_NAME = 100
 LARGEST_WHOLE = 2**53
-"""Whole numbers up to this are whole in every JSON reader."""
+"""Largest integer that every JSON reader represents exactly."""
 
 
 class UserView:
-    """How one user's topic is shown."""
+    """View of one user topic."""
 
     def __init__(self, name: str):
         """name: the key below `tandem/<plant>/`: "user/wind"."""
@@ -46,10 +46,10 @@ class UserView:
         self._root = _Object()
         self._grown = 0
         self.channel: Channel | None = None
-        """With the schema as it is now; None before the first message."""
+        """The channel with its present schema; None before the first message."""
 
     def render(self, payload: bytes) -> Shown | None:
-        """One message, whatever its bytes are; None where there is nothing in it."""
+        """Return the view of a message with any bytes; None if it is empty."""
         content = read(payload)
         values = content if isinstance(content, dict) else {"value": content}
         new = Room(self._root.leaves) if self._grown < MOST_SCHEMAS else Room(MOST_LEAVES)
@@ -64,7 +64,7 @@ class UserView:
 
 
 def read(payload: bytes) -> Any:
-    """Return the content: of JSON, or of a msgpack map or array, or a text, or of any msgpack, or words."""
+    """Return the content as JSON, a msgpack map or array, a text, any other msgpack, or a description."""
     text: str | None = None
     with contextlib.suppress(ValueError, RecursionError):
         text = payload.decode()
@@ -80,7 +80,7 @@ def read(payload: bytes) -> Any:
 
 
 def _text(text: str) -> str:
-    # Half of a surrogate pair is no Unicode, and msgspec refuses it.
+    # Half of a surrogate pair is invalid Unicode, and msgspec refuses it.
     return text.encode(errors="replace").decode()
 
 
@@ -89,7 +89,7 @@ def _bytes(data: bytes) -> str:
 
 
 class Room:
-    """For new leaves."""
+    """Counts the further leaves that may be declared."""
 
     def __init__(self, taken: int):
         self._free, self.used = MOST_LEAVES - taken, 0
@@ -116,7 +116,7 @@ class _Object:
         return {name: _schema(one) for name, one in self._fields.items()}
 
     def take(self, values: dict[Any, Any], new: Room, deep: int) -> Json:
-        """Declare what is new and fits, and return what is declared."""
+        """Declare new fields within the limits, and return the declared values."""
         shown: Json = {}
         for key, value in values.items():
             name = _text(str(key)[:LONGEST_NAME])
@@ -143,7 +143,7 @@ def _schema(field: str | _Object) -> Json:
 
 
 def _plain(value: Any) -> tuple[str, Any]:
-    """The kind of a leaf and its value; an object with no kind; "" where there is nothing to show."""
+    """Return the kind of a leaf and its value. An object has no kind; "" means that there is nothing to show."""
     if isinstance(value, bool):
         return "boolean", value
     if isinstance(value, int):

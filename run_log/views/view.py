@@ -1,8 +1,9 @@
 """The plottable view of each message: JSON with a JSON schema, vectors under the plant's own names.
 
-A view is a message's fields, by name, and what is made of others; its JSON and its schema both follow from the
-message's own Struct. Weights are summarised by their norms, and a keyframe has no view. What a message lacks (no input
-was applied, no estimate yet) is left out rather than null, since plotting tools skip absent fields and choke on others.
+A view contains fields of the message by name, and values computed from other fields. Its JSON and its schema follow
+from the message's Struct. Weights are summarised by their norms, and a keyframe has no view. A missing value (no
+input was applied, no estimate yet) is left out and not null, because plotting tools skip absent fields and fail on
+null.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ NAMED_AFTER = dict.fromkeys((*VECTORS, "h", "h_hat", "column_norms"), "states") 
 WITHOUT_UNIT = ("oracle_norms", "weight", "constant_weight", "column_norms")
 """Vectors whose entries are not in the units of the plant."""
 BY_STATE = ("sensor_faults", "reference", "values")
-"""Fields with values of some of the states, by name."""
+"""Fields with values of some states, by name."""
 LACKING = (*VECTORS, "sensor_faults", "reference", "weights_rolled_back", "reference_from")
-"""What a result has not, where it is empty."""
+"""Fields of a result that are absent if they are empty."""
 JSON_TYPES: dict[type[inspect.Type], str] = {
     inspect.FloatType: "number",
     inspect.IntType: "integer",
@@ -71,14 +72,14 @@ def _of_result(result: m.TickResult) -> Json:
 
 
 def _of_samples(samples: m.Samples) -> Json:
-    """How many there are, and the last of them."""
+    """The number of samples, and the last of them."""
     last = {name: getattr(sample, name) for sample in samples.samples[-1:] for name in ("x", "u", "h")}
     return {"count": len(samples.samples), **last}
 
 
 def _of_output_weights(weights: m.OutputWeights) -> Json:
     K = weights.K.numpy()
-    # Of a K that is no matrix the norm along its first axis is a number: one entry, which is the wrong size.
+    # If K is not a matrix, the norm along its first axis is one number, which has the wrong size.
     columns = np.atleast_1d(np.linalg.norm(K, axis=0))
     return {"norm": float(np.linalg.norm(K)), "column_norms": columns.tolist()}
 
@@ -97,14 +98,14 @@ def _of_reference(reference: m.Reference) -> Json:
 
 
 class Fields(NamedTuple):
-    """What is shown of one kind of message."""
+    """The shown fields of one kind of message."""
 
     names: str
-    """In this order, after run_id and seq."""
+    """Names of the fields, in this order, after run_id and seq."""
     made: Callable[[Any], Json] = lambda _message: {}
     """Values of fields that the message lacks or has in another form; None or absent if it has no value."""
     types: Mapping[str, Any] = {}
-    """Types of these values, where the message's own are not right."""
+    """Types of these values, if they differ from those of the message."""
 
 
 FIELDS_OF: dict[type[m.Message], Fields] = {
@@ -161,7 +162,7 @@ FIELDS_OF: dict[type[m.Message], Fields] = {
 
 
 class View:
-    """How one topic is shown for one plant."""
+    """View of one topic for one plant."""
 
     def __init__(self, topic: Topic, plant: Description):
         self.topic = topic
@@ -180,13 +181,13 @@ class View:
             if isinstance(kind, inspect.DictType) and name not in BY_STATE
         }
         self.channel = self._channel()
-        """With the schema as it is now."""
+        """The channel with its present schema."""
 
     def render(self, message: m.Message) -> Shown:
-        """One message.
+        """Return the view of one message.
 
         Raises:
-            BadMessage: a vector's length is not the plant's.
+            BadMessage: the length of a vector does not fit the plant.
         """
         values: Json = {name: getattr(message, name) for name in self._copied}
         try:
@@ -200,7 +201,7 @@ class View:
         return Shown(self.channel, msgspec.json.encode(shown))
 
     def _name_entries(self, values: Json) -> None:
-        """Name what is in order after the plant's states and inputs. Raises `ValueError`: there are more, or less."""
+        """Name the entries after the plant's states or inputs. Raises `ValueError` if the numbers differ."""
         for name, names in self._vectors.items():
             if (vector := values.get(name)) is not None:
                 values[name] = named(names, vector)
@@ -224,10 +225,10 @@ class View:
             self.channel = self._channel()
 
     def _channel(self) -> Channel:
-        # What may be absent stands last in a schema.
+        # Optional fields are last in a schema.
         optional = [name for name, kind in self._kinds.items() if isinstance(kind, inspect.UnionType)]
         required = [name for name in self._kinds if name not in optional and name not in self._growing]
-        # An object is no part of the schema until one of its fields is known.
+        # An object is not in the schema until one of its fields is known.
         growing = [name for name, one in self._growing.items() if one]
         names = (*required, *growing, *optional)
         schemas = {name: self._schema(name, self._kinds[name]) for name in names}
@@ -277,12 +278,12 @@ def views(plant: Description) -> dict[str, View]:
 
 
 def entry(plant: Description, name: str, with_unit: bool = True) -> Json:
-    """The schema of a state's or an input's value."""
+    """Return the schema of the value of a state or an input."""
     return leaf("number", plant.names.get(name, ""), plant.units.get(name, "") if with_unit else "")
 
 
 def named(names: Sequence[str], values: Sequence[float]) -> dict[str, float]:
-    """Raises `ValueError`: they are not as many."""
+    """Raises `ValueError` if the numbers of entries and names differ."""
     if len(names) != len(values):
         raise ValueError(f"{len(values)} entries where the plant has {len(names)} ({', '.join(names)})")
     return dict(zip(names, values, strict=True))

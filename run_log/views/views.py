@@ -1,4 +1,4 @@
-"""The interface of this room: messages as they travel in, JSON for people and their tools out."""
+"""The interface of the views: encoded messages in, JSON for people and tools out."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A file that continues where it stopped when the disk was full.
 
-The MCAP library writes to this as to any file. What the disk refuses stays in memory, in order, and is tried
-again; so when there is room again the file goes on at the very byte where it stopped, and is never corrupt.
+The MCAP library writes to this as to any file. Data that the disk refuses stay in memory, in order, and are tried
+again. When there is room again, the file continues at the byte where it stopped, and is never corrupt.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ class Sink:
     """An append-only file, created exclusively, with bounded memory for data that cannot be written yet.
 
     Args:
-        path: a file that does not exist yet; missing folders above it are made.
-        patient: False raises `LogError` when the file cannot be created; True goes on trying.
+        path: a file that does not exist yet; missing folders above it are created.
+        patient: False raises `LogError` if the file cannot be created; True tries again.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: not patient, and the file cannot be created.
     """
 

@@ -1,8 +1,8 @@
 """The log of a long run, in parts: each is a complete log that can be plotted and replayed alone.
 
-The index of an MCAP file grows in memory until the file ends, and so does the file. Two parts overlap: the new one
-is written beside the old one until it holds a keyframe, which is where its replay begins, and `OVERLAP_S` more, so
-that nothing that the old one needs is still on its way. No tick is lost to replay at the seam.
+The index of an MCAP file grows in memory until the file ends. Two parts overlap: both are written until the new one
+contains a keyframe, where its replay begins, and `OVERLAP_S` longer, so that late messages of the old one arrive. Every
+tick can be replayed from one of the parts.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ OVERLAP_S = 1.0
 WITHOUT_KEYFRAME_S = 60.0
 """Seconds after which the old part no longer waits for a keyframe in the new one: there may be no controller."""
 REPEATED = frozenset({*(topic.name for topic in topics.RUN_INFO.values()), topics.SETS.name})
-"""Topics that are sent once, and that every part needs."""
+"""Topics whose messages are sent once, and that every part needs."""
 MOST_REPEATED = 8
-"""Senders of each of them that are remembered, the latest."""
+"""Number of latest senders that are remembered for each of them."""
 
 
 def part_path(first: Path, number: int) -> Path:
@@ -47,7 +47,7 @@ def existing_parts(first: Path) -> list[Path]:
 
 
 class PartedLog:
-    """One `LogWriter` after the other, as `config.log` says. What cannot be written yet waits for the disk.
+    """One `LogWriter` after the other, by the settings in `config.log`. Data that cannot be written yet stay in memory.
 
     Args:
         config: the resolved configuration; `log.path` is the first part's.
@@ -57,7 +57,7 @@ class PartedLog:
         start_ns: Unix time of the beginning.
 
     Raises:
-        LogExistsError: something is at `log.path` already.
+        LogExistsError: `log.path` exists already.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class PartedLog:
         self._numbers = count(2)
         self._writer = LogWriter(self._first, config, plant, files, start_ns=start_ns, patient=True)
         self._old: LogWriter | None = None
-        """Written beside `_writer` while both overlap."""
+        """The old part, which is also written while both overlap."""
         self._paths = [self._first]
         self._began = now
         self._keyframe_at: float | None = None
@@ -87,7 +87,7 @@ class PartedLog:
         """Counters of the earlier parts when this one began."""
         self._last_bad_before: str | None = None
         self._torn: str | None = None
-        """Why an earlier part does not hold everything."""
+        """Reason why an earlier part is incomplete."""
 
     @property
     def path(self) -> Path:
@@ -96,7 +96,7 @@ class PartedLog:
 
     @property
     def error(self) -> str | None:
-        """Why something cannot be written at the moment; None if all can."""
+        """Reason why data cannot be written at the moment; None if all can."""
         return self._writer.sink.error or (self._old.sink.error if self._old is not None else None)
 
     @property
@@ -108,12 +108,12 @@ class PartedLog:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Messages that never arrived here, by topic."""
+        """Number of lost messages, by topic."""
         return _sum(self._lost_before, self._writer.lost)
 
     @property
     def bad(self) -> dict[str, int]:
-        """Payloads that are in the log without a view, by topic and reason."""
+        """Number of payloads that are in the log without a view, by topic and reason."""
         return _sum(self._bad_before, self._writer.bad)
 
     @property
@@ -144,7 +144,7 @@ class PartedLog:
             self._begin_part(now, unix_ns)
 
     def close(self) -> None:
-        """End every open part. Raises `LogError`: a part does not hold everything."""
+        """End every open part. Raises `LogError` if a part is incomplete."""
         if self._old is not None:
             self._end_old()
         try:

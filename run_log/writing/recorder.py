@@ -24,10 +24,10 @@ log = logging.getLogger(__name__)
 
 EXIT_CANNOT = 2
 EXIT_NOTHING_WRITTEN = 4
-# After Ctrl-C the other processes still say their last words; listen for that long.
+# After Ctrl-C the other processes still send their last messages; receive for that long.
 QUIET_S = 0.25
 LAST_WORDS_S = 1.5
-# Messages are fetched together: to wake for each costs more than to log it.
+# Messages are fetched together, because waking for each one costs more than logging it.
 GATHER_S = 0.02
 
 

@@ -1,4 +1,4 @@
-"""Puts a run that only exists in memory (a simulation's) into a log like that of a live run."""
+"""Writes a run that is only in memory, such as a simulation, into a log like that of a live run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def save(run: Run, path: str | Path) -> None:
     """Write all messages of `run` to a new log, in the order of their times.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: the file cannot be written, or not to its end.
     """
     entries = [(entry, topic) for topic in topics.ALL for entry in run.entries(topic)]

@@ -1,4 +1,4 @@
-"""How much of users' own topics is logged: the recorder and its disk serve the plant first."""
+"""Limits on the logging of user topics, because the recorder and its disk serve the plant first."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from protocol import topics
 from run_log.views.views import MOST_USER_TOPICS
 
 BYTES_PER_S = 1024 * 1024
-"""Limit for all these topics together: about what Tandem's own messages take at 1 kHz."""
+"""Bytes per second for all these topics together: about the rate of Tandem's own messages at 1 kHz."""
 MESSAGES_PER_S = 1000.0
-"""Limit for all these topics together: as many as a 1 kHz loop has ticks."""
+"""Messages per second for all these topics together: the tick rate of a 1 kHz loop."""
 BURST_S = 4.0
-"""After a pause so many seconds' worth may come at once."""
+"""After a pause, messages of this many seconds may arrive at once."""
 
 
 class UserBudget:
-    """Decides, message by message."""
+    """Decides for each message whether it is logged."""
 
     def __init__(self) -> None:
         self._topics: set[str] = set()
@@ -23,7 +23,7 @@ class UserBudget:
         self._at: int | None = None
 
     def admit(self, name: str, size: int, time_ns: int) -> bool:
-        """Whether a message of so many bytes is logged; `time_ns` is its arrival."""
+        """Whether a message of this size in bytes is logged; `time_ns` is its arrival."""
         seconds = 0.0 if self._at is None else max(0.0, (time_ns - self._at) * 1e-9)
         self._at = time_ns
         self._bytes = min(BURST_S * BYTES_PER_S, self._bytes + seconds * BYTES_PER_S)

@@ -1,10 +1,10 @@
-"""Writes the log of a run: MCAP, readable up to the last flush whatever happens to the process.
+"""Writes the log of a run as MCAP. The file is readable up to the last flush if the process dies.
 
-- `raw/<topic>`: the exact bytes that travelled (msgpack), for replay, in a protobuf message of one field
-  (`run_log.raw_message`). The attachment schemas.json has the schemas of what is inside.
+- `raw/<topic>`: the exact bytes of the messages (msgpack), for replay, in a protobuf message of one field
+  (`run_log.raw_message`). The attachment schemas.json has the schemas of the bytes.
 - `view/<topic>`, `view/bounds`, `view/targets`, `view/events`: plottable JSON with JSON schemas (`run_log.views`).
-- metadata: what the log is of, its clock, units, versions, seeds and configuration.
-- attachments: config.json, config.toml, plant.json (what is known of the plant, as numbers), versions.json, seeds.json,
+- metadata: identity of the log, its clock, units, versions, seeds and configuration.
+- attachments: config.json, config.toml, plant.json (the known plant, as numbers), versions.json, seeds.json,
   units.json, schemas.json.
 """
 
@@ -49,7 +49,7 @@ from run_log.writing.user_budget import UserBudget
 
 MAX_MESSAGE = 4 * topics.WEIGHTS_LIMIT
 MAX_STRANGERS = 100
-"""Channels for keys that are in no topic table; whoever makes up more of them is not logged."""
+"""Largest number of channels for unknown keys; messages on further unknown keys are not logged."""
 
 
 class LogWriter:
@@ -59,15 +59,15 @@ class LogWriter:
         path: a file that does not exist yet.
         config: the resolved configuration.
         plant: the plant that `config` names; its names and units label the views.
-        files: the sha256 of the files that it comes from, by key of the configuration.
+        files: the sha256 of the plant's files, by key of the configuration.
         start_ns: time of the attachments, in the same clock as the messages.
-        versions: what ran; None: the packages installed here.
+        versions: the versions that ran; None: the packages installed here.
         patient: see `Sink`.
-        part: which one of its run's it is, from 1 (`run_log.writing.parts`).
-        clock: what the times of the messages are, for people.
+        part: number of this part of the run, from 1 (`run_log.writing.parts`).
+        clock: description of the clock of the message times.
 
     Raises:
-        LogExistsError: something is at `path` already.
+        LogExistsError: `path` exists already.
         LogError: not patient, and the file cannot be created.
     """
 
@@ -93,7 +93,7 @@ class LogWriter:
             "lost_ticks": 0,
         }
         self.bad: dict[str, int] = {}
-        """Known topics' payloads that are in the log as they came, but have no view: by reason."""
+        """Number of payloads of known topics that are logged without a view, by reason."""
         self.last_bad: str | None = None
         self.sink = Sink(path, patient=patient)
         self._views = Views(config, plant)
@@ -115,14 +115,14 @@ class LogWriter:
 
     @property
     def lost(self) -> dict[str, int]:
-        """By topic, messages that are missing between others: they never arrived here."""
+        """Number of lost messages, by topic: gaps between the numbers that arrived."""
         return self._views.lost
 
     def write(self, name: str, payload: bytes, log_time: int) -> None:
-        """Log what came on topic `name` (its key below `tandem/<plant>/`), whatever it is; `log_time` in ns.
+        """Log a message of topic `name` (its key below `tandem/<plant>/`), valid or not; `log_time` in ns.
 
-        A payload that is no valid message of its topic is logged as it came, and has no view. Nothing here
-        raises for bad input or a full disk: see `counters`, `bad` and `sink.error`.
+        An invalid payload is logged unchanged, without a view. Bad input and a full disk raise no exception: see
+        `counters`, `bad` and `sink.error`.
         """
         if len(payload) > MAX_MESSAGE or self.sink.pending > self.sink.limit:
             self.counters["dropped"] += 1
@@ -147,17 +147,17 @@ class LogWriter:
         self.counters["bytes"] += len(payload)
 
     def flush(self) -> bool:
-        """End the chunk and hand all to the operating system; False when it does not take all of it."""
+        """End the chunk and write all data; return False if the operating system does not accept all of it."""
         self._mcap.flush()
         return self.sink.error is None
 
     def close(self, continued: Path | None = None) -> None:
         """Write the index and close.
 
-        continued: the part in which the log goes on; None: it is the last.
+        continued: the part in which the log continues; None: it is the last.
 
         Raises:
-            LogError: the file does not hold everything; `tandem recover` saves what it holds.
+            LogError: the file is incomplete; `tandem recover` saves its messages.
         """
         if continued is not None:
             self._mcap.add_metadata(CONTINUED, {"in": readable(continued.name)})
@@ -211,7 +211,7 @@ def _metadata(config: Config, plant: Known | Plant, versions: Mapping[str, str])
 
 
 def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Every key of a configuration with its sections before it, and its value as JSON; a text as it is."""
+    """Yield every key of a configuration, with its sections, and its value as JSON; texts stay unquoted."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{before}{key}.")

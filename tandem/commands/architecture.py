@@ -20,7 +20,7 @@ class ArchitectureCheck(Command):
     EXTRAS = "trainer"
 
     name: Annotated[Positional[str], arg(metavar="FILE:NAME")]
-    """As for network.architecture: gru.py:GRU, or a shipped one."""
+    """The architecture, as in network.architecture: gru.py:GRU, or a shipped one."""
 
     def run(self) -> int:
         """Return 0 if they agree on networks of random sizes, as far as the architecture accepts them, else 1."""
@@ -52,7 +52,7 @@ class ArchitectureCheck(Command):
             )
         self.say(
             f"{name}: {accepted} networks of random sizes",
-            *(f"  refused {count}: {text}" for text, count in refused.items()),
+            *(f"  {count} refused: {text}" for text, count in refused.items()),
             f"  largest difference of h_hat between numpy, CasADi and torch: {found.value:.1e} of the output scale",
             f"  largest difference of the slopes between CasADi and torch: {found.slope:.1e}",
             f"  largest entry of phi: {found.phi:.6g}"

@@ -57,7 +57,7 @@ class Command:
 
     @cached_property
     def console(self) -> Console:
-        """Where a person reads."""
+        """Output for a person."""
         return terminal.console(self.json)
 
     def say(self, *lines: str, style: str | None = None) -> None:

@@ -129,7 +129,7 @@ class Experiment(Command):
         return 1 if made.failed else 0
 
     def _workplace(self) -> Callable[[Iterable[Config]], Workplace]:
-        """What makes the place where the runs are made."""
+        """Return the function that opens the workplace of the runs."""
         from tandem.experiments.study.runner import Processes
 
         if self.cluster is None:
@@ -153,7 +153,7 @@ class Experiment(Command):
         return lambda configs: Cluster(address, gather(configs), lambda text: self.say(text, style="dim"))
 
     def _tell(self, failed: list[FailedRun]) -> None:
-        """What went wrong, a line for each of the first runs."""
+        """Print the error of each of the first failed runs."""
         for run in failed[:MOST_TOLD]:
             what = f"case {run.case!r}{' (with the true h)' if run.floor else ''}, seed {run.seed}"
             where = f" on worker {run.failure.where}" if run.failure.where else ""

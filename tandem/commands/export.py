@@ -21,16 +21,16 @@ class Export(Command):
     EXTRAS = "export"
 
     file: Annotated[Positional[Path], arg(metavar="LOG")]
-    """The log; of a log in parts the first one, and the others follow by themselves."""
+    """The log; for a log in parts the first one, from which the others are found."""
     csv: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint=NONE)] = None
-    """A new or empty folder for CSV files, one a table."""
+    """A new or empty folder for CSV files, one per table."""
     parquet: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint=NONE)] = None
-    """A new or empty folder for Parquet files, one a table."""
+    """A new or empty folder for Parquet files, one per table."""
     rrd: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NONE)] = None
     """A new file for Rerun: series, events and a layout."""
 
     def run(self) -> int:
-        """0, or 1 when a part of the log is damaged and missing in the export."""
+        """Return 0, or 1 if a part of the log is damaged and missing in the export."""
         import msgspec
 
         if self.csv is None and self.parquet is None and self.rrd is None:

@@ -152,7 +152,7 @@ class Identify(Command):
 
 
 def _model_of(ran: Any) -> Model:
-    """Oracles of the log's controllers. Raises `LogError`."""
+    """Return the model of the log's plant. Raises `LogError`."""
     from lbmpc.model import ModelError, build_model
     from run_log.errors import LogError
     from run_log.run import plant_of

@@ -100,7 +100,7 @@ class KeysRenew(Command):
     ] = None
     """Folder of the authority's certificate and key, if they are elsewhere."""
     days: Annotated[int, arg(metavar="N")] = 365
-    """How long it is valid."""
+    """Validity of the certificate in days."""
 
     def run(self) -> int:
         from protocol.rights import ROLES

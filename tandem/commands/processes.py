@@ -117,7 +117,7 @@ class Live(Process):
     KEYS = (("port", "live.port"),)
 
     port: Annotated[int | None, arg(metavar="PORT", help_behavior_hint=FROM_CONFIG)] = None
-    """Where the page is served, on this machine alone."""
+    """Port of the page, on this machine only."""
     layout: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Write the layout for Foxglove and Lichtblick to this file, and end."""
 

@@ -21,7 +21,7 @@ class Report(Command):
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """The log."""
     output: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the log's)")] = None
-    """Where the pictures go."""
+    """Folder for the pictures."""
 
     plant: Annotated[
         str | None, arg(metavar="FILE:NAME", help_behavior_hint="(default: the log's numbers)")

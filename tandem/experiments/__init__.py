@@ -1,1 +1,1 @@
-"""The paper's experiment and your own: declared in one file, run on all cores, reported on one page."""
+"""Experiments: declared in one file, run on all cores, reported on one page."""

@@ -24,10 +24,10 @@ DETAILED = ("trajectories", "recovery", "lemma")
 """Pictures that need every sample."""
 REPEATS = 3
 SHORT = 0.2
-"""Share of a timed run that --quick makes."""
+"""Share of a timed run that is made with --quick."""
 
 Progress = Callable[[str, int, int], None]
-"""Told the stage, what is done and of how many."""
+"""Called with the stage, the number of finished items and the total."""
 
 
 class Finished(NamedTuple):
@@ -50,25 +50,25 @@ def run(
     repeats: int = REPEATS,
     progress: Progress = lambda stage, done, total: None,
 ) -> Finished:
-    """Run what is missing under `out`, time the solver, write the report and the summary.
+    """Make the runs that are missing in `out`, time the solver, and write the report and the summary.
 
     Args:
         declared: the experiment.
         where: its file, for messages.
-        plant: what is controlled.
-        out: a folder; the runs it holds already are taken over where settings and code are the same.
-        open_workplace: where the runs are made, from their configurations.
-        command: what the report says it was made with.
+        plant: the controlled plant.
+        out: a folder; its existing runs are used if settings and code are the same.
+        open_workplace: opens the workplace for the runs' configurations.
+        command: the command line, for the report.
         quick: fewer seeds, states and values.
         only: one group instead of all.
-        repeats: timed runs of what the picture of the solver's time shows; one of everything else.
-        progress: told how far it is.
+        repeats: number of timed runs of cases in the picture of solve times; other cases have one.
+        progress: called with the progress.
 
     Raises:
         ConfigError: the experiment or a configuration in it cannot be used.
-        RunnerError: there is no place left to make runs, or every run failed.
+        RunnerError: no workplace is left, or every run failed.
         OSError: `out` cannot be written to.
-        KeyboardInterrupt: what was finished is kept.
+        KeyboardInterrupt: finished runs are kept.
     """
     cases = resolve(declared, plant, where, quick)
     if only is not None:
@@ -117,12 +117,12 @@ def run(
 
 
 def settings(declared: Declaration, where: str) -> Config:
-    """The configuration that no case has changed. Raises `ConfigError`."""
+    """Return the configuration before the changes of the cases. Raises `ConfigError`."""
     return config_of([declared], {}, where, Path(where).parent)
 
 
 def overview(declared: Declaration) -> dict[str, Any]:
-    """What `tandem experiment list` says of one."""
+    """Return the entry of an experiment in `tandem experiment list`."""
     return {
         "name": declared.name,
         "title": declared.title,

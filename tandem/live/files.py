@@ -20,7 +20,7 @@ from tandem.terminal import Refused
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Where one run writes."""
+    """The files of one run."""
 
     log: Path
     picture: Path
@@ -36,19 +36,19 @@ class RunFiles:
         return self.folder / "config.toml"
 
     def there(self) -> list[Path]:
-        """The files that exist, all parts of the log among them."""
+        """Return the existing files, including all parts of the log."""
         paths = dict.fromkeys([self.log, self.picture, self.folder, *existing_parts(self.log)])
         return [path for path in paths if os.path.lexists(path)]
 
 
 @contextmanager
 def claimed(log: Path) -> Iterator[tuple[RunFiles, list[str]]]:
-    """Room for a run's files; yields them, and what a person should know about what lay there before.
+    """Reserve the files of a run; yield them, and notes for a person on existing files.
 
-    What has these names already is moved aside to NAME.1.mcap, NAME.1.png and so on.
+    Existing files with these names are renamed to NAME.1.mcap, NAME.1.png and so on.
 
     Raises:
-        Refused: another run is writing there, the place cannot be written to, or one of the names is not of a file.
+        Refused: another run is writing there, the folder is not writable, or one of the names is not that of a file.
     """
     files = RunFiles.of(log)
     if log.suffix in (".png", ".processes"):

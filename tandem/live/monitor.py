@@ -51,7 +51,7 @@ class Monitor:
         self._x: list[float] | None = None
         self._u: list[float] | None = None
         self._health: dict[str, tuple[m.Health, float]] = {}
-        """The newest health by process, and when it came."""
+        """The newest health by process, and the time of its arrival."""
         self._ended: set[str] = set()
         self._asked_by = ""
         """Sender of the last reference: a repetition renews its lease."""
@@ -62,14 +62,14 @@ class Monitor:
         self._trend: deque[float] = deque(maxlen=TREND_SECONDS)
         self._trend_second = self._first_slot = self._outside_now = 0
         self._counted: float | None = None
-        """When h_hat last counted, or was first weighed."""
+        """Last time at which h_hat had an effect, or the first with a weight."""
         self._patience = max(PATIENCE_S, PATIENCE_TICKS * config.period)
         self._events: deque[Event] = deque(maxlen=EVENTS)
         self._new_events: deque[Event] = deque(maxlen=200)
         self._bad_elsewhere: dict[tuple[str, str], int] = {}
 
     def feed_all(self, deliveries: Sequence[Delivery]) -> None:
-        """Process messages that arrived together, in order; of those that are only shown, the newest is enough."""
+        """Process messages that arrived together, in order; of messages that are only shown, only the newest."""
         newest = {delivery.key: i for i, delivery in enumerate(deliveries)}
         shown = (
             {topic.key(self.config.name) for topic in ONLY_SHOWN} if self.first_command is not None else ()

@@ -21,11 +21,11 @@ class Presence:
         return self._at is not None
 
     def silent(self, now: float) -> bool:
-        """Whether none of its states came for a while, or ever."""
+        """Whether no state arrived for a while, or ever."""
         return self._at is None or now - self._at > self._limit
 
     def came(self, run_id: str, now: float) -> str:
-        """A state came; return the event, if any."""
+        """Take a state that arrived; return the event, if any."""
         missed, away = self._missed, "" if self._at is None else f" after {now - self._at:.1f} s"
         again = self.known and run_id != self._run_id
         self._run_id, self._at, self._missed = run_id, now, False

@@ -25,9 +25,9 @@ class Process:
     """The tandem command that it runs."""
     when_it_dies: Literal["end the run", "go on", "restart"]
     ready_s: float
-    """How long it may take until it says that it is ready."""
+    """Longest time until it reports that it is ready."""
     slow_because: str = ""
-    """What a person who waits should know."""
+    """Reason for a slow start, which a waiting person sees."""
     optional: bool = False
     """Nothing waits for it, and the run continues without it."""
 
@@ -41,10 +41,10 @@ TABLE = (
     Process("controller", "controller", "end the run", 300.0, "its first start compiles the solver"),
 )
 LIVE = Process("live-view", "live", "go on", 0.0, optional=True)
-"""Started beside the table by `tandem run --live`. It publishes nothing, so it cannot say that it is ready."""
-# In the order of stopping, with the seconds that each may take. Controller and plant are told together: a plant that is
-# unstable must not be followed after its last command. The recorder hears the others' last words; the router carries
-# them.
+"""Started beside the table by `tandem run --live`. It publishes nothing, so it cannot report that it is ready."""
+# In the order of stopping, with the seconds that each may take. Controller and plant stop together, because an unstable
+# plant must not run on after its last command. Recorder and router stop last, so that the others' last messages are
+# logged.
 STOP_S = (
     {"controller": 4.0, "plant": 4.0},
     {"trainer": 6.0},
@@ -54,7 +54,8 @@ STOP_S = (
 
 
 def command_line(command: str, config: Path) -> list[str]:
-    """Starts a tandem command that ends when this process does, and imports nothing from the current folder."""
+    """Return the start of a command line for a tandem command that ends with this process and imports nothing from the
+    current folder."""
     child = (sys.executable, "-P", "-m", "tandem.child", str(os.getpid()))
     return [*child, command, "--config", str(config)]
 
@@ -63,10 +64,10 @@ class Child:
     """A process of the table, running in a process group of its own, its output in a file."""
 
     def __init__(self, process: Process, config: Path, folder: Path, *options: str):
-        """config: the TOML file it reads; folder: where its output goes; options: more of its command line."""
+        """config: the TOML file that it reads; folder: for its output; options: further arguments."""
         self.process, self.name = process, process.name
         self.started_at = 0.0
-        """Of the newest start, seconds on the monotonic clock."""
+        """Time of the newest start, seconds on the monotonic clock."""
         self._output = folder / f"{process.name}.txt"
         self._command = [*command_line(process.command, config), *options]
         self._running: subprocess.Popen[bytes] | None = None
@@ -97,7 +98,7 @@ class Child:
             os.killpg(self._running.pid, number)
 
     def wait(self, timeout_s: float) -> None:
-        """Until it has ended, but at most `timeout_s`."""
+        """Wait until it has ended, but at most `timeout_s` seconds."""
         if self._running is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._running.wait(timeout_s)

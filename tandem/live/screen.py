@@ -39,7 +39,7 @@ class Screen:
             self._plain(view.line(now))
 
     def _plain(self, text: str) -> None:
-        # A text of another process with several lines must not imitate a line of ours.
+        # A text of another process with several lines must not imitate a line of this program.
         say(self._console, text.replace("\n", "\n" + 10 * " "))
 
     def __enter__(self) -> Screen:

@@ -86,13 +86,11 @@ class Snapshot:
     prediction_error: float | None = None
     """Mean of the last second."""
     counts: float | None = None
-    """What of the network, or of the constant beside it, counts in the prediction of some state: the most; None where
-    nothing weighs it."""
+    """Largest weight of the network, or of the constant beside it, in the prediction of a state; None without them."""
     adds_nothing: bool = False
     """Whether it has been nearly zero for seconds."""
     noise: dict[str, float] | None = None
-    """Standard deviation of what is measured as the estimator found it, by the names of states; None where it was
-    told."""
+    """Estimated standard deviation of the measurements, by the names of states; None if it is configured."""
     trend: tuple[float, ...] = ()
     """Mean prediction error of each second so far, the newest last."""
     weights_version: int = -1

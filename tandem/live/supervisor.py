@@ -1,4 +1,4 @@
-"""`tandem run`: start every process of the table, watch them, stop them in order, whatever happens."""
+"""`tandem run`: starts every process of the table, watches them, and stops them in order in every case."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tandem.live.processes import LIVE, STOP_S, TABLE, Child
 from tandem.live.snapshot import Snapshot
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# One Ctrl-C may arrive twice (`timeout`, a shell's process group): still one wish.
+# One Ctrl-C may arrive twice (`timeout`, a shell's process group) and counts once.
 SAME_WISH_S = 0.3
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 LONG_LIFE_S = 20.0
@@ -33,11 +33,11 @@ Show = Callable[[Snapshot], None]
 
 
 class Impatient(BaseException):
-    """The person asked a second time: end everything now."""
+    """A second stop signal: end everything now."""
 
 
 class StartError(RuntimeError):
-    """A process did not get ready. `exit_code` is its own, None when it still ran or was killed."""
+    """A process was not ready in time. `exit_code` is that of the process, None if it still ran or was killed."""
 
     def __init__(self, text: str, exit_code: int | None = None):
         super().__init__(text)
@@ -46,14 +46,14 @@ class StartError(RuntimeError):
 
 @dataclass
 class Wish:
-    """What the person's signals ask for."""
+    """The stop requests of the person, from signals."""
 
     stop: bool = False
 
 
 @contextmanager
 def wishes() -> Iterator[Wish]:
-    """SIGINT, SIGTERM and SIGHUP set `stop`; a second one raises `Impatient` wherever the program is."""
+    """SIGINT, SIGTERM and SIGHUP set `stop`; a second signal raises `Impatient` at any point of the program."""
     wish, since = Wish(), 0.0
 
     def handle(_number: int, _frame: FrameType | None) -> None:
@@ -81,13 +81,13 @@ class Supervisor:
     """Runs the table once. `run` returns why the run ended badly, or None; nothing is left running after it.
 
     Args:
-        config: what every process gets; its endpoint must be free to listen on.
+        config: the configuration of every process; its endpoint must be free.
         config_file: the same as TOML, for the processes.
-        folder: where the processes' output goes.
-        monitor: is fed with everything on the bus.
+        folder: for the output of the processes.
+        monitor: gets every message on the bus.
         wish: when to stop.
-        show: is called about five times a second with what there is to see.
-        elsewhere: those of the table that are not started here.
+        show: is called about five times a second with a snapshot.
+        elsewhere: processes of the table that are not started here.
         live: also serve the run to browsers.
     """
 
@@ -105,7 +105,7 @@ class Supervisor:
         self.config, self.monitor, self.wish, self._show = config, monitor, wish, show
         absent = {*elsewhere, *(() if trains(config) else ("trainer",))}
         table = [process for process in (*TABLE, *([LIVE] if live else [])) if process.name not in absent]
-        # The log's name may be any bytes, which a TOML file cannot say.
+        # The log's name may be any bytes, which a TOML file cannot contain.
         options = {"recorder": ("--log", config.log.path)}
         self.children = {
             process.name: Child(process, config_file, folder, *options.get(process.name, ()))
@@ -118,15 +118,15 @@ class Supervisor:
         self._restart_at: dict[str, float] = {}
         self._deaths: dict[str, int] = {}
         self._gone: set[str] = set()
-        """Those that have died and are not missed."""
+        """Names of dead processes without which the run continues."""
 
     @property
     def recorder_died(self) -> bool:
-        """Whether the log is not whole."""
+        """Whether the log is incomplete."""
         return "recorder" in self._gone
 
     def run(self) -> str | None:
-        """Start, watch, stop. Raises `StartError`, and `Impatient` after everything was killed."""
+        """Start, watch and stop all processes. Raises `StartError`, and `Impatient` after all were killed."""
         try:
             try:
                 self._start_all()
@@ -161,7 +161,7 @@ class Supervisor:
             self.children[name].start()
 
     def _connect(self) -> None:
-        """Become a client of the router; whether it listens is seen by that."""
+        """Connect to the router, which also shows that it listens."""
         stop = threading.Event()
         bus = Bus(self.config, "monitor", new_run_id("monitor"), stop)
         opened = threading.Event()
@@ -221,7 +221,7 @@ class Supervisor:
     # -- watching ----------------------------------------------------
 
     def _watch(self) -> str | None:
-        """Until the time is over, or the person asks, or a process without which nothing goes on has died."""
+        """Wait for the end of the run: the time is over, the person stops it, or a process that it needs has died."""
         self.monitor.phase = ""
         slots = max(1.0, self.monitor.seconds * self.config.rate)
         waiting_since = time.monotonic()
@@ -230,7 +230,7 @@ class Supervisor:
                 self.monitor.say(text, waiting_since)
         while not self.wish.stop:
             first = self.monitor.first_command
-            # The last slot says it exactly, the clock in any case.
+            # The last slot is the exact end; the clock ends the run in any case.
             if self.monitor.slots > slots - 0.5:
                 return None
             if first is not None and time.monotonic() >= first + self.monitor.seconds + GRACE_S:
@@ -247,7 +247,7 @@ class Supervisor:
         return None
 
     def _what_a_plant_needs(self) -> tuple[str, str]:
-        """For whoever starts it elsewhere, or looks why nothing comes."""
+        """Return texts for the person who starts the plant elsewhere: the router's address and the topic."""
         plant, bus = self.monitor.plant, self.config.bus
         places = " or ".join(filter(None, (bus.endpoint, bus.remote)))
         states = f"{plant.d} states ({', '.join(plant.states)}) at {self.config.rate:g} Hz"
@@ -258,7 +258,7 @@ class Supervisor:
         )
 
     def _died(self, child: Child) -> str | None:
-        """What to do about a process that has ended: text that ends the run, or None to go on."""
+        """Handle a dead process; return the text that ends the run, or None if the run continues."""
         now, died = time.monotonic(), f"the {child.name} died ({child.how_it_ended()})"
         if child.process.when_it_dies == "end the run":
             return f"{died}\n{child.last_words()}"
@@ -283,13 +283,13 @@ class Supervisor:
         return None
 
     def _without(self, child: Child, died: str) -> str:
-        """What a person should know about a process that the run goes on without."""
+        """Return the report of a dead process without which the run continues."""
         if child.name == "recorder":
             return f"NOT LOGGED from here on: {died}; the loop continues"
         return f"{died}; the run continues without it\n{child.last_words()}"
 
     def _listen(self, wait_s: float = 0.02) -> None:
-        """Take what arrives within a little time, together, and show it now and then."""
+        """Process the messages of a short interval together, and update the display from time to time."""
         time.sleep(wait_s)
         if self._mailbox is not None:
             self.monitor.feed_all(self._mailbox.drain())
@@ -301,7 +301,7 @@ class Supervisor:
     # -- stopping ----------------------------------------------------
 
     def _stop_all(self) -> None:
-        """In order, politely, then not. The screen keeps the last moment of the run."""
+        """Stop all processes in order with SIGTERM, then SIGKILL. The display keeps the last state of the run."""
         ended = time.monotonic()
         last = self._end = self.monitor.snapshot(ended)
         for together in STOP_S:
@@ -322,13 +322,13 @@ class Supervisor:
                     continue
                 self.monitor.say(f"the {name} {how}", time.monotonic(), "bad")
                 self._gone.add(name)
-        # With what was still on its way: the last tick, and anything that went wrong in stopping.
+        # This includes late messages: the last tick, and errors while stopping.
         frozen = ("states", "inputs", "source", "processes", "phase")
         whole = self.monitor.snapshot(ended)
         self._show(replace(whole, **{name: getattr(last, name) for name in frozen}))
 
     def _kill_all(self) -> None:
-        """Whatever still runs. Signals are ignored meanwhile, so that nothing interrupts this."""
+        """Kill all processes that still run. Signals are ignored meanwhile, so that nothing interrupts this."""
         with _signals_go_to(signal.SIG_IGN):
             for child in self.children.values():
                 child.signal(signal.SIGKILL)
@@ -337,5 +337,5 @@ class Supervisor:
 
 
 def trains(config: Config) -> bool:
-    """Whether there is anything for a trainer to do."""
+    """Whether the configuration needs a trainer."""
     return config.controller.oracle == "dnn" and config.trainer.enabled

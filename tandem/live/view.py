@@ -261,7 +261,7 @@ def _learning(now: Snapshot, width: int) -> Table:
             ("rolled back", _counted(now.rolled_back, "sets")),
             ("loss", Text(loss)),
             ("buffer", Text(f"{now.samples} samples")),
-            ("bad messages", _counted(now.bad_messages, "not obeyed")),
+            ("bad messages", _counted(now.bad_messages, "ignored")),
             *([] if now.noise is None else [("noise found", Text(_noise(now.noise)))]),
         ]
     )

@@ -1,7 +1,7 @@
 """A client on the bus in the role `commander`: it gives set-points or drives the plant manually.
 
 With certificates it needs the commander's own. Its messages travel on the control lane, where a message may be lost.
-It therefore repeats a message until an answer shows that it counts, and for as long as it shall hold.
+It therefore repeats a message until an answer shows that it was accepted, and while it must hold.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Commander:
 
     Args:
         bus: open.
-        heard: the topics that it listens to.
+        heard: the topics that it receives.
     """
 
     def __init__(self, bus: Bus, heard: tuple[Topic, ...]):

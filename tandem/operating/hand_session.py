@@ -32,7 +32,7 @@ class Follower:
         self._run_id, self._of = run_id, of
         self._said_at: int | None = None
         self.state: m.PlantState | None = None
-        """The newest."""
+        """The newest state of the plant."""
         self.begun = False
         """Whether the plant or its controller accepted the message."""
         self.mine = True
@@ -43,12 +43,12 @@ class Follower:
         """Why the plant is no longer driven manually, as it reports."""
 
     def said(self) -> None:
-        """A word was sent."""
+        """Note that the message was sent."""
         if self._said_at is None:
             self._said_at = -1 if self.state is None else self.state.seq
 
     def take(self, message: m.Message) -> str:
-        """Process a message; return why the person's message counts no longer, or ""."""
+        """Process a message; return why the person's message no longer holds, or ""."""
         if message.run_id == self._run_id:
             return ""
         match message:

@@ -3,7 +3,7 @@
     tandem model check THIS_FILE:PLANT
     tandem run --set plant.model=THIS_FILE:PLANT
 
-Below is the same cart twice: as PLANT by its equations, and as MATRICES by numbers alone. Keep the one that you need.
+Below is the same cart twice: PLANT has its equations, and MATRICES has matrices only. Keep the one that you need.
 """
 
 import casadi as ca
@@ -34,7 +34,7 @@ PLANT = Plant(
     rhs=equations(**PARAMETERS),
     equations=equations,
     parameters=PARAMETERS,
-    # The equilibrium, where the plant is wanted: dx/dt = 0 there.
+    # The desired equilibrium: dx/dt = 0 there.
     x_e=[0.0, 0.0],
     u_e=[0.0],
     # Bounds that the controller keeps; infinite without a bound. Then scale={"speed": 1.0} says what counts as 1.
@@ -42,7 +42,7 @@ PLANT = Plant(
     x_max=[1.0, 1.0],
     u_min=[-3.0],
     u_max=[3.0],
-    # What the linear model misses, per second, as half-widths of a box: `tandem model check` shows its size.
+    # Error of the linear model, per second, as half-widths of a box: `tandem model check` shows its size.
     W=[0.01, 0.1],
     # Initial state of a simulation.
     x0=[-0.8, 0.0],

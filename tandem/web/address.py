@@ -16,10 +16,10 @@ def address(config: Config) -> str:
 
 
 def taken(config: Config) -> str:
-    """What to tell a person when the port is taken."""
+    """Return the message for a port that is in use."""
     port = config.live.port
     return (
-        f"live.port {port} is taken, perhaps by the live view of another system; choose another: "
+        f"live.port {port} is in use, perhaps by the live view of another system; choose another port: "
         f"--set live.port={port + 1}"
     )
 
@@ -27,7 +27,7 @@ def taken(config: Config) -> str:
 def is_free(config: Config) -> bool:
     """Return whether the port can be listened on at this moment."""
     with socket.socket() as probe:
-        # As servers do: what a closed link left behind is no listener.
+        # As servers do: a closed link that still holds the port is not a listener.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, config.live.port))

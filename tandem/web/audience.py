@@ -130,7 +130,7 @@ class Audience:
         try:
             request = protocol.request_of(text)
         except ValueError as error:
-            viewer.say(protocol.refusal(f"not understood: {error}"))
+            viewer.say(protocol.refusal(f"invalid request: {error}"))
             return
         match request:
             case protocol.Subscribe(subscriptions=wanted):

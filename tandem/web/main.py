@@ -1,4 +1,4 @@
-"""`tandem live`: serves the bus of one plant to browsers, in a process of its own."""
+"""`tandem live`: serves the bus of one plant to browsers, in a separate process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ EVENTS, BOUNDS = f"{VIEW}events", f"{VIEW}bounds"
 def main(config: Config, stop: threading.Event | None = None) -> int:
     """Serve until told to stop.
 
-    The page is served at once, and goes on being served while there is no router or no plant.
+    The page is served at once, and also while there is no router or no plant.
 
     Returns:
         0; 2 when the port is taken, the plant is unknown, or the router refuses the certificate.

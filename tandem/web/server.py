@@ -102,16 +102,20 @@ def respond(request: Request, documents: Mapping[str, Document], viewers: int) -
     """Return the answer to a request over HTTP; None: the request may become a socket."""
     headers = request.headers
     if not is_own_name(_only(headers, "Host")):
-        return _said(HTTPStatus.FORBIDDEN, "this server answers to localhost only; from elsewhere use ssh -L")
+        return _said(
+            HTTPStatus.FORBIDDEN, "this server accepts only localhost; from another machine use ssh -L"
+        )
     if "websocket" in headers.get("Upgrade", "").lower():
         if not all(may_connect(origin) for origin in headers.get_all("Origin")):
             return _said(HTTPStatus.FORBIDDEN, "pages of this origin may not connect")
         if viewers >= MOST_VIEWERS:
-            return _said(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {viewers} viewers already")
+            return _said(
+                HTTPStatus.SERVICE_UNAVAILABLE, f"{viewers} viewers are connected already, which is the limit"
+            )
         return None
     document = documents.get(request.path.partition("?")[0])
     if document is None:
-        return _said(HTTPStatus.NOT_FOUND, "there is nothing at this path; the page is at /")
+        return _said(HTTPStatus.NOT_FOUND, "no document at this path; the page is at /")
     return _response(HTTPStatus.OK, document)
 
 

@@ -256,7 +256,7 @@ def test_a_run_that_never_ends_is_stopped_and_the_others_are_made(
     say(said)
     assert code == 1
     assert "case 'never ends'" in said
-    assert "it had not ended after 30 s" in said
+    assert "it did not end within 30 s" in said
     told = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert len(told["rows"]) == 8
     assert told["failed"][0]["failure"]["kind"] == "time"

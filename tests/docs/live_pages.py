@@ -1,7 +1,7 @@
-"""Every command of every page, run as a reader runs it. `make docs-test`; for one page, -k NAME.
+"""Runs every command of every page as a reader does. `make docs-test`; for one page, -k NAME.
 
-Not collected by `make test`, which parses all of them and runs the quick ones. `tests.docs.pages` says how a page marks
-what cannot be run here.
+`make test` does not collect this file. It parses all commands and runs the quick ones. `tests.docs.pages` describes how
+a page marks commands that cannot be run here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 @contextmanager
 def ended_with_the_page() -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes of a page's background commands, interrupted at its end as a person does."""
+    """Processes of a page's background commands. They are interrupted at the end of the page."""
     running: list[subprocess.Popen[bytes]] = []
     try:
         yield running

@@ -1,15 +1,15 @@
 """The code blocks of the documents, and the commands in them.
 
-A block is one of commands where it is marked `sh`, or where it is marked with nothing and its first command is one of
-`COMMANDS`. A comment in the line above a block says what is special about it:
+A block contains commands if its language is `sh`, or if it has no language and its first command is in `COMMANDS`. A
+comment in the line above a block gives it options:
 
-    <!-- docs-test: skip REASON -->      is not run here: another machine, Docker, many minutes
-    <!-- docs-test: background 8 -->     goes on in the background, with 8 s until the next command; ended with the page
-    <!-- docs-test: exit 1 -->           is expected to end with this code
-    <!-- docs-test: ci -->               is run by `make test` too; each of its commands takes a second or two
-    <!-- docs-test: file gru.py -->      is a file; a block whose first line is `# gru.py` is one without this
-    <!-- docs-test: run -->              Python that is run, in one namespace with the others of its page
-    <!-- docs-test: with ORACLE=dnn -->  what stands for a placeholder; may be added to any of the others
+    <!-- docs-test: skip REASON -->      not run here: another machine, Docker, many minutes
+    <!-- docs-test: background 8 -->     runs in the background, with 8 s until the next command; ends with the page
+    <!-- docs-test: exit 1 -->           expected exit code
+    <!-- docs-test: ci -->               `make test` runs it too; each command takes a second or two
+    <!-- docs-test: file gru.py -->      a file; a first line `# gru.py` has the same effect
+    <!-- docs-test: run -->              Python that is run, in the namespace of its page
+    <!-- docs-test: with ORACLE=dnn -->  replaces a placeholder; may be added to the other options
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Block:
 
     @property
     def file(self) -> str | None:
-        """The name of the file that the block is; None: it is none."""
+        """Name of the file that the block contains; None if it is not a file."""
         if self.marks[:1] == ("file",):
             return self.marks[1]
         named = re.match(r"# ([\w-]+\.(?:py|toml|csv))\n", self.text)
@@ -72,11 +72,11 @@ class Block:
 
     @property
     def seconds_in_background(self) -> float | None:
-        """None: it does not go on in the background."""
+        """Seconds until the next command of a background command; None for one in the foreground."""
         return float(self.marks[1]) if self.marks[:1] == ("background",) else None
 
     def commands(self) -> list[list[str]]:
-        """The words of every command; without comments, prompts and environment variables before it."""
+        """Return the words of every command, without comments, prompts and leading environment variables."""
         if self.language not in ("", "sh", "bash", "console") or self.file:
             return []
         joined = re.sub(r"\\\n\s*", " ", self.text)
@@ -99,7 +99,7 @@ class Block:
 
 
 def blocks(page: Path) -> Iterator[Block]:
-    """Every code block of a page, from top to bottom."""
+    """Return all code blocks of a page, from top to bottom."""
     text = page.read_text(encoding="utf-8")
     for match in _BLOCK.finditer(text):
         marks, _, given = (match["marks"] or "").partition("with ")
@@ -115,14 +115,14 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def lay_out(page: Path, folder: Path) -> None:
-    """Make a folder as a reader of this page has it: the repository's examples, and the files that pages define."""
+    """Fill a folder as a reader of this page has it: the repository's examples and the files that pages define."""
     for name in ("examples", "configs", "benchmarks", "verification"):
         (folder / name).symlink_to(ROOT / name)
     if page.is_relative_to(ROOT / "examples"):
         for neighbour in page.parent.iterdir():
             if neighbour.suffix != ".md" and not (folder / neighbour.name).exists():
                 (folder / neighbour.name).symlink_to(neighbour)
-    # A page may go on with the file of another one; its own comes last.
+    # A page may use the file of another page; its own files are written last.
     for other in [*(one for one in PAGES if one != page), page]:
         for block in blocks(other) if other.exists() else ():
             if block.file and (other == page or block.text.startswith(f"# {block.file}")):
@@ -131,7 +131,7 @@ def lay_out(page: Path, folder: Path) -> None:
 
 
 def with_interpreter(words: list[str], python: str) -> list[str]:
-    """The command with this Python, and the `tandem` of this Python."""
+    """Return the command with this Python and its `tandem`."""
     first = words[0].removeprefix(".venv/bin/")
     if first == "tandem":
         return [python, "-m", "tandem", *words[1:]]
@@ -139,7 +139,7 @@ def with_interpreter(words: list[str], python: str) -> list[str]:
 
 
 def is_run_here(words: list[str]) -> bool:
-    """Whether a command can be run in a folder of its own, without installing anything and within minutes."""
+    """Whether a command can run in a separate folder, within minutes and without an installation."""
     first = words[0].removeprefix(".venv/bin/")
     measured = words[1:2] == ["-m"] and words[2].split(".")[0] in ("benchmarks", "verification", "mkdocs")
     return (

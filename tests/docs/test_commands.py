@@ -1,4 +1,4 @@
-"""Every command of every page is one that Tandem has: parsed by the real parser, with the keys and files it names."""
+"""Every command of every page is valid: the real parser accepts it, with its keys and files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.helpers.paths import ROOT
 EXISTING = [page for page in PAGES if page.exists()]
 NAMED_FILE = re.compile(r"[\w./-]+\.(?:py|toml|mcap|csv|json)(?=$|:)")
 WRITTEN = ("--log", "--out", "--output", "--layout")
-# What a command leaves behind without being told the name.
+# Files that a command writes under a default name.
 LEFT = {"run": ["run.mcap", "run.png"], "keys": ["keys"], "record": ["run.mcap"]}
 
 
@@ -34,7 +34,7 @@ def relative(page: Path) -> str:
 
 
 def parsed(block: Block, words: list[str]) -> Configured | None:
-    """The command, where it is one with a configuration, its configuration resolved."""
+    """Parse a command; resolve its configuration if it has one."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
@@ -76,7 +76,7 @@ def test_commands_parse_and_what_they_name_exists(
 
 
 def made_by(words: list[str]) -> set[str]:
-    """The files that a command leaves behind, for those that follow."""
+    """Create the files that a command would write, for the commands after it."""
     named = {value for option, value in itertools.pairwise(words) if option in WRITTEN}
     new = set(words[3:4]) if words[1:3] == ["model", "new"] else set()
     return named | new | set(LEFT.get(words[1] if words[1:] else "", []))
@@ -99,7 +99,7 @@ def test_python_and_data_of_a_page_are_sound(page: Path) -> None:
 
 
 def require_names(block: Block, node: ast.ImportFrom) -> None:
-    """What a page imports of Tandem is there."""
+    """Every name that a page imports from Tandem exists."""
     module = node.module or ""
     if not (ROOT / module.partition(".")[0] / "__init__.py").exists():
         return

@@ -1,4 +1,4 @@
-"""The tables of docs/reference/gateway.md are what the protocol says: keys, sizes, fields and their types."""
+"""The tables of docs/reference/gateway.md agree with the protocol: keys, sizes, fields and their types."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHOWN = (m.PlantState, m.Piece, m.Command, m.Backup, m.Override, m.Health)
 
 
 def table(heading: str) -> list[list[str]]:
-    """The cells of the first table below a heading, without its own head."""
+    """Return the cells of the first table below a heading, without the header row."""
     section = re.split(r"^#+ ", PAGE.split(f"\n{heading}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)[0]
     rows = [line for line in section.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]

@@ -1,4 +1,4 @@
-"""What the repository says of itself agrees: version, changes, citation, type information."""
+"""The metadata of the repository agree: version, changes, citation, type information."""
 
 from __future__ import annotations
 

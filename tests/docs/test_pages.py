@@ -27,15 +27,15 @@ MODULE = re.compile(rf"`((?:{NAME})(?:\.\w+)+)")
 RUN = re.compile(r"python -m ([\w.]+)")
 MAKE = re.compile(r"\bmake ([a-z-]+)\b(?=[`\s\"])")
 TANDEM = re.compile(r"(?:^|[`\s/])tandem ((?:[a-z]+(?:-[a-z]+)* ?){1,2})([^`\n|]*)", re.MULTILINE)
-# What a page may name that is made when something runs, or is an example of the reader's own.
+# Paths that a page may name because a run creates them, or because they are examples of a reader's files.
 MADE = ("tandem/jet",)
 METADATA = {"tandem.configuration"}
-"""Keys of an exported file, which look like modules."""
+"""Keys of an exported file. They look like modules."""
 OWN = {"gru.py", "tanks.py", "tank.py", "true.py", "my.py"}
 
 
 def code(text: str) -> str:
-    """Inline code and code blocks of a page, one a line."""
+    """Return inline code and code blocks of a page, one per line."""
     blocks = re.findall(r"^```.*?^```", text, re.DOTALL | re.MULTILINE)
     return "\n".join([*blocks, *re.findall(r"`[^`\n]+`", text)])
 
@@ -50,7 +50,7 @@ def source(path: Path) -> str:
 
 
 def is_a_module(dotted: str) -> bool:
-    """Whether a dotted name is a package, a module, or something that stands in one."""
+    """Whether a dotted name is a package, a module, or a name in a module."""
     parts = dotted.split(".")
     for length in range(len(parts), 0, -1):
         place = ROOT.joinpath(*parts[:length])
@@ -63,7 +63,7 @@ def is_a_module(dotted: str) -> bool:
 
 @cache
 def help_of(*words: str) -> str | None:
-    """What `tandem WORDS --help` prints; None where there is no such command."""
+    """Return the output of `tandem WORDS --help`; None if there is no such command."""
     import contextlib
     import io
 
@@ -73,7 +73,7 @@ def help_of(*words: str) -> str | None:
 
 
 def leads_somewhere(page: Path, link: str) -> bool:
-    """Whether a link leads to a file, or to a page that the site makes from the code."""
+    """Whether a link leads to a file, or to a page that the site generates from the code."""
     target = (page.parent / link).resolve()
     return target.exists() or target in GENERATED_PAGES
 
@@ -106,7 +106,7 @@ def test_commands_and_options_of_a_page_exist(page: Path) -> None:
         chosen = words.split()
         told = help_of(*chosen)
         if told is None:
-            # The second word is an argument, or a sentence goes on.
+            # The second word is an argument, or part of a sentence.
             chosen = chosen[:1]
             told = help_of(*chosen)
         if told is None:

@@ -1,4 +1,4 @@
-"""The reference is made from the code, and has words for every key, field and option."""
+"""The reference is generated from the code and describes every key, field and option."""
 
 from __future__ import annotations
 
@@ -54,6 +54,13 @@ def test_a_help_text_is_read_by_its_boxes() -> None:
     assert read.usage.startswith("tandem replay")
     assert [name for name, _ in read.options if not name.startswith("-")] == ["FILE"]
     assert dict(read.options)["--architecture FILE:NAME"].endswith("(default: none)")
+
+
+def test_every_role_is_on_the_page_with_what_it_publishes() -> None:
+    page = messages.page()
+    assert "| viewer |  | everything |" in page
+    assert "| user | `user/**` |" in page
+    assert "| commander | `operator/reference`, `operator/override` | everything |" in page
 
 
 @pytest.mark.parametrize("topic", topics.ALL, ids=lambda topic: topic.name)

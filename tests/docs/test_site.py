@@ -1,4 +1,4 @@
-"""The site builds: every link and anchor leads somewhere, every page is in the navigation, every docstring reads."""
+"""The site builds: every link and anchor exists, every page is in the navigation, every docstring can be parsed."""
 
 from __future__ import annotations
 

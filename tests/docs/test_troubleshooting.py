@@ -21,7 +21,7 @@ QUOTED = [
 
 @cache
 def literals() -> str:
-    """All text in the sources, as it is printed: adjacent pieces joined, what is filled in as {}."""
+    """Return all texts in the sources as printed: adjacent literals joined, fields replaced by {}."""
     said = []
     for package in INSTALLED:
         for path in (ROOT / package).rglob("*.py"):

@@ -1,4 +1,4 @@
-"""Examples in lock-step, shorter than on their pages: what learning is worth on each."""
+"""Comparisons of oracles on the examples in lock-step, shorter than on their pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOT_COMPILED = {"controller": {"solver": {"compile": "never"}}}
 
 
 def costs(name: str, steps: int, *oracles: str) -> tuple[dict[str, float], dict[str, float]]:
-    """J of each oracle, and how far the first performance state is off at the end."""
+    """Return J of each oracle, and the error of the first performance state at the end."""
     folder = EXAMPLES / name
     (config,) = (path for path in folder.glob("*.toml") if path.stem in name)
     rows = compare(config, steps, oracles, **NOT_COMPILED)
@@ -34,7 +34,7 @@ def costs(name: str, steps: int, *oracles: str) -> tuple[dict[str, float], dict[
 def test_learning_removes_the_offset_and_lowers_J(
     name: str, steps: int, linear_off: float, dnn_off: float, shares: dict[str, float]
 ) -> None:
-    """linear_off, dnn_off: off by so much at the end. shares: J of the network is less than this share of theirs."""
+    """linear_off, dnn_off: error at the end. shares: J of the network is less than this share of theirs."""
     J, off = costs(name, steps, *shares, "dnn")
     assert off["linear"] > linear_off
     assert off["dnn"] < dnn_off

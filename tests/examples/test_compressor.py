@@ -1,4 +1,4 @@
-"""The compressor in ten lines: the script runs as it stands, and says what its page says."""
+"""The compressor in ten lines: the script runs unchanged and prints the output that its page shows."""
 
 from __future__ import annotations
 

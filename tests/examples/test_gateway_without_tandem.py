@@ -1,4 +1,4 @@
-"""The gateway without Tandem's code keeps the same rules as Tandem's own, and drives the compressor live."""
+"""The gateway without Tandem's code follows the rules of Tandem's gateway, and drives the compressor live."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ TAME = replace(
     positive=(),
     safe_gain=None,
 )
-"""A plant of the compressor's size that bears any input."""
+"""A plant of the compressor's size that stays bounded for any input."""
 CONFIG = Config()
 PERIOD, PATIENCE, SILENCE = CONFIG.period, CONFIG.plant.plan_patience, CONFIG.bus.follow_silence
 RUN = "plant-a"
 
 
 class Machine:
-    """What the example asks of one, moved by Tandem."""
+    """The machine interface of the example, moved by Tandem's simulation."""
 
     def __init__(self, plant: Plant) -> None:
         self.truth, self.x, self.u, self.t = Truth(plant), plant.x0, None, 0.0
@@ -57,7 +57,7 @@ class Machine:
 
 
 class Foreign:
-    """The example in virtual time."""
+    """Run the example's gateway in virtual time."""
 
     def __init__(self, machine: Any) -> None:
         self.gateway = EXAMPLE["Gateway"](machine, RUN, 0.0)
@@ -87,7 +87,7 @@ class Foreign:
 
 
 class Own:
-    """Tandem's gateway in virtual time, with what its inbox does before it."""
+    """Run Tandem's gateway in virtual time, with the checks of its inbox before it."""
 
     def __init__(self) -> None:
         self.sim = PlantSim(TAME, Truth(TAME), PERIOD, TAME.x0, PATIENCE, RUN)
@@ -108,7 +108,7 @@ class Own:
 
 
 def some_command(rng: np.random.Generator, seq: int, state_seq: int) -> bytes:
-    """Mostly what a controller says, and now and then what must not be obeyed."""
+    """Return a command: mostly a valid one, sometimes one that must be refused."""
     plan = [[float(u)] for u in TAME.u_e + rng.uniform(-0.3, 0.3, rng.integers(1, 5))]
     fields: dict[str, Any] = {
         "run_id": "controller-a",
@@ -200,7 +200,7 @@ def test_no_message_stops_the_monitor(odd: Any) -> None:
 
 
 def acted(pieces: list[m.Piece]) -> list[float]:
-    """Seconds and input of each stretch under one input."""
+    """Return duration and value of each interval with a constant input."""
     merged: list[list[float]] = []
     for piece in pieces:
         if merged and piece.u == merged[-1][1:]:

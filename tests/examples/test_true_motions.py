@@ -1,4 +1,4 @@
-"""Simulators of others as true plants: nothing is kept between calls, and parts of a period make the whole."""
+"""External simulators as true plants: they keep no state between calls, and the parts of a period add up to it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_the_same_numbers_in_give_the_same_numbers_out(named: tuple[str, str]) -
     again = true.step(x, u, 0.02)
     assert once.tobytes() == again.tobytes()
     assert np.abs(once - x).max() > 1e-4
-    # What was given out is no view of the simulator's own memory.
+    # The returned state is not a view of the simulator's memory.
     assert not np.shares_memory(once, again)
     np.testing.assert_array_equal(true.step(x, u, 0.0), x)
 
@@ -59,7 +59,7 @@ SLIDING_BOX = """
 
 
 def test_mujocos_warm_start_is_reset() -> None:
-    """It begins where it ended the last time, unless it is told not to, and ends some rounding away."""
+    """MuJoCo's contact solver starts from its last solution, which would change results by rounding, so it is reset."""
     crane, _ = loaded(CRANE)
     model = type(crane.model).from_xml_string(SLIDING_BOX)
     box = type(crane)(model)

@@ -1,4 +1,4 @@
-"""What a change would have commanded: a log is enough, and a change that is none gives the recorded bits."""
+"""Commands of a changed setting are computed from a log alone. Without a change they equal the recorded ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_an_unchanged_setting_gives_the_recorded_commands(log: Path) -> None:
     recorded = np.array([command.u for command in run.commands])
     np.testing.assert_array_equal(commanded(run, "controller.oracle=constant"), recorded)
     linear = commanded(run, "controller.oracle=linear")
-    # It does not see the leak, and would give less than what the true tanks rest at.
+    # It does not know the leak, and would command less than the equilibrium of the true tanks needs.
     assert linear[-1, 0] < recorded[-1, 0] - 2.0
 
 

@@ -251,7 +251,7 @@ def test_the_check_passes_and_skips_sizes_that_the_architecture_refuses(
             "        return dense(",
             '        if hasattr(state, "dim"):\n            state = 0.9 * state\n        return dense(',
             1,
-            "NOT",
+            "DIFFER",
         ),
         (
             "        return dense(",

@@ -1,4 +1,4 @@
-"""The wheel in bare environments, used from an empty folder. `make wheel-test`: some minutes, most of them pip's."""
+"""The wheel in bare environments, used from an empty folder. `make wheel-test` takes some minutes, mostly in pip."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tests.helpers.plants.tanks import write_tanks
 from tests.packaging.wheel import build_wheel, copy_sources
 
 PATIENCE_S = 600.0
-"""A limit only ends a hang."""
+"""Limit in seconds that only ends a hang."""
 
 
 class Environment:
-    """A virtual environment with the wheel and some of its extras; commands run in a folder of their own."""
+    """A virtual environment with the wheel and some of its extras. Commands run in a separate folder."""
 
     def __init__(self, wheel: Path, folder: Path, extras: str = ""):
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
@@ -40,7 +40,7 @@ class Environment:
 
     @contextmanager
     def running(self, cwd: Path, *arguments: str) -> Iterator[None]:
-        """A command for as long as the block takes; it must not end by itself."""
+        """Run a command during the block; it must not end before."""
         process = subprocess.Popen(self.command(*arguments), cwd=cwd, env=BARE)
         try:
             yield
@@ -51,7 +51,7 @@ class Environment:
 
 
 BARE = {"PATH": "/usr/bin:/bin"}
-"""No PYTHONPATH: nothing is found but what is installed."""
+"""Return the environment without PYTHONPATH, so that only installed packages are found."""
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_a_users_plant_in_an_empty_folder(whole: Environment, tmp_path: Path):
     (tmp_path / "shown.toml").write_text(shown.stdout)
     again = whole.tandem(tmp_path, "config", "show", "--config", "shown.toml")
     assert again.stdout == shown.stdout
-    # The log is enough; what it names is not loaded.
+    # The log is sufficient; the file that it names is not loaded.
     file.write_text("raise SystemExit('loaded')\n")
     for command in ("replay", "report"):
         done = whole.tandem(tmp_path, command, "run.mcap")

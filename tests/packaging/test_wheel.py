@@ -1,4 +1,4 @@
-"""What `pip install` gets: the packages with their data and the shipped configurations, and nothing else."""
+"""`pip install` installs the packages with their data and the shipped configurations, and nothing else."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(sources: Path) -> set[str]:
-    """Every file of the packages; those of configs/ once more, as data of tandem."""
+    """Return every file of the packages, and the files of configs/ also as data of tandem."""
     files = {path for name in INSTALLED for path in (sources / name).rglob("*") if path.is_file()}
     configs = {f"tandem/configs/{path.relative_to(CONFIGS)}" for path in CONFIGS.rglob("*") if path.is_file()}
     return {str(path.relative_to(sources)) for path in files} | configs
@@ -33,7 +33,7 @@ def wheel(sources: Path, expected: set[str], tmp_path_factory: pytest.TempPathFa
 
 
 def content(wheel: Path) -> set[str]:
-    """Its files, but for those that describe it."""
+    """Return the files of a wheel without its metadata."""
     with zipfile.ZipFile(wheel) as archive:
         return {name for name in archive.namelist() if ".dist-info/" not in name}
 

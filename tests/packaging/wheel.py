@@ -1,4 +1,4 @@
-"""Builds what `pip install` gets, from a copy of the sources: a build leaves files where it runs."""
+"""Builds the wheel and the source distribution from a copy of the sources, because a build leaves files behind."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ INSTALLED = (
     *("network_model", "lbmpc", "protocol", "node_runtime", "controller_node", "trainer_node", "plant_sim"),
     *("run_log", "tandem"),
 )
-"""The packages that the wheel holds."""
+"""The packages that the wheel contains."""
 BESIDE = ("benchmarks", "verification", "tests", "configs")
-"""Folders that a build sees as well."""
+"""Other folders that a build reads."""
 _CACHES = shutil.ignore_patterns("__pycache__", "*.egg-info")
 
 
 def copy_sources(folder: Path) -> Path:
-    """The sources in a new folder, links as links."""
+    """Copy the sources into a new folder; links stay links."""
     for name in (*INSTALLED, *BESIDE):
         shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=_CACHES)
     for name in ("pyproject.toml", "README.md"):
@@ -30,12 +30,12 @@ def copy_sources(folder: Path) -> Path:
 
 
 def build_wheel(sources: Path, out: Path) -> Path:
-    """The wheel of these sources, in `out`."""
+    """Build the wheel of these sources in `out`; return its path."""
     return _build("wheel", sources, out)
 
 
 def unpacked_sdist(sources: Path, out: Path) -> Path:
-    """The folder that the source distribution of these sources unpacks to, in `out`."""
+    """Build and unpack the source distribution in `out`; return the folder."""
     with tarfile.open(_build("sdist", sources, out)) as archive:
         archive.extractall(out, filter="data")
     (folder,) = (path for path in out.iterdir() if path.is_dir())

@@ -50,8 +50,8 @@ def test_a_function_that_modifies_its_input_does_not_change_the_record() -> None
     ("read", "said"),
     [
         (raising(OSError("no such device")), "read failed: OSError: no such device"),
-        (lambda: [1.0], "x has the shape (1,), the plant has 2 states"),
-        (lambda: [[1.0], [2.0]], "x has the shape (2, 1), the plant has 2 states"),
+        (lambda: [1.0], "x has the shape (1,), but the plant has 2 states"),
+        (lambda: [[1.0], [2.0]], "x has the shape (2, 1), but the plant has 2 states"),
         (lambda: [1.0, float("nan")], "x is not finite"),
         (lambda: [1.0, float("inf")], "x is not finite"),
         (lambda: None, "shape ()"),

@@ -25,23 +25,23 @@ def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
         ear = BusListener(bus)
         with Process("plant_sim.node", config) as process:
             ear.until(health_of("plant", status="ready", note="held at x0 until the first command"))
-            foreign = Bus(config, "controller", "controller-b")
-            foreign.open()
-            wait_for(lambda: matched(bus, topics.COMMAND) and matched(foreign, topics.COMMAND))
+            second = Bus(config, "controller", "controller-b")
+            second.open()
+            wait_for(lambda: matched(bus, topics.COMMAND) and matched(second, topics.COMMAND))
             for k in range(5):
                 ear.of(topics.PLANT_STATE)
                 state = ear.until(lambda message: isinstance(message, m.PlantState))
                 assert isinstance(state, m.PlantState)
                 answer = command(k, U + 0.01, [U] * 40, answers=state.seq, run_id=state.run_id)
                 bus.publish(topics.COMMAND, answer)
-                foreign.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
+                second.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
             ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
             foreign = "bad_controller_command_foreign"
             ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
             process.signal(signal.SIGINT)
             ear.until(health_of("plant", status="stopping"))
             assert process.end() == 0
-            foreign.close()
+            second.close()
     states = ear.of(topics.PLANT_STATE)
     order = [source for source, _ in groupby(state.source for state in states)]
     assert order[0] == "hold"

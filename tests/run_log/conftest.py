@@ -1,4 +1,4 @@
-"""A short log that several files of tests read."""
+"""A short log that several test files read."""
 
 from __future__ import annotations
 

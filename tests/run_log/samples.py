@@ -1,4 +1,4 @@
-"""A run that never happened, made of real messages: the true compressor under a plain state feedback."""
+"""A constructed run of real messages: the true compressor under a plain state feedback."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MS = 1_000_000
 GAIN = np.array([[-1.5, 1.2, 0.1, -0.005]])
 Logged = tuple[Topic, m.Message, int]
 STEPS = 60
-"""Ticks of the log that tests share."""
+"""Number of ticks of the shared log."""
 
 
 def synthetic(config: Config | None = None, steps: int = 100, seed: int = 0) -> tuple[Config, list[Logged]]:
-    """Messages of `steps` ticks in the order in which a recorder would see them."""
+    """Yield the messages of `steps` ticks in the order in which a recorder receives them."""
     config = config or Config()
     plant: Plant = get_plant(config.plant.model)
     truth, rng = Truth(plant), np.random.default_rng(seed)
@@ -161,7 +161,7 @@ def _weights(k: int, rng: np.random.Generator) -> m.HiddenWeights:
 
 
 def write(path: Path, config: Config, messages: list[Logged], flush_every: int = 50) -> Path:
-    """A finished log of these messages."""
+    """Write a complete log of these messages."""
     with LogWriter(path, config, get_plant(config.plant.model), versions={"python": "3.11"}) as writer:
         for i, (topic, message, log_time) in enumerate(messages):
             writer.write(topic.name, codec.encode(message), log_time)
@@ -171,7 +171,7 @@ def write(path: Path, config: Config, messages: list[Logged], flush_every: int =
 
 
 def payloads(messages: list[Logged]) -> dict[str, list[bytes]]:
-    """What a log of them must hold of each topic."""
+    """Return the messages that a log of them must contain, by topic."""
     found: dict[str, list[bytes]] = {}
     for topic, message, _ in messages:
         found.setdefault(topic.name, []).append(codec.encode(message))
@@ -179,5 +179,5 @@ def payloads(messages: list[Logged]) -> dict[str, list[bytes]]:
 
 
 def logged(path: Path) -> dict[str, list[bytes]]:
-    """What it holds of each topic."""
+    """Return the messages that the log contains, by topic."""
     return {name: [entry.payload for entry in entries] for name, entries in read_run(path).streams.items()}

@@ -1,4 +1,4 @@
-"""Logs that are cut, damaged, edited or no logs: what is read of them, what is said, and what `recover` saves."""
+"""Cut, damaged and edited logs, and files that are not logs: the readable part, the message, and `recover`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from run_log.reading.reader import read_run
 from run_log.reading.recover import recover
 from tests.run_log.samples import Logged, logged, payloads
 
-# -- files that are not as they should be ----------------------------------------------------------------
+# -- damaged files ---------------------------------------------------------------------------------------
 
 
 def test_a_cut_file_is_read_up_to_the_cut(whole: Path, messages: list[Logged], tmp_path: Path) -> None:
@@ -27,7 +27,7 @@ def test_a_cut_file_is_read_up_to_the_cut(whole: Path, messages: list[Logged], t
         try:
             run = read_run(cut)
         except LogError:
-            unreadable.append(end)  # cut before there was a configuration
+            unreadable.append(end)  # cut before the configuration
             continue
         assert run.truncated
         assert f"of {end}" in run.note
@@ -70,7 +70,7 @@ def test_foreign_files_are_named(tmp_path: Path) -> None:
     cases = {
         b"": "is empty",
         b"PK\x03\x04 and so on": "not an MCAP file",
-        b"\x89MCAP0\r\n": "ends before anything",
+        b"\x89MCAP0\r\n": "contains no message",
     }
     for data, said in cases.items():
         path.write_bytes(data)
@@ -92,7 +92,7 @@ def test_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 def test_a_chunk_with_a_wrong_size_uses_no_extra_memory(whole: Path, tmp_path: Path) -> None:
-    """A chunk that says it is 2^62 bytes when unpacked."""
+    """A chunk that states an unpacked size of 2^62 bytes."""
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks(data)[0] + 9 + 16, 2**62)
     path = tmp_path / "liar.mcap"
@@ -138,7 +138,7 @@ def test_recover_overwrites_nothing_and_leaves_whole_files_alone(whole: Path, tm
 
 
 def chunks(data: bytes | bytearray) -> list[int]:
-    """Where each chunk record begins."""
+    """Return the positions at which the chunk records begin."""
     found, position = [], 8
     while data[position] != 0x0F:  # the end of the data
         if data[position] == 6:
@@ -149,7 +149,7 @@ def chunks(data: bytes | bytearray) -> list[int]:
 
 @pytest.mark.parametrize("which", [0, 4, -1])
 def test_recover_saves_what_is_around_the_damage(whole: Path, tmp_path: Path, which: int) -> None:
-    """The first chunk too, in which the channels are declared."""
+    """The damaged chunk may also be the first one, which declares the channels."""
     data = bytearray(whole.read_bytes())
     data[chunks(data)[which] + 200] ^= 1
     edited, out = tmp_path / "edited.mcap", tmp_path / "out.mcap"

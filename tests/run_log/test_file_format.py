@@ -1,4 +1,4 @@
-"""A log says its format first, and a reader refuses a format that it does not know, in words."""
+"""A log begins with its format, and a reader refuses an unknown format with a message."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def log_of(path: Path, library: str) -> Path:
 
 
 def stated(path: Path) -> tuple[str, str]:
-    """The library in the header, and the format in the metadata."""
+    """Return the library in the header, and the format in the metadata."""
     with path.open("rb") as stream:
         reader = make_reader(stream)
         (identity,) = (record for record in reader.iter_metadata() if record.name == IDENTITY)
@@ -68,7 +68,7 @@ def test_a_log_of_an_older_format_names_the_version_that_reads_it(tmp_path: Path
 
 
 def test_the_format_is_that_of_this_version_or_an_earlier_one() -> None:
-    """The number goes up together with the version that the package will be released as."""
+    """The number increases together with the version of the next release."""
     ours = tomllib.loads((CONFIGS.parent / "pyproject.toml").read_text())["project"]["version"]
     assert [int(n) for n in VERSIONS[FORMAT].split(".")] <= [int(n) for n in ours.split(".")]
 

@@ -1,4 +1,4 @@
-"""Logs of format 2, whose raw channels hold bytes without a wrapping, are read, replayed and recovered."""
+"""Logs of format 2 are read, replayed and recovered. Their raw channels contain unwrapped bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_log_of_format_2_is_read_and_replayed() -> None:
         assert all(codec.encode(entry.message) == entry.payload for entry in entries)
     found = replay(run)
     assert found.ticks == 30
-    # Made on another machine, perhaps.
+    # The log may come from another machine.
     assert found.largest_difference < 1e-7
 
 

@@ -1,4 +1,4 @@
-"""A recorder that gets no core loses nothing; and what is lost nevertheless is counted and said."""
+"""A recorder without processor time loses no message. Lost messages are counted and reported."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def timing(seq: int) -> m.TickTiming:
 def test_a_recorder_without_processor_time_for_longer_than_the_lease_loses_nothing(
     tmp_path: Path, rate: int
 ) -> None:
-    """Real-time loops that need both cores did that: the router cut the recorder's link, and seconds were lost."""
+    """Real-time loops on both cores once caused this: the router cut the recorder's link, and seconds were lost."""
     path = tmp_path / "run.mcap"
     config = live_config(f"bus.lease_ms={LEASE_S * 1e3:.0f}", f'log.path="{path}"', f"rate={rate}")
     with open_router(config), Process("run_log.writing.recorder", config) as recorder:
-        # The lease in question is the recorder's: the other side's link holds, however late this process is.
+        # Only the recorder's lease matters here: the link of the other side holds however late this process is.
         with Bus(override(config, ["bus.lease_ms=60000"]), "controller", "controller-a") as bus:
             wait_for(lambda: matched(bus, topics.TIMING) and matched(bus, topics.BATCH["controller"]))
             bus.publish(topics.TIMING, timing(0))
@@ -70,7 +70,7 @@ def test_lost_messages_are_counted_by_the_recorder_and_in_the_figures(tmp_path: 
     config, messages = synthetic(steps=60)
     each = {topics.TICK.name, topics.COMMAND.name, topics.RESULT.name}
     kept = [one for one in messages if not (one[0].name in each and 20 <= one[1].seq < 27)]
-    # One result more, of another tick.
+    # One more result, of another tick.
     kept = [one for one in kept if not (one[0] is topics.RESULT and one[1].seq == 40)]
     with LogWriter(tmp_path / "run.mcap", config, get_plant(config.plant.model)) as writer:
         for topic, message, log_time in kept:

@@ -1,4 +1,4 @@
-"""The log of a run: what goes in comes out; others can read it; what a full disk does to it."""
+"""The log of a run: it contains every message, foreign readers can read it, and it survives a full disk."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_a_fast_loop_has_all_its_bytes_in_the_log_and_100_views_a_second(
                 run_id="p", seq=i, t=i / rate, x=[0.0] * 4, applied=None, source="hold", command_seq=-1
             )
             writer.write("plant/state", codec.encode(state), i * 1_000_000_000 // rate)
-            # Of topics without such a limit nothing is left out.
+            # Topics without such a limit are complete.
             writer.write("controller/output_weights", codec.encode(weights), i * 1_000_000_000 // rate)
     with path.open("rb") as stream:
         found = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
@@ -183,7 +183,7 @@ def test_a_simulation_saves_the_same_log_twice(
     assert logged(tmp_path / "a.mcap") == payloads(messages)
 
 
-# -- a disk that does not take it ------------------------------------------------------------------------
+# -- a full disk -----------------------------------------------------------------------------------------
 
 
 def test_nothing_is_ever_overwritten(tmp_path: Path, config: Config) -> None:
@@ -212,7 +212,7 @@ def test_an_unwritable_place_is_an_error_or_is_waited_for(tmp_path: Path, config
 
 @contextmanager
 def file_size_limit(limit: int) -> Iterator[None]:
-    """No file of this process may grow beyond `limit` bytes: what a full disk is to a writer."""
+    """Limit files of this process to `limit` bytes, which a writer sees as a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:

@@ -1,4 +1,4 @@
-"""The log of a long run in parts: each replays alone, no tick is lost at a seam, and old ones may go."""
+"""The log of a long run in parts: each replays alone, no tick is lost between parts, and old parts are removed."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ SETS = m.CertifiedSets(run_id="another", seq=0, kind="terminal", sha256="", cont
 
 @pytest.fixture(scope="module")
 def ran() -> Run:
-    """A run with adopted weights and a keyframe a second."""
+    """A run with adopted weights and one keyframe per second."""
     settings = ["controller.horizon=10", f"controller.keyframe_every={EVERY}", "network.hidden=[8]"]
     return simulate(override(Config(), [*settings, "trainer.steps=20", "trainer.device=cpu"]), STEPS)
 
 
 def config(ran: Run, path: Path, *assignments: str) -> Config:
-    # A part lasts three seconds and then some, until the next keyframe and a second more.
+    # A part lasts three seconds, then until the next keyframe, and one second more.
     return override(ran.config, [f'log.path="{path}"', f"log.split_minutes={3 / 60}", *assignments])
 
 
 def entries(ran: Run) -> list[tuple[str, bytes, int]]:
-    """(topic, payload, log_time) in the order in which a recorder hears them; the controller says who it is."""
+    """(topic, payload, log_time) in the order in which a recorder receives them, with the controller's run info."""
     said = [
         (entry.log_time, topic.name, entry.payload) for topic in topics.ALL for entry in ran.entries(topic)
     ]
@@ -55,7 +55,7 @@ def entries(ran: Run) -> list[tuple[str, bytes, int]]:
 
 
 def record(ran: Run, into: Config, heard: list[tuple[str, bytes, int]], *, end: bool = True) -> PartedLog:
-    """As the recorder does, in the run's own time."""
+    """Write the messages as the recorder does, in the time of the run."""
     start = heard[0][2]
     writer = PartedLog(into, get_plant(into.plant.model), now=0.0, start_ns=start)
     flushed = 0.0
@@ -95,7 +95,7 @@ def test_every_part_replays_alone_and_no_tick_is_lost_at_a_seam(ran: Run, tmp_pa
     ]
     assert "continues in run.part2.mcap" in runs[0].note
     for run in runs:
-        # What was said once is in every part, and a part's edges are no gaps.
+        # Messages that are sent once are in every part, and the edges of a part are no gaps.
         assert [entry.message for entry in run.entries(topics.SETS)] == [SETS]
         assert {info.run_id for info in run.run_infos} == {"plant-x", "controller-simulated"}
         assert summarise(run).lost_ticks == 0
@@ -167,7 +167,7 @@ def test_an_old_part_is_not_ended_before_the_new_one_can_be_written(ran: Run, tm
         writer.write(name, payload, log_time, now)
         if 2.9 < now < 3.0 and folder.is_dir():
             writer.flush(now, log_time)
-            # The disk goes: what is open stays open, nothing new can be made.
+            # The disk fails: open files stay open, and no new file can be created.
             folder.rename(away)
             folder.write_bytes(b"")
         if now > 6.0 and not folder.is_dir():
@@ -178,7 +178,7 @@ def test_an_old_part_is_not_ended_before_the_new_one_can_be_written(ran: Run, tm
         writer.flush(now, log_time)
     writer.close()
     runs = [read_run(part) for part in existing_parts(folder / "run.mcap")]
-    # The first one went on for as long as the second could not be made.
+    # The first part continued for as long as the second could not be created.
     assert max(tick.seq for tick in runs[0].ticks) >= 6.0 / runs[0].config.period - 1
     found = [replay(run) for run in runs]
     assert all(result.equal and not result.lost_ticks for result in found)
@@ -189,7 +189,7 @@ def test_the_edges_of_a_part_are_no_gaps(ran: Run) -> None:
     def cut(topic: topics.Topic, first: int, last: int) -> list[tuple[topics.Topic, m.Message, int]]:
         return [(topic, e.message, e.log_time) for e in ran.entries(topic) if first <= e.message.seq <= last]
 
-    # The last messages of tick 19 came after the part began, and some of tick 60 were still on their way at its end.
+    # The last messages of tick 19 arrived after the part began, and some of tick 60 arrived after its end.
     told = [*cut(topics.TICK, 20, 60), *cut(topics.COMMAND, 20, 60), *cut(topics.RESULT, 19, 59)]
     run = gather(ran.config, told)
     run.part, run.continued = 2, "run.part3.mcap"

@@ -1,4 +1,4 @@
-"""The yardstick on motions that are known in closed form."""
+"""The performance figures of motions that are known in closed form."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OSCILLATOR = Plant(
 
 
 def motion(x: Any, applied: Any = 0.0, period: float = 1.0, pieces: Any = None) -> Trajectory:
-    """x: (n, d); applied: the input over the periods between."""
+    """x: (n, d); applied: the input over the periods between the samples."""
     x = np.array(x, dtype=float)
     inputs = np.vstack([[np.nan], np.broadcast_to(np.reshape(applied, (-1, 1)), (len(x) - 1, 1))])
     known = pieces or tuple(((period, (u,)),) for u in inputs[1:, 0])
@@ -132,14 +132,14 @@ def test_rows_beside_the_boxes_are_counted_by_name() -> None:
 
 
 def test_the_motion_between_samples_is_that_of_the_truth() -> None:
-    # Once around in every period: the samples see nothing of it, and a quarter of the way the speed is 0.9.
+    # One revolution per period: the samples do not show it, and after a quarter of it the speed is 0.9.
     around = motion([[0.9, 0.0]] * 3, period=TURN)
     found = figures(around, f"rate={1 / TURN}")
     assert found.constraint_violations == 0
     assert found.excess_between_samples == pytest.approx((0.9 - 0.5) / 0.5, abs=1e-7)
     inside = motion([[0.4, 0.0]] * 3, period=TURN)
     assert figures(inside).excess_between_samples == 0.0
-    # A sample outside counts too: the last one, after which nothing is known.
+    # A sample outside counts too: the last one, after which the motion is not known.
     assert figures(motion([[0.9, 0.0]] * 3, period=0.0)).excess_between_samples == 0.0
     assert figures(motion([[1.5, 0.0]] * 3, period=0.0)).excess_between_samples == pytest.approx(0.5)
 
@@ -152,7 +152,7 @@ def test_the_inputs_of_a_period_act_in_turn() -> None:
 
 
 def test_with_a_dead_time_earlier_inputs_act() -> None:
-    # As above, a quarter of a turn later; what acts before that is not known.
+    # As above, a quarter of a turn later; the input before that is not known.
     turns = (((TURN / 2, (0.3,)), (TURN / 2, (-0.3,))), ((TURN / 2, (0.0,)), (TURN / 2, (0.1,))))
     late = override(Config(), [f"rate={1 / TURN}", f"plant.truth.dead_time={TURN / 4}"])
     given = motion([[0.9, 0.9], [0.3, -0.3], [0.0, 0.0]], pieces=turns)
@@ -160,7 +160,7 @@ def test_with_a_dead_time_earlier_inputs_act() -> None:
     assert acted[:2] == ((), ())
     shares = [(round(seconds / TURN, 12), u) for seconds, (u,) in acted[2]]
     assert shares == [(0.25, -0.3), (0.5, 0.0), (0.25, 0.1)]
-    # Where a sample is missing the line begins afresh.
+    # After a missing sample a new line begins.
     lossy = motion([[0.0, 0.0]] * 5, pieces=(turns[0], (), turns[0], turns[1]))
     assert [bool(one) for one in behind(lossy, TURN / 4).pieces] == [False, False, False, False, True]
     assert behind(given, 0.0) is given
@@ -193,7 +193,7 @@ def test_a_plant_that_was_lost_has_finite_figures() -> None:
 def test_figures_of_the_parts_of_a_run() -> None:
     x = [[0.9, 0.3], [0.5, 0.0], [-0.1, 0.0], [0.5, 0.3], [0.2, 0.1], [0.0, 0.0]]
     whole = motion(x, [0.1, 0.2, 1.5, 0.4, 0.5])
-    # Put back between the third sample and the fourth, by an input that belongs to neither part.
+    # The plant is reset between the third and the fourth sample, with an input of neither part.
     first, second = whole.part(0, 2), whole.part(3, 5)
     assert figures(first, "rate=1").J + figures(second, "rate=1").J == pytest.approx(
         figures(whole, "rate=1").J - 0.1**2 - 1.5**2

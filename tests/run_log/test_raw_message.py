@@ -1,4 +1,4 @@
-"""The wrapping of raw bytes: exact, protobuf, and strict about what it takes back."""
+"""The wrapping of raw bytes is exact, valid protobuf, and strict when it is decoded."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_other_bytes_are_refused(data: bytes) -> None:
 
 
 def test_the_schema_is_what_the_protobuf_compiler_makes() -> None:
-    """Compared with google.protobuf, which parsed it and serialised it to the same bytes; protobufjs reads it too."""
+    """google.protobuf parsed it and serialised it to the same bytes; protobufjs reads it too."""
     assert schema().hex() == (
         "0a4b0a1474616e64656d5f6c6f672f7261772e70726f746f120a74616e64656d5f6c6f67221f0a0352617712180a077061796c6f6164"
         "18012001280c52077061796c6f6164620670726f746f33"

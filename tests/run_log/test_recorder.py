@@ -1,4 +1,4 @@
-"""The recorder as a process of its own: it logs whatever is said, and neither a kill nor a full disk spoils it."""
+"""The recorder as a separate process: it logs every message, and neither a kill nor a full disk damages the log."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def base() -> Iterator[Config]:
 
 @pytest.fixture
 def config(base: Config, tmp_path: Path) -> Config:
-    # A name of its own: what other tests say is not on this bus.
+    # A separate plant name, so that messages of other tests are not on this bus.
     name = f"jet{abs(hash(tmp_path)) % 10**8}"
     return override(base, [f'log.path="{tmp_path / "run.mcap"}"', f"name={name}"])
 
@@ -63,7 +63,7 @@ def state(seq: int, x: float = 1.0) -> m.PlantState:
 
 
 def timing(seq: int) -> m.TickTiming:
-    """On the bulk lane, where nothing is ever dropped, however late a thread is that passes it on."""
+    """Return a message of the bulk lane, which never drops one, however late its sending thread is."""
     return m.TickTiming(
         run_id="controller-a", seq=seq, solve_ms=0.1, tick_ms=0.2, lateness_ms=0.0, state_age_ms=0.0
     )
@@ -79,7 +79,7 @@ def noted(text: str) -> Callable[[m.Message], bool]:
 
 
 def recorded(plant: Bus, ear: BusListener, process: Process, config: Config) -> None:
-    """Wait until the recorder hears the plant."""
+    """Wait until the recorder receives messages of the plant."""
     ear.until(noted("writing"))
     wait_for(lambda: matched(plant, topics.PLANT_STATE))
 
@@ -99,7 +99,7 @@ def test_every_message_is_in_the_log(config: Config, plant: Bus, ear: BusListene
             plant.publish(topics.TIMING, message)
         ear.until(lambda x: noted("writing")(x) and x.counters["messages"] >= 305)
         process.signal(signal.SIGINT)
-        # Others still have something to say when everybody is told to stop.
+        # Other processes still send messages when all are told to stop.
         last_words = [timing(300 + i) for i in range(20)]
         for message in last_words:
             clock.sleep_until(clock.now() + 0.02)
@@ -126,7 +126,7 @@ def test_every_message_is_in_the_log(config: Config, plant: Bus, ear: BusListene
 
 
 def readable(path: str) -> int:
-    """How many timings a reader finds in a log that is being written."""
+    """Return the number of timings in a log that is being written."""
     try:
         return len(read_run(path).timings)
     except LogError:
@@ -144,7 +144,7 @@ def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: BusListe
         process.signal(signal.SIGINT)
         assert process.end() == 0
     first, second = (read_run(part) for part in existing_parts(Path(config.log.path)))
-    # No keyframe came, so both were written to the end, and each says who wrote it.
+    # No keyframe arrived, so both files were written to the end, and each contains its recorder's run info.
     assert [timing.seq for timing in first.timings] == [0, 1]
     assert [timing.seq for timing in second.timings] == [1]
     assert [info.process for info in first.run_infos + second.run_infos] == ["recorder", "recorder"]
@@ -154,7 +154,7 @@ def test_a_long_run_is_logged_in_parts(config: Config, plant: Bus, ear: BusListe
 def test_a_killed_recorder_leaves_all_messages_before_its_last_flush(
     config: Config, plant: Bus, ear: BusListener
 ) -> None:
-    """That it is all but the last half second, `make faults` measures."""
+    """`make faults` measures that only the last half second is missing."""
     stop = threading.Event()
 
     def talk() -> None:
@@ -168,7 +168,7 @@ def test_a_killed_recorder_leaves_all_messages_before_its_last_flush(
         recorded(plant, ear, process, config)
         talker.start()
         ear.until(lambda x: noted("writing")(x) and x.counters["messages"] >= 100)
-        # Readable while it goes on, so readable whenever it is killed.
+        # The log is readable while it is written, so it is readable after a kill.
         wait_for(lambda: readable(config.log.path) >= 90)
         flushed = readable(config.log.path)
         process.signal(signal.SIGKILL)
@@ -188,7 +188,7 @@ def test_a_killed_recorder_leaves_all_messages_before_its_last_flush(
 def talk_while_full(
     config: Config, plant: Bus, ear: BusListener, fill: Callable[[int], None], free: Callable[[int], None]
 ):
-    """The disk fills up, stays full for a while, and has room again: nothing is lost, and Health says it all."""
+    """The disk fills up, stays full, and has room again: no message is lost, and Health reports each change."""
     noise = [m.Keyframe(run_id="plant-a", seq=i, arrays={"a": array(i)}) for i in range(20)]
     with recorder(config) as process:
         recorded(plant, ear, process, config)
@@ -212,7 +212,7 @@ def talk_while_full(
 
 
 def array(seed: int) -> m.Array:
-    """Does not compress."""
+    """Random bytes, which do not compress."""
     import numpy as np
 
     return m.Array.of(np.random.default_rng(seed).normal(size=2000))
@@ -279,7 +279,7 @@ def test_stopped_before_there_was_a_router(config: Config) -> None:
 
 
 def test_a_live_loop_replays_byte_for_byte(config: Config, ear: BusListener) -> None:
-    """Three real processes; the log alone gives every command back."""
+    """The log of three real processes reproduces every command."""
     with recorder(config) as log:
         ear.until(noted("writing"))
         with (

@@ -1,4 +1,4 @@
-"""A run in figures and pictures, from its log alone."""
+"""Figures and pictures of a run from its log alone."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_summary_of_a_known_run(config: Config, messages: list[Logged]) -> None:
 
 
 def moved(messages: list[Logged], **changes: Any) -> list[Logged]:
-    """With fields of every plant state replaced by functions of it."""
+    """Return the messages with fields of every plant state replaced by functions of the state."""
     return [
         (topic, msgspec.structs.replace(message, **{k: f(message) for k, f in changes.items()}), t)
         if topic is topics.PLANT_STATE
@@ -109,7 +109,7 @@ def test_summary_counts_after_the_hold_and_ignores_strangers(
 
 
 def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: list[Logged]) -> None:
-    """Half of the run, then a plant of another name that is held for a while and goes the same way."""
+    """Half of the run, then a plant with another run id that is held for a while and then moves in the same way."""
     middle = STEPS // 2
     first = [one for one in messages if one[0] is not topics.PLANT_STATE or one[1].seq <= middle]
     states = [message for topic, message, _ in messages if topic is topics.PLANT_STATE]
@@ -133,7 +133,7 @@ def test_a_plant_that_starts_again_is_another_episode(config: Config, messages: 
     assert (summary.J, summary.constraint_violations) == (one.J, 2 * one.constraint_violations)
     motion = trajectory(run, PLANT)
     assert motion.starts == (0, middle + 1)
-    # The clock goes on; the hold at the second start is no motion.
+    # The clock continues; the hold at the second start is no motion.
     assert motion.t[motion.starts[1]] == pytest.approx(100.0 + 3 * 0.05)
     assert motion.x[motion.starts[1]] == pytest.approx(PLANT.x0)
     line = plots.pictures(traces(run))["states"]().axes[0].lines[0]
@@ -195,7 +195,7 @@ def test_summary_counts_an_overrun_as_late(config: Config, messages: list[Logged
 
 
 def test_the_first_and_last_predictions_of_a_slow_plant_count(config: Config, messages: list[Logged]) -> None:
-    """At a period of 4 s, no second has a prediction in it."""
+    """At a period of 4 s, no single second contains a prediction."""
     spread = [
         (topic, msgspec.structs.replace(said, t=80.0 * said.t) if isinstance(said, Tick) else said, t)
         for topic, said, t in messages

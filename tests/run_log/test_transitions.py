@@ -1,4 +1,4 @@
-"""The samples of a log as motion: nothing leads across an episode, a gap or a restart."""
+"""Transitions between the samples of a log: none spans an episode, a gap or a restart."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_each_transition_is_a_true_step_within_one_episode(episodes: Run) -> Non
     model = build_model(episodes.config)
     seen = observed(episodes, model)
     states = episodes.plant_states
-    # Behind its last tick an episode has one more sample, which no controller saw.
+    # After its last tick an episode has one more sample, which the controller does not use.
     pairs = [(a, b) for a, b in pairwise(states) if a.run_id == b.run_id and b.seq < 12]
     assert len(pairs) == 22
     np.testing.assert_allclose(seen.transitions.x, [a.x for a, _b in pairs], atol=1e-13)

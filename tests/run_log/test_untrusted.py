@@ -1,4 +1,4 @@
-"""A log from anybody: it runs no code, overwrites nothing and takes bounded memory (docs/how/security.md)."""
+"""A log from an unknown source runs no code, overwrites no file and uses bounded memory (docs/how/security.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.helpers.paths import ROOT
 from tests.run_log.samples import synthetic, write
 
 MEMORY = 3 * 1024**3
-"""Bytes of address space in which a command must say that it does not read a log."""
+"""Address space in bytes within which a command must refuse a log with a message."""
 FAR = 2**63 - 1
 SMALL = override(
     Config(), ["controller.oracle=linear", "controller.horizon=8", "controller.solver.compile=never"]
@@ -94,7 +94,7 @@ def test_another_compression_than_ours_is_damage(tmp_path: Path) -> None:
 
 
 def far_log(path: Path) -> Path:
-    """One with a tick, a result and a command whose numbers are as large as a number can be."""
+    """Write a log with a tick, a result and a command with the largest possible numbers."""
     config, messages = synthetic(override(Config(), ["controller.keyframe_every=20"]), 60)
     with LogWriter(path, config, get_plant(config.plant.model)) as writer:
         for topic, message, log_time in messages:
@@ -112,7 +112,7 @@ def test_a_distant_number_uses_no_memory_for_the_numbers_between(tmp_path: Path)
 
 
 def configured(path: Path, **changes: dict[str, object]) -> Path:
-    """A log with a whole header and this configuration, and nothing else."""
+    """Write a log with a complete header and this configuration, and nothing else."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile=PROFILE, library=LIBRARY)
@@ -144,7 +144,7 @@ def test_sizes_and_names_in_a_logs_configuration_have_limits(
 
 
 def with_plant(path: Path, data: bytes) -> Path:
-    """A log with this attachment and a configuration, and nothing else."""
+    """Write a log with this attachment and a configuration, and nothing else."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile=PROFILE, library=LIBRARY)
@@ -155,7 +155,7 @@ def with_plant(path: Path, data: bytes) -> Path:
 
 
 def hostile(**changes: object) -> bytes:
-    """The plant of a log, with these of its fields."""
+    """Return the plant record of a log with these fields changed."""
     tree = json.loads(plant_record.encode(get_plant("moore_greitzer"), {}))
     tree["known"] |= changes
     return json.dumps(tree).encode()
@@ -201,7 +201,7 @@ def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path
     for read in (summarise, lambda run: report(run, tmp_path)):
         with pytest.raises(LogError, match="Tandem loads no file because a log names it"):
             read(run)
-    # What a controller has said of itself is in the log as well.
+    # The log also contains the controller's run info.
     told = [
         (
             topic,
@@ -234,7 +234,7 @@ def bombed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", ["replay", "report", "recover"])
 def test_a_hostile_log_writes_and_runs_nothing(command: str, tmp_path: Path, bombed: Path) -> None:
-    """In a process with little memory, beside files that have the names that the log names."""
+    """The command has little memory, and its folder contains the files that the log names."""
     folder = tmp_path / "a" / "b"
     folder.mkdir(parents=True)
     (folder / "os.py").write_text("raise SystemExit('imported')")
@@ -255,7 +255,7 @@ def test_a_hostile_log_writes_and_runs_nothing(command: str, tmp_path: Path, bom
         env=os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
         timeout=120,
     )
-    expected = [2, 0] if command == "recover" else [2, 2]  # what is whole needs no recovery
+    expected = [2, 0] if command == "recover" else [2, 2]  # a complete file needs no recovery
     assert (run.returncode, run.stdout.splitlines()[-1]) == (0, str(expected)), run.stderr
     assert "Traceback" not in run.stderr
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

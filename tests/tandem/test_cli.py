@@ -1,4 +1,4 @@
-"""The command line as a person or a program meets it: exit codes, one JSON object, one message."""
+"""The command line for people and programs: exit codes, one JSON object, one message."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def tandem(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProc
 
 
 def called(*arguments: str) -> int:
-    """The exit code of the same without a process of its own: quicker."""
+    """Return the exit code of the command in this process, which is quicker."""
     try:
         return main(arguments)
     except SystemExit as end:
@@ -253,7 +253,7 @@ def test_recover_makes_a_cut_log_whole(
     shown = tandem("recover", str(cut), "--json")
     assert shown.returncode == 0, shown.stderr
     assert json.loads(shown.stdout)["log"] == str(tmp_path / "cut.recovered.mcap")
-    assert tandem("recover", str(cut)).returncode == 2  # it is there now, and nothing is overwritten
+    assert tandem("recover", str(cut)).returncode == 2  # it exists now, and no file is overwritten
 
 
 def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]):
@@ -275,7 +275,7 @@ sys.meta_path.insert(0, Absent)
 from tandem.cli import main
 sys.exit(main(sys.argv[2:]))
 """
-"""A command, as it is where one package is not installed."""
+"""Run a command as if one package were not installed."""
 
 
 @pytest.mark.parametrize(

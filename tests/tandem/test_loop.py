@@ -1,4 +1,4 @@
-"""`tandem.Loop`: the lock-step in Python, at once or one step at a time, with a plant that moves elsewhere too."""
+"""`tandem.Loop`: lock-step runs in Python, complete or step by step, also with an external plant."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Simulator:
 
 
 def payloads(run: Run) -> dict[str, list[bytes]]:
-    """All that does not depend on the clock."""
+    """Return the payloads that do not depend on the clock."""
     return {
         topic.name: [entry.payload for entry in run.entries(topic)]
         for topic in topics.ALL
@@ -134,7 +134,7 @@ def test_another_episode_begins_with_the_memory_and_without_a_label() -> None:
     np.testing.assert_array_equal(step.x, PLANT.x0)
     assert step.result.h is None
     np.testing.assert_array_equal(loop.result.run.output_weights[-1].K.numpy(), learned)
-    # By hand too, from wherever it is.
+    # Manual control too, from any state.
     loop.start_again()
     loop.control(PLANT.x_e + 0.01)
     assert loop.result.run.results[-1].h is None
@@ -144,7 +144,7 @@ def test_another_episode_begins_with_the_memory_and_without_a_label() -> None:
 @pytest.mark.parametrize("truth", [Simulator(), PLANT])
 def test_objects_are_true_as_well(truth: object, simulated: Run) -> None:
     ours, theirs = payloads(Loop(truth=truth, **QUICK).run(STEPS).run), payloads(simulated)
-    # What the controller says of itself has the name of its truth.
+    # The controller's run info contains the name of its truth.
     del ours[topics.RUN_INFO["controller"].name], theirs[topics.RUN_INFO["controller"].name]
     assert ours == theirs
 

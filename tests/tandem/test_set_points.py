@@ -1,4 +1,4 @@
-"""Set-points as a person writes them: words, tables, and what `tandem set-point` and `tandem simulate` say to them."""
+"""Set-points as arguments and tables, and the answers of `tandem set-point` and `tandem simulate`."""
 
 from __future__ import annotations
 

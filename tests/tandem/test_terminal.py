@@ -1,4 +1,4 @@
-"""What commands show of strings that others wrote, and limits that say so."""
+"""Foreign strings in the output of commands, and messages about limits."""
 
 from __future__ import annotations
 

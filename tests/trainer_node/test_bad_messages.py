@@ -25,10 +25,10 @@ def test_bad_messages_are_counted_and_stop_nothing(config: Config) -> None:
     config = msgspec.structs.replace(config, bus=msgspec.structs.replace(config.bus, follow_silence=60.0))
     with Controller(config, "controller-1") as controller, RunningTrainer(config) as trainer:
         controller.until(joined)
-        foreign = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
+        session = zenoh.open(session_config("client", config.bus.endpoint, config.bus.lease_ms))
         for topic in (topics.SAMPLES, topics.OUTPUT_WEIGHTS):
             for payload in (b"", b"\xc1" * 40, os.urandom(200)):
-                foreign.put(topic.key(config.name), payload)
+                session.put(topic.key(config.name), payload)
         controller.tick(5)
         nan = Sample(seq=9, x=[float("nan"), 0.0], u=[0.0], h=[0.0, 0.0])
         long = Sample(seq=9, x=[0.0] * 3, u=[0.0], h=[0.0, 0.0])
@@ -47,7 +47,7 @@ def test_bad_messages_are_counted_and_stop_nothing(config: Config) -> None:
         )
         controller.seq = 5
         health = controller.until(lambda h: h.counters["adopted"] >= 1, tick=True)
-        foreign.close()
+        session.close()
         for key in (
             "bad_controller_samples_malformed",
             "bad_controller_output_weights_malformed",

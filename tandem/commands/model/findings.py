@@ -202,7 +202,7 @@ def _start(model: Model, x0: np.ndarray) -> Finding:
         for i in np.flatnonzero(rows.beyond(x0) > 0.0)
     ]
     if outside:
-        return Finding("note", "x0", f"outside X:  {'; '.join(outside)}")
+        return Finding("note", "x0", f"outside X: {'; '.join(outside)}")
     return Finding("ok", "x0", "in X")
 
 

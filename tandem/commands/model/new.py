@@ -16,7 +16,7 @@ class ModelNew(Command):
     """Write a plant file to start from, with comments; it runs without changes."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.py")]
-    """Its name."""
+    """Name of the new file."""
 
     def run(self) -> int:
         from importlib.resources import files

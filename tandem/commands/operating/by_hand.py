@@ -26,7 +26,7 @@ RENEWALS = 3
 """Share of a lease: two messages may be lost."""
 HEARD_S, HEARD_PERIODS = 2.0, 4.0
 HEALTH_S = 0.7
-"""Seconds. A little more than the interval of health messages."""
+"""Seconds: a little more than the interval of health messages."""
 LOOK_S = 0.1
 LONGEST_S = 1e8
 ENDED = 1
@@ -57,7 +57,7 @@ class ByHand(Configured):
     """A command that stays in the foreground while its message counts."""
 
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="(default: until Ctrl-C)")] = None
-    """For how long."""
+    """Duration in seconds."""
 
     def run(self) -> int:
         config, plant = self.resolve_with_plant()
@@ -128,7 +128,7 @@ class ByHand(Configured):
 
 @dataclass(frozen=True, kw_only=True)
 class Manual(ByHand):
-    """Drive a running plant manually, until Ctrl-C or until it would leave X. The controller goes on learning, and
+    """Drive a running plant manually, until Ctrl-C or until it would leave X. The controller continues to learn, and
     takes over at the end. With certificates it needs the commander's."""
 
     inputs: Annotated[Positional[list[str]], arg(metavar="INPUT=VALUE...")]

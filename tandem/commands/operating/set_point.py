@@ -79,7 +79,7 @@ class SetPoint(Configured):
 
 
 def answer(result: m.TickResult) -> dict[str, object]:
-    """What `--json` prints."""
+    """Return the object that `--json` prints."""
     return {
         "tick": result.seq,
         "reference": result.reference,
@@ -89,7 +89,7 @@ def answer(result: m.TickResult) -> dict[str, object]:
 
 
 def words(result: m.TickResult, course: str = "") -> str:
-    """Return the controller's answer for a person; `course` says where a moving reference goes."""
+    """Return the answer as text for a person; `course` says where a moving reference goes."""
     now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
     if not now:
         return f"taken in tick {result.seq}: the target is the equilibrium again"

@@ -207,7 +207,7 @@ def _meaning(sets: CertifiedSets, model: Model) -> str:
     given = certificate.source_of_W == "given"
     text = (
         f"From every state of {'this set' if count == 1 else f'these {count} sets'} the inputs of U can keep the plant "
-        f"in {'it' if count == 1 else 'them'}, and so in X, at all times:  {certificate.model.plant} at "
+        f"in {'it' if count == 1 else 'them'}, and so in X, at all times: {certificate.model.plant} at "
         f"{1 / certificate.model.period:g} Hz, "
     )
     if not given:

@@ -1,4 +1,4 @@
-"""Which addresses of a scheduler are used: workers run whatever code they are sent."""
+"""Checks the address of a scheduler, because workers run any code that they receive."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXAMPLES = "tcp://127.0.0.1:8786 on this machine, tls://HOST:8786 on another one
 
 
 def checked(address: str) -> str:
-    """The address with its protocol.
+    """Return the address with its protocol.
 
     Raises:
         ConfigError: not an address, or one beyond this machine without TLS.

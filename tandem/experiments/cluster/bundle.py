@@ -1,4 +1,4 @@
-"""The files that a configuration names, for a machine that does not have them."""
+"""The files of a configuration, for a machine that does not have them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from node_runtime.config.strict import ConfigError
 from node_runtime.whole_file import read_regular, write_whole
 
 LARGEST = 32 * 2**20
-"""Bytes in all."""
+"""Largest total size in bytes."""
 REMEDY = "move the file that the configuration names to a folder of its own"
 
 
 class Bundle(msgspec.Struct, frozen=True):
-    """Files by folder and name; folders as the client names them."""
+    """Files by folder and name; folders have the client's paths."""
 
     folders: dict[str, dict[str, bytes]]
 
@@ -29,9 +29,9 @@ class Bundle(msgspec.Struct, frozen=True):
 
 
 def gather(configs: Iterable[Config]) -> Bundle:
-    """What the configurations need: of a file with code its folder without those below it, of certified sets the file.
+    """Return the files of the configurations: the folder of a file with code, without subfolders, and files of sets.
 
-    A file with code may import its neighbours and read data beside it. Hidden files stay.
+    A file with code may import and read other files of its folder. Hidden files are left out.
 
     Raises:
         ConfigError: they are too large, or certified sets are needed and not named.
@@ -51,7 +51,7 @@ def gather(configs: Iterable[Config]) -> Bundle:
             total += path.stat().st_size
             if total > LARGEST:
                 raise ConfigError(
-                    f"{folder}: its files would travel to the workers, and they are more than {LARGEST >> 20} MiB; "
+                    f"{folder}: its files must be sent to the workers, and they exceed {LARGEST >> 20} MiB; "
                     f"{REMEDY}"
                 )
             files[path.name] = _read(path)
@@ -68,7 +68,7 @@ def unpack(bundle: Bundle, root: Path) -> None:
 
 
 def moved(config: Config, root: Path) -> Config:
-    """The configuration with its files where `unpack` has put them."""
+    """Return the configuration with the paths to which `unpack` has written its files."""
 
     def new(path: str) -> str:
         return str(_place(root, str(Path(path).parent)) / Path(path).name)
@@ -95,7 +95,7 @@ def _place(root: Path, folder: str) -> Path:
 
 
 def _code(config: Config) -> dict[str, str]:
-    """Paths of files with code, by key."""
+    """Return the paths of files with code, by key."""
     found = {}
     for key in ("plant.model", "plant.truth", "network.architecture"):
         text = getattr(*_owner(config, key))

@@ -1,4 +1,4 @@
-"""What a worker's child process does. The worker itself imports no science, so imports stand in the functions."""
+"""Functions of a worker's child process. They contain their imports, because the worker itself imports no science."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ NEEDED = ("torch", "mcap", "zstandard", "matplotlib", "jinja2")
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker is."""
+    """Facts about a worker."""
 
     code: str
-    """`code_version`, of code and packages."""
+    """`code_version` of code and packages."""
     versions: dict[str, str]
     missing: list[str]
     """Packages of the extra `experiment` that it does not have."""
 
 
 def facts() -> Facts:
-    """Facts of this process. A worker may have been started before its packages were changed; a child is new."""
+    """Return the facts of this process. A worker may be older than its packages, but a child process is new."""
     from node_runtime import provenance
     from tandem.experiments.study.plan import PACKAGES, code_version
 
@@ -35,7 +35,7 @@ def facts() -> Facts:
 
 
 def make(task: bytes, root: Path) -> bytes:
-    """The `Done` of a `Task`, both pickled. root: where the client's files are."""
+    """Run a pickled `Task` and return its pickled `Done`. root: folder of the client's files."""
     from tandem.experiments.cluster.bundle import moved
     from tandem.experiments.study.work import Task, work
 

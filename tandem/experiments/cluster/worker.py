@@ -1,4 +1,4 @@
-"""What a Dask worker does: it takes the client's files, says what it is, and has its child processes make runs."""
+"""Functions of a Dask worker: it stores the client's files, reports its facts, and makes runs in child processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PREPARING = Limits(seconds=300.0)
 
 
 def prepare(bundle: Bundle) -> Facts | Failure:
-    """Put the client's files on this worker, and say what it is."""
+    """Write the client's files on this worker, and return its facts."""
     root = _root(bundle.sha256)
     unpack(bundle, root)
     with _children(root).one() as child:
@@ -25,7 +25,7 @@ def prepare(bundle: Bundle) -> Facts | Failure:
 
 
 def perform(task: bytes, limits: Limits, bundle: str) -> bytes | Failure:
-    """Make one run, unless it is cancelled meanwhile; a pickled `Task` comes in and a pickled `Done` goes out.
+    """Make one run from a pickled `Task`, unless it is cancelled meanwhile; return a pickled `Done`.
 
     bundle: the hash of the client's files.
     """
@@ -52,5 +52,5 @@ def _root(bundle: str) -> Path:
 
 @cache
 def _children(root: Path) -> Children:
-    """Of this worker process, for one client's files: what a child has imported from them stays in it."""
+    """Return the child processes for one client's files. A child keeps the modules that it has imported from them."""
     return Children()

@@ -1,7 +1,7 @@
-"""Runs on the workers of a Dask scheduler: what `run_all` needs of a workplace, over `dask.distributed`.
+"""Runs on the workers of a Dask scheduler: a workplace for `run_all` over `dask.distributed`.
 
-A worker gets runs when it has shown that it has the client's code and packages. Dask hands a run to another worker when
-its worker dies. When the scheduler is gone, the runs that were under way are lost, and are made again after it is back.
+A worker gets runs if it has the client's code and packages. If it dies, Dask gives its run to another worker. If the
+scheduler dies, unfinished runs are lost and repeated when it is back.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from tandem.experiments.study.work import Task
 
 CONNECT_S = 10.0
 PATIENCE_S = 300.0
-"""How long a sweep waits for a scheduler that is gone, or for a worker."""
+"""Seconds for which a sweep waits for a lost scheduler, or for a worker."""
 LOOK_S = 1.0
-"""How often the workers are counted."""
+"""Interval between two counts of the workers, seconds."""
 KEPT = "the finished runs are kept; the same command continues from there"
 
 
@@ -42,7 +42,7 @@ class Cluster:
     Args:
         address: as `address.checked` returns it.
         bundle: the files that the runs need.
-        notice: told which workers come, go and are refused, in a sentence for a person.
+        notice: gets a sentence for each worker that joins, leaves or is refused.
         patience: seconds without a scheduler or a usable worker until the sweep ends.
 
     Raises:
@@ -56,13 +56,13 @@ class Cluster:
         notice: Callable[[str], None] = lambda text: None,
         patience: float = PATIENCE_S,
     ):
-        # What happens is told in sentences, and not by Dask's own loggers as well.
+        # `notice` reports events, so Dask's own loggers are silenced.
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         self._address, self._bundle, self._notice, self._patience = address, bundle, notice, patience
         self._accepted: dict[str, int] = {}
-        """Threads by address."""
+        """Number of threads, by address."""
         self._folders: dict[str, str] = {}
-        """Each known worker's own folder by address: another one means that the worker was started again."""
+        """Folder of each known worker, by address. Another folder means that the worker was restarted."""
         self._preparing: dict[str, DaskFuture] = {}
         self._refused: dict[str, str] = {}
         self._under_way: dict[DaskFuture, tuple[Future[Answer], set[str]]] = {}
@@ -72,12 +72,12 @@ class Cluster:
             self._client = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, RuntimeError) as error:
             raise RunnerError(
-                f"no Dask scheduler answers at {address}: is the address right, and is `dask scheduler` running? "
-                f"({error})"
+                f"no Dask scheduler answers at {address}: check the address, and that `dask scheduler` "
+                f"runs there ({error})"
             ) from error
 
     def room(self) -> int:
-        """Two runs for each thread of a worker, so that none waits for the next one."""
+        """Return two runs for each thread of a worker, so that no thread waits for the next run."""
         now = monotonic()
         if now - self._looked >= LOOK_S or not self._accepted:
             self._looked = now
@@ -94,7 +94,7 @@ class Cluster:
 
     def submit(self, task: Task) -> Future[Answer]:
         future: Future[Answer] = Future()
-        # A run that a worker may have begun cannot be taken back.
+        # A run that a worker may have begun cannot be withdrawn.
         future.set_running_or_notify_cancel()
         workers = list(self._accepted)
         try:
@@ -113,14 +113,14 @@ class Cluster:
         return future
 
     def close(self) -> None:
-        """Cancel what is under way, and leave the cluster as it was."""
+        """Cancel all unfinished runs, and leave the cluster unchanged."""
         with contextlib.suppress(OSError, RuntimeError, asyncio.CancelledError):
             if self._client.status == "running":
                 self._client.cancel(list(self._under_way), force=True)
             self._client.close(timeout=5)
 
     def _done(self, sent: DaskFuture) -> None:
-        """In a thread of Dask's."""
+        """Handle a finished run, in a thread of Dask."""
         future, _workers = self._under_way.pop(sent, (None, None))
         if future is None:
             return
@@ -135,13 +135,13 @@ class Cluster:
     # -- workers ---------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Find out which workers there are, have new ones prepared, and forget those that are gone."""
+        """Update the list of workers: prepare new ones and forget lost ones."""
         there = self._workers()
         folders = {address: info["local_directory"] for address, info in there.items()}
         new = {address for address in folders if folders[address] != self._folders.get(address)}
         for address in [address for address in self._accepted if address not in there or address in new]:
             del self._accepted[address]
-            self._notice(f"worker {address} is gone; {len(self._accepted)} left")
+            self._notice(f"worker {address} is lost; {len(self._accepted)} left")
         for known in (self._refused, self._preparing):
             for address in [address for address in known if address not in there or address in new]:
                 del known[address]
@@ -157,7 +157,7 @@ class Cluster:
         self._drop_stranded()
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """By address; none while the scheduler is gone. Raises `RunnerError`: it stays away."""
+        """Return the workers by address; none while the scheduler is lost. Raises `RunnerError` if it stays lost."""
         gone, said = monotonic(), False
         while monotonic() - gone < self._patience:
             found = self._ask()
@@ -167,14 +167,14 @@ class Cluster:
                 return found
             if not said:
                 said = True
-                self._notice(f"the scheduler at {self._address} is gone; waiting for it")
+                self._notice(f"the scheduler at {self._address} is lost; waiting for it")
             sleep(LOOK_S)
-        raise RunnerError(f"the scheduler at {self._address} was gone for {self._patience:.0f} s; {KEPT}")
+        raise RunnerError(f"the scheduler at {self._address} was lost for {self._patience:.0f} s; {KEPT}")
 
     def _ask(self) -> dict[str, dict[str, Any]] | None:
-        """The workers as the scheduler says now; None where it does not answer."""
+        """Return the workers that the scheduler reports now; None if it does not answer."""
         try:
-            # A client tries to connect again for some seconds, and then closes itself.
+            # A client tries to reconnect for some seconds, and then closes.
             if self._client.status != "running":
                 self._lose_all()
             if self._client.status == "closed":
@@ -189,7 +189,7 @@ class Cluster:
         return workers
 
     def _lose_all(self) -> None:
-        """Have all runs handed over again."""
+        """Let all runs be submitted again."""
         for sent in list(self._under_way):
             future, _workers = self._under_way.pop(sent, (None, None))
             if future is not None:
@@ -203,7 +203,7 @@ class Cluster:
         except asyncio.CancelledError:
             return
         except Exception as error:  # noqa: BLE001 - of a worker that lacks Tandem or is otherwise not like this process
-            why = f"Tandem does not run there: {type(error).__name__}: {error}"
+            why = f"Tandem does not run on it: {type(error).__name__}: {error}"
         if why is None:
             self._accepted[address] = info["nthreads"]
             self._notice(f"{name} has joined, {info['nthreads']} runs at a time")
@@ -212,16 +212,16 @@ class Cluster:
             self._notice(self._refused[address])
 
     def _drop_stranded(self) -> None:
-        """Have runs handed over again for which no worker is left that they were meant for."""
+        """Let runs be submitted again if none of their intended workers is left."""
         for sent, (_future, workers) in list(self._under_way.items()):
             if not workers & self._accepted.keys():
                 sent.cancel(force=True)
 
 
 def why_not(facts: Facts | Failure) -> str | None:
-    """Why a worker must not make runs; None: it has the code and the packages of this process."""
+    """Return why a worker must not make runs; None if it has the code and the packages of this process."""
     if isinstance(facts, Failure):
-        return f"Tandem does not run there: {facts.text}"
+        return f"Tandem does not run on it: {facts.text}"
     ours = provenance.versions(PACKAGES)
     other = [
         f"{name} {facts.versions.get(name) or 'is missing'}, here {ours.get(name) or 'none'}"
@@ -237,14 +237,14 @@ def why_not(facts: Facts | Failure) -> str | None:
 
 
 def _require_certificates(address: str) -> None:
-    """Raises `RunnerError`: Dask's configuration has no certificates that can be used, and the address needs some."""
+    """Raises `RunnerError` if the address needs certificates and Dask's configuration has no usable ones."""
     if not address.startswith("tls"):
         return
     why = "distributed.comm.tls has no ca-file"
     try:
         if Security().get_connection_args("client").get("ssl_context") is not None:
             return
-    except (OSError, ValueError) as error:  # a file is not there, or is no certificate
+    except (OSError, ValueError) as error:  # a file is missing, or is not a certificate
         why = str(error)
     raise RunnerError(
         f"{address} needs certificates, and Dask's configuration has none that can be used ({why}): name them in "

@@ -13,10 +13,10 @@ from tandem.experiments.reporting.charts import Chart, Line
 from tandem.experiments.reporting.style import figure, legend_above
 
 NEAR = 0.6
-"""A bound is drawn when it is this near the lines, as a share of what they span."""
+"""Largest distance of a drawn bound from the lines, as a share of their range."""
 
 LONG = 26
-"""Characters of a label, from which on the legend has one column."""
+"""Length of a label from which the legend has one column."""
 
 
 def chart_figure(chart: Chart) -> Figure:

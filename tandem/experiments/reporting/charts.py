@@ -20,7 +20,7 @@ DIGITS = 5
 
 
 class Line(NamedTuple):
-    """A line, with a band around it where several runs stand behind it."""
+    """A line, with a band around it if it stands for several runs."""
 
     label: str
     look: Look
@@ -32,7 +32,7 @@ class Line(NamedTuple):
     high: np.ndarray | None = None
     """(n,) the smallest and the largest value of all runs."""
     runs: int = 1
-    """Behind the line, where they differ."""
+    """Number of runs behind the line, if they differ."""
 
     @property
     def legend(self) -> str:
@@ -54,18 +54,18 @@ class Chart(NamedTuple):
     y_label: str
     lines: list[Line]
     scale: str = "linear"
-    """Of y: "linear", "log", or "asinh", which is linear near 0 and logarithmic beyond."""
+    """Scale of y: "linear", "log", or "asinh", which is linear near 0 and logarithmic beyond."""
     linear_up_to: float = 1.0
-    """Of "asinh"."""
+    """End of the linear range of "asinh"."""
     ticks: list[float] | None = None
-    """Of y; None leaves them to the plot."""
+    """Ticks of y; None: chosen by the plot."""
     levels: tuple[Level, ...] = ()
     bounds: tuple[float, float] | None = None
-    """The region outside is shaded, where it is near the lines."""
+    """Bounds. The region outside is shaded if it is near the lines."""
     span: tuple[float, float] | None = None
-    """A part of the x axis that is marked."""
+    """Marked part of the x axis."""
     whole: bool = False
-    """Whether x counts something, and takes whole numbers alone."""
+    """Whether x is a count, with whole numbers only."""
 
 
 class Picture(NamedTuple):
@@ -77,9 +77,9 @@ class Picture(NamedTuple):
 
 
 def of_runs(result: CaseResult, look: Look, values: list[np.ndarray]) -> Line | None:
-    """Return the median of several runs over time, with the band of all of them; None where there is no run.
+    """Return the median of several runs over time, with the band of all of them; None if there is no run.
 
-    values: one (n,) for each run, from the start on.
+    values: one (n,) for each run, from the start.
     """
     if not values:
         return None
@@ -125,7 +125,7 @@ def reduced(line: Line, most: int = MOST) -> Line:
 
 
 def to_page(chart: Chart) -> dict[str, Any]:
-    """Return what the script of the page draws, as plain values for JSON. Lines share one x, with null where absent."""
+    """Return the chart as plain values for the page's script. Lines share one x; missing values are null."""
     lines = [reduced(line) for line in chart.lines]
     x = np.unique(np.concatenate([line.x for line in lines])) if lines else np.empty(0)
 
@@ -133,7 +133,7 @@ def to_page(chart: Chart) -> dict[str, Any]:
         if values is None:
             return None
         found = np.full(len(x), np.nan)
-        # A logarithmic axis has no place for 0.
+        # A logarithmic axis cannot show 0.
         found[np.searchsorted(x, line.x)] = (
             np.where(values > 0, values, np.nan) if chart.scale == "log" else values
         )
@@ -174,5 +174,5 @@ def _rounded(value: float) -> float | None:
 
 
 def _dash(look: Look) -> list[float]:
-    """In pixels, from Matplotlib's "-" or (offset, lengths)."""
+    """Return the dashes in pixels, from Matplotlib's "-" or (offset, lengths)."""
     return [] if look["linestyle"] == "-" else [2.0 * length for length in look["linestyle"][1]]

@@ -1,4 +1,4 @@
-"""Charts of the regret by episode: what is left to learn when the plant starts again."""
+"""Charts of the regret by episode, which show the learning that remains after restarts of the plant."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LARGEST = 1000.0
 
 
 def episodes(results: list[CaseResult]) -> list[Picture]:
-    """J above that of the true h: a line for each oracle, a chart for each combination of all else that varies."""
+    """Return the charts of J relative to the true h: a line per oracle, a chart per combination of the other values."""
     panels: dict[str, list[CaseResult]] = {}
     for result in results:
         if result.oracle != "perfect":
@@ -69,7 +69,7 @@ def _chart(title: str, members: list[CaseResult], what: str) -> Chart:
 
 
 def _regret(result: CaseResult) -> np.ndarray:
-    """(runs, episodes) percent; NaN where the plant was lost."""
+    """Return the regret in percent, (runs, episodes); NaN if the plant was lost."""
     regret = [[np.nan if one is None else 100 * one for one in row.regret_by_episode] for row in result.rows]
     return np.minimum(np.array(regret), LARGEST)
 

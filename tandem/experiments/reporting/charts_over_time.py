@@ -43,7 +43,7 @@ def _state(results: list[CaseResult], plant: Description, i: int) -> Chart:
 
 
 def _whole(result: CaseResult) -> list[Traces]:
-    """Of the runs in which the plant was not lost."""
+    """Return the traces of the runs in which the plant was not lost."""
     return [r.traces for r in result.records if r.traces is not None and r.lost is None]
 
 
@@ -101,7 +101,7 @@ def recovery(results: list[CaseResult], plant: Description) -> list[Picture]:
 
 
 def _change(result: CaseResult, plant: Description) -> tuple[tuple[float, float] | None, str]:
-    """When the plant changes, in seconds, and how."""
+    """Return the times of the plant's changes, in seconds, and their descriptions."""
     drift = result.case.faults.drift
     if drift is None:
         return None, "no change of the plant"

@@ -43,7 +43,7 @@ def what_varies(members: list[CaseResult], plant: Description) -> str:
 
 
 def _entry(values: list[Any]) -> int | None:
-    """The entry in which lists of numbers differ most; None where the values are not such lists."""
+    """Return the index at which lists of numbers differ most; None if the values are not such lists."""
     try:
         numbers = np.array(values, dtype=float)
     except (TypeError, ValueError):

@@ -151,7 +151,7 @@ def _times(linear: CaseResult, l2nw: CaseResult, dnn: CaseResult) -> list[Claim]
 
 
 def compare(results: list[CaseResult], reference: str | None) -> list[Comparison]:
-    """Compare each case with the reference; empty where the reference is not among the results."""
+    """Compare each case with the reference; empty if the reference is not among the results."""
     base = next((result for result in results if result.case.name == reference), None)
     if base is None:
         return []
@@ -188,7 +188,7 @@ def _differences(result: CaseResult, base: CaseResult) -> list[str]:
 
 
 def below_perfect(results: list[CaseResult]) -> list[str]:
-    """Say in how many runs J is below that of the true h."""
+    """Return a sentence on the number of runs whose J is below that of the true h."""
     below = {
         result.label: values[values < -BELOW]
         for result in results
@@ -208,7 +208,7 @@ def below_perfect(results: list[CaseResult]) -> list[str]:
 
 
 def survival(results: list[CaseResult]) -> list[str]:
-    """For each family, the most runs kept and at which value, and how many at the last value."""
+    """Return for each family the largest number of kept runs with its value, and the number at the last value."""
     said = []
     for members in by_family(results).values():
         at, shares = places(members), [member.kept for member in members]
@@ -228,7 +228,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def kept(result: CaseResult) -> str:
-    """How many runs keep all constraints at samples, as "3 of 4"."""
+    """Return the number of runs that keep all constraints at samples, such as "3 of 4"."""
     return f"{sum(record.kept for record in result.records)} of {len(result.records)}"
 
 

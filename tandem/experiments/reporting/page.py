@@ -33,10 +33,10 @@ class Drawn(NamedTuple):
     """One picture on the page: a chart, or an image where `uri` is not empty, or a caption alone."""
 
     chart: str
-    """JSON for the script of the page; empty where it is no chart."""
+    """JSON for the script of the page; empty if it is not a chart."""
     uri: str
     png: bytes
-    """Empty where the picture could not be drawn; the caption says why."""
+    """PNG; empty if the picture could not be drawn. The caption gives the reason."""
     caption: str
     alt: str
 
@@ -154,7 +154,7 @@ def _drawn(picture: pictures.Picture) -> Drawn:
     if isinstance(shown, Chart):
         return Drawn(_json(to_page(shown)), "", style.png(chart_figure(shown)), picture.caption, picture.alt)
     png = style.png(shown)
-    # The layout is found: to find it again takes as long as to draw.
+    # The layout is known; computing it again would take as long as drawing.
     shown.set_layout_engine("none")
     return Drawn("", style.data_uri(shown), png, picture.caption, picture.alt)
 
@@ -169,17 +169,17 @@ def _named_pictures(part: Part) -> list[tuple[str, bytes]]:
 
 
 def _json(values: Any) -> str:
-    """JSON that may stand inside a script element: no text in it can end the element."""
+    """Return JSON for a script element: no text in it can end the element."""
     return msgspec.json.encode(values).decode().replace("<", "\\u003c")
 
 
 def _prose(text: str) -> Markup:
-    """Text of the experiment's file, with what stands between backticks as code."""
+    """Return text of the experiment's file as HTML, with text in backticks as code."""
     code = Markup("<code>{}</code>").format
     parts = " ".join(text.split()).split("`")
     return Markup("").join(code(part) if i % 2 else escape(part) for i, part in enumerate(parts))
 
 
 def _text(name: str) -> str:
-    """A file of the package, by its path below `tandem`."""
+    """Return a file of the package by its path below `tandem`."""
     return (files("tandem") / name).read_text("utf-8")

@@ -1,4 +1,4 @@
-"""Pictures of a group: which it has, and the static ones, which show distributions over runs."""
+"""Pictures of a group: their selection, and the static ones, which show distributions over runs."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from tandem.experiments.study.results import CaseResult
 WIDE = 50.0
 """Percent of regret. Beyond it the axis is logarithmic, except for the first percent on either side of 0."""
 MOST = 40
-"""Cases that one picture shows."""
+"""Largest number of cases in one picture."""
 STROKES = 100
-"""Runs of a case that are drawn one by one; of more, the quantiles."""
+"""Largest number of runs of a case that are drawn singly; for more, quantiles are drawn."""
 
 
 def draw(kind: Kind, results: list[CaseResult], plant: Description, reference: str | None) -> list[Picture]:
@@ -116,7 +116,7 @@ def _strip(ax: Axes, i: int, result: CaseResult, values: np.ndarray, right: floa
 
 
 def _regret_scale(ax: Axes, finite: np.ndarray, name: str) -> None:
-    """A logarithmic axis where the values differ widely."""
+    """Make the axis logarithmic if the values differ widely."""
     if finite.min() > 0 and finite.max() > 6 * finite.min():
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter("{x:g}")
@@ -140,7 +140,7 @@ def _wrapped(label: str) -> str:
 
 
 def states(results: list[CaseResult], plant: Description) -> list[Picture]:
-    """Each initial state at its place: kept in every run, in some runs, or in none."""
+    """Draw each initial state: constraints kept in every run, in some runs, or in none."""
     first, *more = [*plant.performance, *(i for i in range(plant.d) if i not in plant.performance)]
     second = more[0] if more else None
     columns = 2
@@ -193,7 +193,7 @@ def _axis(plant: Description, i: int) -> str:
 
 
 def _frame(plant: Description, i: int) -> tuple[float | None, float | None]:
-    """A state's bounds; None where the state has none."""
+    """Return the bounds of a state; None if it has none."""
     low, high = (float(bound[i]) if np.isfinite(bound[i]) else None for bound in (plant.x_min, plant.x_max))
     return low, high
 
@@ -205,12 +205,12 @@ def survival(results: list[CaseResult], plant: Description) -> list[Picture]:
     heads = [members[0] for members in families.values()]
     at_first = places(next(iter(families.values())))
     for i, (members, look) in enumerate(zip(families.values(), looks(heads), strict=True)):
-        # Side by side, because many lie on each other.
+        # Side by side, because many points coincide.
         at = np.arange(len(members)) + 0.07 * (i - (len(heads) - 1) / 2)
         runs = len(members[0].rows)
         label = words(f"{family_label(members[0])} ({runs} {'run' if runs == 1 else 'runs'} each)")
         ax.plot(at, [100 * one.kept for one in members], **look, markersize=5, linewidth=1.4, label=label)
-    # Even steps, because the values crowd at the small end.
+    # Equal steps, because most values are small.
     ax.set_xticks(range(len(at_first)), [words(place) for place in at_first])
     ax.set_ylim(-4, 104)
     ax.set_ylabel("runs that keep all constraints (%)")

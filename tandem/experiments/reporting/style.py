@@ -63,13 +63,13 @@ def figure(height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, list
 
 
 def legend_above(ax: Axes, height: float = 1.0, columns: int = 2, space: float = 0.2) -> None:
-    """Put the legend above the axes, where it hides nothing."""
+    """Put the legend above the axes, where it hides no data."""
     place: Any = {"loc": "lower left", "bbox_to_anchor": (0, height), "borderaxespad": space}
     ax.legend(**place, ncols=columns, frameon=False, fontsize=8.5)
 
 
 def full_name(plant: Description, index: int) -> str:
-    """Return the name of a state in words, where the plant has them."""
+    """Return the long name of a state; its short name if the plant has none."""
     return printable(plant.names.get(plant.states[index], plant.states[index]))
 
 

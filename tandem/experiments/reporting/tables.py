@@ -1,4 +1,4 @@
-"""Tables of the report, and the sentences that say what was run."""
+"""Tables of the report, and the sentences about the runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tandem.experiments.study.declaration import Group
 from tandem.experiments.study.results import CaseResult, spread
 
 MISLEADS = 0.01
-"""A median regret below minus this share shows that the true h has not the least J."""
+"""A median regret below minus this share shows that the true h does not have the smallest J."""
 SETTINGS = 4
-"""Different lengths of runs that the sentence names; of more, the number."""
+"""Largest number of run lengths that the sentence names; for more, it gives their number."""
 
 
 class Column(NamedTuple):
     above: str
-    """Heading over several columns; empty where the column stands alone."""
+    """Heading over several columns; empty for a single column."""
     name: str
     cells: list[str]
 
@@ -108,12 +108,12 @@ def survival_table(results: list[CaseResult], plant: Description) -> Table:
 
 
 def size(results: list[CaseResult]) -> str:
-    """Say how many cases and runs there are."""
+    """Return a sentence on the number of cases and runs."""
     return f"{counted(len(results), 'case')}, {counted(sum(len(result.rows) for result in results), 'run')}"
 
 
 def ran(results: list[CaseResult]) -> str:
-    """Say what was run: cases, runs, seeds, initial states, length."""
+    """Return sentences on cases, runs, seeds, initial states and lengths."""
     said = [f"{size(results)}."]
     drawing = [result for result in results if result.case.draws]
     if drawing:
@@ -153,7 +153,7 @@ def _seeds(seeds: list[int]) -> str:
 
 
 def headline(group: Group, results: list[CaseResult]) -> str:
-    """The result of a group in one line."""
+    """Return the result of a group in one line."""
     if group.picture == "survival":
         shares = {
             family_label(members[0]): (
@@ -176,7 +176,7 @@ def headline(group: Group, results: list[CaseResult]) -> str:
     learned = [result for result in results if result.oracle != "perfect"]
     name = "regret" if any(row.regret is not None for result in results for row in result.rows) else "J"
     if name == "regret" and any(result.median("regret") < -MISLEADS for result in learned):
-        # The true h is no floor of J here.
+        # The true h does not give the smallest J here.
         name = "deviation"
     known = {r.label: r.median(name) for r in (learned if name == "regret" else results)}
     shown = {
@@ -191,7 +191,7 @@ def headline(group: Group, results: list[CaseResult]) -> str:
 
 
 def _extremes(shown: dict[str, tuple[float, str]], what: str) -> str:
-    """Name the lowest and the highest of what is ordered by the number beside the text."""
+    """Name the lowest and the highest value. shown: (number, text) by name."""
     if not shown:
         return "–"
     low, high = min(shown, key=lambda name: shown[name][0]), max(shown, key=lambda name: shown[name][0])

@@ -1,4 +1,4 @@
-"""Faults of a run that the paper leaves out and a user meets."""
+"""Faults of a run that occur in practice and are not in the paper."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RAMP_PIECES = 20
 
 
 class Drift(Section, frozen=True):
-    """The true plant's parameters change linearly in time and stay at their final values; no model is told."""
+    """The true plant's parameters change linearly in time and stay at their final values; the model does not change."""
 
     to: dict[str, float]
     """Final values by name, of the plant's `parameters`."""
@@ -21,7 +21,7 @@ class Drift(Section, frozen=True):
     """Duration of the change in seconds; 0: a step."""
 
     def plants(self, plant: Known | Plant | TrueMotion) -> list[tuple[float, Plant]]:
-        """(from this time on, this plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError`: no such parameter."""
+        """Return (start time, plant), a ramp in `RAMP_PIECES` steps. Raises `KeyError` for an unknown parameter."""
         if not isinstance(plant, Plant):
             raise KeyError("the true plant has no equations, and so no parameter can drift")
         pieces = RAMP_PIECES if self.over > 0 else 1

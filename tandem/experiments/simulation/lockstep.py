@@ -1,9 +1,9 @@
 """Lock-step simulation: the real controller, trainer and plant in one process, on a virtual clock.
 
-Deterministic for a seed: a tick's state is the plant's sample at exactly that time, its command acts from that time
-on and a training takes no time unless `Faults` say so, and its weights arrive at the next tick after it.
+The simulation is deterministic for a seed. The state of a tick is the plant's sample at exactly that time. Its command
+acts from that time on, a training takes no time unless `Faults` set one, and its weights arrive at the next tick.
 
-Each episode is a plant that was started again at x0; controller and trainer go on with all they have learned.
+In each episode the plant restarts at x0; controller and trainer keep their memory.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def simulate(
     episodes: int = 1,
     set_points: m.Reference | None = None,
 ) -> Run:
-    """`follow`, without faults, for a plant that is not lost.
+    """Run `follow` without faults; raise an error if the plant is lost.
 
     Raises:
-        ConfigError: the configuration admits no controller.
+        ConfigError: the configuration does not give a controller.
         PlantError: the true plant left every state from which its equations can be followed.
     """
     outcome = follow(config, steps, progress=progress, episodes=episodes, set_points=set_points)
@@ -88,13 +88,13 @@ def follow(
     Args:
         config: the resolved configuration.
         steps: ticks of each episode.
-        faults: what goes wrong; its times count from the first episode on.
-        progress: told the number of finished steps, of all episodes.
-        episodes: how often the plant is started.
-        set_points: where the plant shall go from the beginning of each episode on; None: as configured.
+        faults: the faults; their times count from the begin of the first episode.
+        progress: called with the number of finished steps of all episodes.
+        episodes: number of starts of the plant.
+        set_points: the reference from the begin of each episode; None: the configured one.
 
     Raises:
-        ConfigError: the configuration admits no controller, or the faults do not fit the plant.
+        ConfigError: the configuration does not give a controller, or the faults do not fit the plant.
     """
     with one_blas_thread():
         return drive(LockStep(config, faults, set_points=set_points), steps, progress, episodes)
@@ -136,12 +136,12 @@ class LockStep:
 
     Args:
         config: the resolved configuration.
-        faults: what goes wrong.
-        given: objects that stand for the plant of the configuration and for its truth.
+        faults: the faults of the run.
+        given: objects that replace the configured plant and its truth.
         set_points: as of `follow`.
 
     Raises:
-        ConfigError: the configuration admits no controller, or the faults do not fit the plant.
+        ConfigError: the configuration does not give a controller, or the faults do not fit the plant.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class LockStep:
         settings = config.controller
         self.way_back = WayBack(self.core.controller.model, settings.backup.margin, settings.horizon)
         self.acting = self.core.plant.safe_input
-        """The input, (m,), that the last step gave the plant."""
+        """Input, (m,), of the last step."""
         self.plant = self._started_plant(initial_state(config, self.core.plant))
         self.changes = self._changes()
         self.sensors = Sensors(config, self.core.plant)
@@ -213,9 +213,9 @@ class LockStep:
         )
 
     def so_far(self, lost: bool = False) -> Run:
-        """What a recorder would have seen until now. Nothing changes: the loop can go on.
+        """Return the messages that a recorder would have received so far. The loop can continue.
 
-        lost: without where the last command has led the plant.
+        lost: without the state after the last command.
 
         Raises:
             PlantError: the true motion cannot be followed to the end of the last period.
@@ -228,11 +228,11 @@ class LockStep:
         return run
 
     def manual(self, u: np.ndarray) -> None:
-        """From the next sample on u, (m,), plant units, acts manually: until `auto`, or until X would be left."""
+        """Let u, (m,), plant units, act manually from the next sample until `auto`, or until X would be left."""
         self._override(self.person.manual(u), self.taken * self.config.period)
 
     def auto(self) -> None:
-        """From the next sample on the controller's commands act again."""
+        """Let the controller's commands act again from the next sample."""
         self._override(self.person.auto(), self.taken * self.config.period)
 
     def _override(self, word: m.Override, t: float) -> None:
@@ -240,31 +240,31 @@ class LockStep:
         self._note(topics.OVERRIDE, word, self.taken)
 
     def start_again(self, lost: bool = False) -> None:
-        """Begin another episode: the plant is at x0 again. Argument and errors are those of `so_far`."""
+        """Begin another episode at x0. Argument and errors are those of `so_far`."""
         self.log += [] if lost else self._end()
         self.episode, self.began, self.elsewhere = self.episode + 1, self.taken, False
         self.plant = self._started_plant(initial_state(self.config, self.core.plant))
         self.person.start_again()
 
     def ask(self, reference: m.Reference) -> None:
-        """Give a reference from the next period on."""
+        """Give a reference that holds from the next period."""
         self.person.ask(reference)
 
     def _end(self) -> list[tuple[Topic, m.Message, int]]:
-        """The state after the last command; unknown for a plant that moves elsewhere."""
+        """Return the state after the last command; unknown for an external plant."""
         if self.elsewhere:
             return []
         end = self.plant.look(self.taken * self.config.period)
         return [self._noted(topics.PLANT_STATE, end, self.taken)]
 
     def step(self, x: np.ndarray | None = None) -> tuple[m.PlantState, Outputs]:
-        """The next period, up to the command that acts in it.
+        """Run the next period, up to the command that acts in it.
 
         Args:
-            x: where the plant is, (d,), of one that moves elsewhere; None: where its true motion has led it.
+            x: state of an external plant, (d,); None: the simulated true motion gives it.
 
         Returns:
-            The plant's sample, without noise, and what the controller said to it.
+            The plant's sample, without noise, and the controller's messages.
 
         Raises:
             PlantError: the true plant left every state from which its equations can be followed.
@@ -318,7 +318,7 @@ class LockStep:
         return true, outputs
 
     def _arriving(self, seq: int) -> m.HiddenWeights | None:
-        """The newest hidden weights that have arrived."""
+        """Return the newest hidden weights that have arrived."""
         weights = None
         while self.on_the_way and self.on_the_way[0][0] <= seq:
             weights = self.on_the_way.pop(0)[1]
@@ -348,7 +348,7 @@ class LockStep:
         return dies is not None and seq * self.config.period > dies
 
     def _measured(self, true: m.PlantState) -> m.PlantState | None:
-        """The sample as its controller gets it; None if it is lost."""
+        """Return the sample that the controller gets; None if it is lost."""
         x = self.sensors.measure(np.array(true.x), true.t)
         return None if x is None else msgspec.structs.replace(true, **measurement(self.core.plant, x))
 

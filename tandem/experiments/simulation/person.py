@@ -22,7 +22,7 @@ class Person:
 
     Args:
         period: of the loop, seconds.
-        set_points: where the plant shall go from the beginning of each episode on; None: as configured.
+        set_points: the reference from the begin of each episode; None: the configured one.
     """
 
     def __init__(self, period: float, set_points: m.Reference | None):
@@ -33,15 +33,15 @@ class Person:
         """The message while the input acts manually."""
 
     def start_again(self) -> None:
-        """Another episode begins."""
+        """Begin another episode."""
         self._asked = self._set_points or self._asked
 
     def ask(self, reference: m.Reference) -> None:
-        """Give a reference from the next period on."""
+        """Give a reference that holds from the next period."""
         self._asked = reference
 
     def reference(self) -> m.Reference | None:
-        """The new message since the last call; None: there is none."""
+        """Return the new message since the last call; None if there is none."""
         if self._asked is None:
             return None
         said = msgspec.structs.replace(self._asked, run_id=f"{COMMANDER}-{self._references}", seq=0)
@@ -49,13 +49,13 @@ class Person:
         return said
 
     def manual(self, u: np.ndarray) -> m.Override:
-        """Begin to drive with u, (m,), plant units."""
+        """Begin manual control with u, (m,), plant units."""
         lease = lease_of(self._period)
         self.by_hand = m.Override(run_id=self._name(), seq=0, mode="manual", u=u.tolist(), lease=lease)
         return self.by_hand
 
     def auto(self) -> m.Override:
-        """Gives it back."""
+        """End manual control."""
         self.by_hand = None
         return m.Override(run_id=self._name(), seq=0, mode="auto")
 
@@ -64,9 +64,9 @@ class Person:
         return f"{COMMANDER}-hand-{self._intentions}"
 
     def renewals(self, hand: Hand, t: float) -> Iterator[tuple[m.Override, float]]:
-        """What is said, and when, in time for the period from t on; what has ended is said no more.
+        """Yield the repetitions of a manual input for the period from t, with their sending times; none after its end.
 
-        The plant whose `hand` this is takes each before the next is asked for.
+        The plant of `hand` must process each one before the next is requested.
         """
         if self.by_hand is None:
             return

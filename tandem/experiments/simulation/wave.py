@@ -13,9 +13,9 @@ from protocol import messages as m
 from tandem.operating.set_points import trajectory
 
 Values = Mapping[str, Sequence[float]]
-"""Values by the name of a state, plant units, one after the other in a cycle, equally long."""
+"""Set-points by state name, plant units: the values of a cycle, each of equal duration."""
 CLOSE = 1e-8
-"""Half-widths: an equilibrium may move by this much in a period, and miss its set-point by it."""
+"""Tolerance in half-widths for the motion at an equilibrium in one period, and for its distance from the set-point."""
 
 
 def require_fit(values: Values, plant: Description, where: str) -> None:
@@ -41,7 +41,7 @@ def require_fit(values: Values, plant: Description, where: str) -> None:
 
 
 def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
-    """`cycles` cycles of so many seconds, and one more, so that plans at the end of the last one have a preview."""
+    """Return the reference of `cycles` cycles of `seconds`, and one more for the preview of the last plans."""
     parts = len(next(iter(values.values())))
     turns = np.arange((cycles + 1) * parts)
     times = np.repeat(seconds / parts * np.append(turns, turns[-1] + 1), 2)[1:-1]
@@ -54,12 +54,12 @@ def reference(values: Values, seconds: float, cycles: int) -> m.Reference:
 def rests(
     values: Values, steps: int, true: TrueMotion, plant: Description, period: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The true plant's equilibrium at each set-point: (steps, d) and (steps, m) of a cycle's ticks, plant units.
+    """Return the true plant's equilibrium at each tick of a cycle: (steps, d) and (steps, m), plant units.
 
-    values: as of `require_fit`: with as many outputs as inputs a rest is unique.
+    values: checked by `require_fit`. With as many outputs as inputs an equilibrium is unique.
 
     Raises:
-        PlantError: it does not rest there.
+        PlantError: there is no equilibrium at a set-point.
     """
     own = [plant.states.index(name) for name in values]
     found = [_rest(np.array(row), own, true, plant, period) for row in zip(*values.values(), strict=True)]

@@ -1,7 +1,7 @@
-"""The process that makes runs for another one: `python -P -m tandem.experiments.study.child_process DESCRIPTOR`.
+"""A process that makes runs for another one: `python -P -m tandem.experiments.study.child_process DESCRIPTOR`.
 
 It reads pickled (function, arguments) from the descriptor and writes (value, None), or (None, (line, traceback)) where
-the function raised. It ends when the other side does, or after `IDLE_S` without a request.
+the function raised. It ends when the other process does, or after `IDLE_S` without a request.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ IDLE_S = 120.0
 
 
 def main() -> int:
-    # Ctrl-C on a terminal reaches every process there. The parent decides whether a run ends.
+    # Ctrl-C on a terminal reaches every process. The parent decides whether a run ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(int(sys.argv[1]))
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -38,7 +38,7 @@ def _listen(channel: Connection, requests: queue.SimpleQueue[bytes]) -> None:
         while True:
             requests.put(channel.recv_bytes())
     except (EOFError, OSError):
-        # The parent is gone. The main thread may be in a run that never ends.
+        # The parent has ended. The main thread may be in a run that never ends.
         os._exit(1)
 
 

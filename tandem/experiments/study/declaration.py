@@ -1,4 +1,4 @@
-"""An experiment as its file declares it: groups of cases, each a configuration, seeds, initial states and faults."""
+"""The declaration of an experiment: groups of cases, each with a configuration, seeds, initial states and faults."""
 
 from __future__ import annotations
 
@@ -27,49 +27,49 @@ ORACLES = {
     "dnn": "network",
     "perfect": "true h",
 }
-"""As the report calls them."""
+"""Names of the oracles in the report."""
 STEPS = 200
 Name = Annotated[str, msgspec.Meta(pattern=r"^[^/\\]{1,60}$")]
 
 
 class Starts(Section, frozen=True):
-    """Initial states: some by hand, or a grid."""
+    """Initial states: a list of points, or a grid."""
 
     points: list[list[float]] | None = None
-    """Each (d,), plant units."""
+    """Points, each (d,), plant units."""
     grid: dict[str, list[float]] | None = None
-    """Values by state name, every combination; the states that are not named are the plant's x0's."""
+    """Values by state name, for every combination; other states have the values of the plant's x0."""
 
 
 class Runs(Section, frozen=True, kw_only=True):
-    """What a case runs. Its group and the experiment may say it for all of theirs: the nearest that says it counts."""
+    """Settings of runs. A case, its group and the experiment may set them; the innermost setting has precedence."""
 
     config: str | None = None
-    """What to start from: a shipped configuration by its name, or a file, beside the experiment's or from here."""
+    """Base: the name of a shipped configuration, or a file, relative to the experiment's or to the current folder."""
     set: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Changes of the configuration, as a table like it: a case's over its group's, a group's over the experiment's."""
+    """Changes of the configuration, as a table of the same form. Those of a case override its group's, and so on."""
     seeds: list[Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]] | Count | None = None
-    """Which, or how many from 0 on; 1 where nothing is said. A case that draws nothing has the first alone."""
+    """Seeds, or their number from 0; 1 by default. A case without random numbers uses only the first."""
     steps: Count | None = None
-    """Ticks of an episode; 200 where nothing is said."""
+    """Ticks of an episode; 200 by default."""
     episodes: Count | None = None
-    """How often the plant starts, with all that was learned kept; 1 where nothing is said."""
+    """Number of starts of the plant with the memory kept; 1 by default."""
     faults: Faults | None = None
     set_points: dict[str, list[float]] | None = None
-    """By state name: values that follow each other within `steps` ticks, equally long, in every episode again. The
-    plant goes on from where it is, so that an episode is a cycle."""
+    """Set-points by state name: values of equal duration within `steps` ticks, repeated in every episode. The plant is
+    not reset between episodes, so an episode is a cycle."""
 
 
 class Group(Runs, frozen=True, kw_only=True):
-    """Cases that one table shows together."""
+    """Cases that are shown in one table."""
 
     name: Name
     title: str
     about: str = ""
-    """What is asked, in a few sentences; above the table."""
+    """The question of the group in a few sentences, shown above the table."""
     picture: Picture = "rows"
     reference: str | None = None
-    """The case that the others are compared with, in words below the table."""
+    """The reference case of the comparison below the table."""
     x0s: Name = "default"
     """A name of [x0s]; "default" is the configuration's own x0."""
 
@@ -78,11 +78,11 @@ class Case(Runs, frozen=True, kw_only=True):
     name: Name
     group: Name
     label: str = ""
-    """What the report calls it; the name where there is none."""
+    """Title in the report; by default the name."""
     vary: dict[str, list[Any]] = msgspec.field(default_factory=dict)
-    """Makes a case of each combination: "section.key" -> values."""
+    """Values by "section.key"; each combination is a case."""
     x0s: Name | None = None
-    """Others than its group's."""
+    """Name of its initial states, if not those of its group."""
     log: bool = False
     """Keep the MCAP log of every run from the default x0."""
     quick: bool = True
@@ -90,17 +90,17 @@ class Case(Runs, frozen=True, kw_only=True):
 
 
 class Quick(Section, frozen=True):
-    """What --quick leaves of each case."""
+    """Limits of each case with --quick."""
 
     seeds: Count = 2
     x0s: Count = 3
     values: Count = 3
-    """Values of each `vary`: first, last and some between; of the oracles all."""
+    """Number of values of each `vary`: the first, the last and some between; oracles are all kept."""
     episodes: Count = 2
 
 
 class Declaration(Runs, frozen=True, kw_only=True):
-    """The file."""
+    """The declaration in the file."""
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
     title: str
@@ -113,18 +113,18 @@ class Declaration(Runs, frozen=True, kw_only=True):
 
 
 class Resolved(msgspec.Struct, frozen=True, kw_only=True):
-    """One case, ready to run: a configuration for each seed and initial state is `config_of`."""
+    """One case, ready to run. `config_of` gives the configuration for a seed and an initial state."""
 
     name: str
     group: str
     label: str
     family: str
-    """The label without the last value that is varied: what it has in common with the cases beside it."""
+    """The label without the last varied value, which neighbouring cases share."""
     config: Config
     varied: dict[str, Any]
-    """What this case has of its declaration's `vary`."""
+    """Values of the declaration's `vary` in this case."""
     words: dict[str, str]
-    """The same as the report says it."""
+    """The same values as texts of the report."""
     seeds: list[int]
     x0s: list[list[float] | None]
     steps: int
@@ -135,7 +135,7 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def draws(self) -> bool:
-        """Whether two seeds are two different runs."""
+        """Whether two seeds give two different runs."""
         return _draws(self.config)
 
     def config_of(self, seed: int, x0: list[float] | None) -> Config:
@@ -147,7 +147,7 @@ def load(path: Path) -> Declaration:
     """Read an experiment.
 
     Raises:
-        ConfigError: names the file, the key and the nearest right one.
+        ConfigError: the file is invalid; the message names the key and the nearest valid one.
     """
     declared = strict(load_tree(path), Declaration, str(path))
     groups = [group.name for group in declared.group]
@@ -164,7 +164,7 @@ def load(path: Path) -> Declaration:
 
 
 def resolve(declared: Declaration, plant: Description, where: str, quick: bool = False) -> list[Resolved]:
-    """Every case with its configuration. Raises `ConfigError`, as `load` does."""
+    """Return every case with its configuration. Raises `ConfigError`, as `load` does."""
     resolved = [
         one
         for case in declared.case
@@ -181,12 +181,12 @@ def resolve(declared: Declaration, plant: Description, where: str, quick: bool =
 
 
 def config_of(levels: Sequence[Runs], varied: Mapping[str, Any], where: str, folder: Path) -> Config:
-    """The configuration of an experiment, of a group or of a case, with what varies on top.
+    """Return the configuration of an experiment, a group or a case, with the varied values.
 
-    where: for messages; folder: the experiment's, to which its references are relative.
+    where: for messages; folder: that of the experiment, to which its references are relative.
 
     Raises:
-        ConfigError: there is no such configuration to start from, or the changes do not fit it.
+        ConfigError: the base configuration does not exist, or the changes do not fit it.
     """
     name = _said(levels, "config", None)
     changes: dict[str, Any] = {}
@@ -256,7 +256,7 @@ def _draws(config: Config) -> bool:
 
 
 def _said(levels: Sequence[Runs], key: str, otherwise: Any) -> Any:
-    """What the nearest level says of one of the keys of `Runs`."""
+    """Return the innermost setting of a key of `Runs`."""
     said = [getattr(level, key) for level in levels]
     return next((value for value in reversed(said) if value is not None), otherwise)
 
@@ -291,7 +291,7 @@ def _known(path: Path, key: str, name: str, names: list[str]) -> None:
 
 
 def _merged(tree: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a plain tree with another laid over it."""
+    """Return a copy of a plain tree, with the values of another one over it."""
     merged = dict(tree)
     for key, value in change.items():
         below = merged.get(key)
@@ -308,14 +308,14 @@ def _spread(values: list[Any], count: int) -> list[Any]:
 
 
 def _below(key: str, value: Any) -> Any:
-    """A plain tree that has nothing but the value at "section.key"."""
+    """Return a plain tree that contains only the value at "section.key"."""
     for name in reversed(key.split(".")):
         value = {name: value}
     return value
 
 
 def _keys(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:
-    """Every "section.key" of a plain tree, the sections too."""
+    """Yield every "section.key" of a plain tree, and the sections."""
     for name, value in tree.items():
         yield above + name
         if isinstance(value, dict):
@@ -327,7 +327,7 @@ def _label(case: Case, words: list[str]) -> str:
 
 
 def _words(key: str, value: Any) -> str:
-    """A value as the report has it; an oracle and a table of values need no key."""
+    """Return a value as text for the report; an oracle and a table of values need no key."""
     if key == ORACLE:
         return ORACLES.get(value, value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Functions called in processes of their own, within limits of time and memory.
+"""Calls functions in separate processes, with limits of time and memory.
 
 A call that crashes, never ends or fills the memory ends its process and nothing else. A process serves one call after
 the other, because importing CasADi and torch takes seconds.
@@ -25,12 +25,12 @@ from node_runtime.config.sections import Positive, Seconds, Section
 from tandem.experiments.study import child_process
 
 POLL_S = 0.2
-"""How often memory and time are looked at."""
+"""Interval between two checks of memory and time, seconds."""
 GIB = 2**30
 
 
 class Limits(Section, frozen=True):
-    """What one run may take; a run beyond it is stopped."""
+    """Limits of one run; a run that exceeds them is stopped."""
 
     seconds: Seconds = 3600.0
     memory_gib: Positive = 4.0
@@ -44,11 +44,11 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
     """A run without a result."""
 
     kind: Literal["error", "crash", "time", "memory"]
-    """An exception, or why its process ended."""
+    """An exception, or the reason why its process ended."""
     text: str
     """One line."""
     traceback: str
-    """Empty where there was no exception."""
+    """Traceback; empty without an exception."""
     where: str = ""
     """The worker; empty for this machine."""
 
@@ -62,7 +62,7 @@ class Child:
 
     def __init__(self) -> None:
         self._channel, theirs = Pipe()
-        # -P: nothing is imported from the current folder. What a plant prints is not this process's output.
+        # -P: no import from the current folder. The output of a plant must not mix with that of this process.
         command = [sys.executable, "-P", "-m", child_process.__name__, str(theirs.fileno())]
         self._process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=2, pass_fds=[theirs.fileno()]
@@ -82,12 +82,12 @@ class Child:
         limits: Limits,
         wanted: Callable[[], bool] = lambda: True,
     ) -> Any:
-        """The function's value, or a `Failure`.
+        """Return the function's value, or a `Failure`.
 
-        function: of a module, since it is pickled by name; wanted: asked while the call goes on.
+        function: of a module, because it is pickled by name; wanted: called repeatedly during the call.
 
         Raises:
-            Unwanted: `wanted` said no.
+            Unwanted: `wanted` returned False.
         """
         ends = monotonic() + limits.seconds
         try:
@@ -95,11 +95,11 @@ class Child:
             while not self._channel.poll(POLL_S):
                 if self._memory() > limits.memory_gib * GIB:
                     self.kill()
-                    text = f"stopped: it held more than {limits.memory_gib:g} GiB of memory"
+                    text = f"stopped: it used more than {limits.memory_gib:g} GiB of memory"
                     return Failure(kind="memory", text=text, traceback="")
                 if monotonic() > ends:
                     self.kill()
-                    text = f"stopped: it had not ended after {limits.seconds:g} s"
+                    text = f"stopped: it did not end within {limits.seconds:g} s"
                     return Failure(kind="time", text=text, traceback="")
                 if not wanted():
                     self.kill()
@@ -115,14 +115,14 @@ class Child:
         self._process.wait()
 
     def end(self) -> None:
-        """Have an idle one end."""
+        """End the process if it is idle."""
         self._channel.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         self.kill()
 
     def _memory(self) -> int:
-        """Resident bytes; 0 where it has ended."""
+        """Return the resident memory in bytes; 0 if the process has ended."""
         try:
             pages = Path(f"/proc/{self._process.pid}/statm").read_text().split()[1]
         except (OSError, IndexError):
@@ -137,8 +137,8 @@ class Child:
             return "its process closed the connection"
         if code >= 0:
             return f"its process ended with exit code {code}"
-        hint = ", perhaps by the system for want of memory" if -code == signal.SIGKILL else ""
-        return f"its process was ended by {signal.Signals(-code).name}{hint}"
+        hint = ", perhaps by the system because memory ran out" if -code == signal.SIGKILL else ""
+        return f"its process was killed by {signal.Signals(-code).name}{hint}"
 
 
 class Children:
@@ -151,7 +151,7 @@ class Children:
 
     @contextlib.contextmanager
     def one(self) -> Iterator[Child]:
-        """A process for one call."""
+        """Yield a process for one call."""
         child = self._free() or Child()
         with self._lock:
             self._busy.add(child)
@@ -173,7 +173,7 @@ class Children:
             child.end()
 
     def kill(self) -> None:
-        """End all, also those in a call, which then is a `Failure`."""
+        """End all processes. A call in progress then gives a `Failure`."""
         with self._lock:
             idle, self._idle = self._idle, []
             busy = list(self._busy)

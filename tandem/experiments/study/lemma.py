@@ -4,7 +4,7 @@
     V_a(K) = |K - W*|_F^2 / gamma,      eps_j(x, u) = h(x, u) - W*' phi_j(x, u)
 
 This is the sum of the lemma's (ii), for any W* within the bounds on the columns. Part (iii) puts 4 Wbar / gamma for
-V_a and the largest |eps| for each of them. Everything in units of h.
+V_a and the largest |eps| for each of them. All values are in units of h.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Lemma(msgspec.Struct, frozen=True, kw_only=True):
     epsilon: list[float]
     """|eps_j(x_t, u_t)|^2 with W* fitted to the whole run, (n,)."""
     sigma2: float
-    """Largest |phi_j(x_t, u_t)|^2 seen."""
+    """Largest |phi_j(x_t, u_t)|^2 of the run."""
     sigma2_bound: float
-    """Largest that bounded neurons allow: 1 + n_L."""
+    """Its bound for bounded neurons: 1 + n_L."""
     gamma: float
     V0: float
     """V_a(K_0)."""
@@ -43,19 +43,19 @@ class Lemma(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def bound(self) -> np.ndarray:
-        """With what the run really had: sigma, V_a(K_0) and every eps; (n,)."""
+        """Bound (ii) with the values of the run: sigma, V_a(K_0) and every eps; (n,)."""
         return self.sigma2 / (1 - self.gamma) * (self.V0 + np.cumsum(self.epsilon))
 
     @property
     def bound_beforehand(self) -> np.ndarray:
-        """(iii), with the constants known before the run and the largest eps of it; (n,)."""
+        """Bound (iii) with the constants known before the run and its largest eps; (n,)."""
         c0 = self.sigma2_bound / (1 - self.gamma)
         n = np.arange(1, len(self.error) + 1)
         return c0 * n * max(self.epsilon) + 4 * c0 / self.gamma * self.W_bar
 
 
 def measure(run: Run, oracle: DnnOracle) -> Lemma | None:
-    """From the log alone. None where the lemma says nothing: no sample, labels with a variance, or another law."""
+    """Evaluate the lemma from the log. None if it does not apply: no sample, labels with a variance, or another law."""
     samples = {sample.seq: sample for sample in run.samples}
     weights = [w for w in run.output_weights if w.seq in samples]
     if any(sample.variance for sample in samples.values()):

@@ -1,4 +1,4 @@
-"""From cases to runs: each run once, however many rows show it, and a name for it that changes when its result may."""
+"""Plans the runs of the cases. Each run is made once for all its rows, under a hash of its settings and code."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CODE = (
     "tandem/experiments/simulation/wave.py",
 )
 PACKAGES = (*provenance.SCIENCE, "torch")
-"""What a result depends on beside the code."""
+"""Packages on which a result depends, beside the code."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,7 +61,7 @@ class RowPlan(NamedTuple):
 
 
 def rows(cases: list[Resolved]) -> Iterator[RowPlan]:
-    """Every case for every seed and initial state, in the order of the file."""
+    """Return the rows of every case, seed and initial state, in the order of the file."""
     for case in cases:
         for x0 in case.x0s:
             for seed in case.seeds:
@@ -83,13 +83,13 @@ def _job(config: Config, case: Resolved) -> Job:
 
 
 def _floor(config: Config, case: Resolved) -> Job:
-    """The same run with the true h, of the present plant where it drifts."""
+    """Return the same run with the true h, which follows a drifting plant."""
     controller = msgspec.structs.replace(config.controller, oracle="perfect")
     return _job(msgspec.structs.replace(config, controller=controller), case)
 
 
 def _what_counts(config: Config) -> Config:
-    """The same run under the shortest name: sections and seeds that nothing in it reads are the defaults."""
+    """Return the configuration in normal form: unused sections and seeds have their defaults."""
     unread, oracle = ["name", "bus", "log", "realtime"], config.controller.oracle
     if oracle != "constant":
         unread.append("constant")

@@ -1,4 +1,4 @@
-"""Rows, and what a case comes to over its seeds and initial states."""
+"""Rows of the results, and the figures of a case over its seeds and initial states."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from tandem.experiments.study.work import Record
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, as `summary.json` has it.
+    """One run in `summary.json`.
 
-    Of several episodes, J, regret, deviation, overshoot and settling are those from the second one on: what the run
-    came to with a memory. J and the deviation are their mean, overshoot and settling the worst.
+    With several episodes, J, regret, deviation, overshoot and settling cover those from the second one on, which show
+    the effect of the memory. J and the deviation are means, overshoot and settling the worst values.
     """
 
     case: str
@@ -34,35 +34,34 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     x0: list[float]
     J: float | None
-    """Sum of the stage costs, Q and R as densities; null where the plant was lost, as for the five after it."""
+    """Sum of the stage costs, Q and R as densities; null if the plant was lost, as are the next five."""
     regret: float | None
-    """J above that of the true h from the same start, as a share of it, negative where below; null where either was
-    lost."""
+    """Difference of J to that of the true h from the same start, as a share of it; null if either plant was lost."""
     deviation: float | None
     """Integral of the summed squared deviations of the performance states, plant units squared times seconds."""
     J_by_episode: list[float | None]
     regret_by_episode: list[float | None]
-    """J and regret of each episode; null where the plant was lost before its end."""
+    """J and regret of each episode; null if the plant was lost before its end."""
     overshoot: dict[str, float | None] | None
-    """Per performance state, as a share of its initial deviation; null for one that began settled."""
+    """Overshoot of each performance state, as a share of its initial deviation; null for one that began settled."""
     settled_s: float | None
-    """Seconds; null where not settled at the end."""
+    """Settling time in seconds; null if not settled at the end."""
     settled_by_state_s: dict[str, float | None] | None
     violations: int
     """Samples outside X or U by more than 1e-6 of a half-width."""
     excess_between_samples: float | None
-    """Largest distance from X, as a share of a half-width; null where the truth between the samples is not known."""
+    """Largest distance from X, as a share of a half-width; null if the motion between samples is not known."""
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
     solve_ms: Spread | None
-    """Of runs made alone, of the same oracle, horizon, network and rate."""
+    """Solve times of runs made alone, with the same oracle, horizon, network and rate."""
     lost: str | None
     weights_adopted: int
     error_first_second: float | None
     error_last_second: float | None
     arithmetic: str
-    """Processor, BLAS kernels and compiler of the machine that made the run: what its last digits depend on."""
+    """Processor, BLAS kernels and compiler of the machine of the run, on which its last digits depend."""
 
     @property
     def J_first(self) -> float | None:
@@ -81,12 +80,12 @@ class FailedRun(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     x0: list[float] | None
     floor: bool
-    """Whether it is the run with the true h from the same start."""
+    """Whether the failed run is that with the true h from the same start."""
     failure: Failure
 
 
 def failed(plans: list[RowPlan], failures: dict[str, Failure]) -> list[FailedRun]:
-    """In the order of the file, each run once."""
+    """Return the failed runs in the order of the file, each once."""
     found: dict[str, FailedRun] = {}
     for plan in plans:
         for job, floor in ((plan.job, False), (plan.floor, True)):
@@ -105,7 +104,7 @@ def failed(plans: list[RowPlan], failures: dict[str, Failure]) -> list[FailedRun
 def with_results(
     cases: list[Resolved], plans: list[RowPlan], records: dict[str, Record], failed: list[FailedRun]
 ) -> list[Resolved]:
-    """The cases that have a run at least. Raises `RunnerError`: none has."""
+    """Return the cases with at least one run. Raises `RunnerError` if there is none."""
     made = {plan.case.name for plan in plans if plan.job.key in records}
     if not made:
         first = failed[0]
@@ -125,15 +124,15 @@ class CaseResult(NamedTuple):
     timing: Timing | None
 
     def values(self, name: str) -> np.ndarray:
-        """(rows,) one figure of each, of the first performance state where each has its own.
+        """Return one figure of every row, (rows,); for figures by state, that of the first performance state.
 
-        What is lost, or not settled, is infinitely bad; NaN where there is no such figure, as for the overshoot of a
-        state that began settled.
+        A lost or unsettled run counts as infinite. A missing figure is NaN, such as the overshoot of a state that began
+        settled.
         """
         return np.array([_value(row, name) for row in self.rows])
 
     def median(self, name: str) -> float:
-        """Median of the rows that have this figure; NaN where none has."""
+        """Return the median over the rows with this figure; NaN if none has it."""
         values = self.values(name)
         values = values[~np.isnan(values)]
         return float(np.median(values)) if values.size else math.nan
@@ -145,7 +144,7 @@ class CaseResult(NamedTuple):
 
     @property
     def kept(self) -> float:
-        """Share of the runs that keep all constraints on the true plant, at samples."""
+        """Return the share of runs that keep all constraints of the true plant at samples."""
         return float(np.mean([record.kept for record in self.records]))
 
     @property
@@ -169,7 +168,7 @@ def _value(row: Row, name: str) -> float:
 def collect(
     plans: list[RowPlan], records: dict[str, Record], timings: dict[str, Timing], plant: Description
 ) -> list[CaseResult]:
-    """In the order of the file, without the runs that failed."""
+    """Return the rows in the order of the file, without failed runs."""
     cases: dict[str, CaseResult] = {}
     for plan in plans:
         case, record = plan.case, records.get(plan.job.key)
@@ -219,7 +218,7 @@ def _row(
 
 
 def _figures(record: Record) -> dict[str, Any]:
-    """Figures of the episodes from the second one on, or of the only one; nothing where the plant was lost."""
+    """Return the figures of the episodes from the second one on, or of the only one; empty if the plant was lost."""
     if record.lost is not None:
         return {}
     return msgspec.structs.asdict(of_episodes(record.episodes[1:] or record.episodes))
@@ -248,7 +247,7 @@ def summary(
     code: str,
     quick: bool,
 ) -> dict[str, Any]:
-    """What `summary.json` holds."""
+    """Return the content of `summary.json`."""
     return {
         "experiment": declared.name,
         "quick": quick,

@@ -1,4 +1,4 @@
-"""Makes the runs that are not there yet: on this machine's cores, or wherever else runs can be made.
+"""Makes the missing runs, on this machine's cores or on another workplace.
 
 A run is the same in any process, so neither the number of processes nor an interruption changes a figure.
 """
@@ -20,35 +20,35 @@ from tandem.experiments.study.plan import Job, RowPlan, code_version
 from tandem.experiments.study.work import Done, Record, Task, read, work
 
 Progress = Callable[[int, int], None]
-"""Told what is done and of how many."""
+"""Called with the number of finished items and the total."""
 Answer = Done | Failure
 
 TRIES = 3
-"""How often a run is tried if its process ends. A run that raises or exceeds a limit would do so again."""
+"""Number of attempts if the process of a run dies. A run that raises or exceeds a limit is not repeated."""
 POLL_S = 0.5
 LONGEST_NAME = 160
-"""Letters of a case in a file's name, which may have 255 in all."""
+"""Largest number of letters of a case in a file name, which may have 255 in all."""
 
 
 class RunnerError(RuntimeError):
-    """The runs cannot go on; the text says why and what to do."""
+    """The runs cannot continue; the text gives the reason and a remedy."""
 
 
 class Lost(Exception):
-    """A run was not made for a reason that is not its own, such as a worker that is gone."""
+    """A run was not made for an external reason, such as a lost worker."""
 
 
 class Workplace(Protocol):
-    """Where runs are made: on this machine, or on a cluster."""
+    """A place that makes runs: this machine, or a cluster."""
 
     def room(self) -> int:
-        """How many runs to hand over at a time, so that none has to wait for the next. Raises `RunnerError`."""
+        """Return the number of runs to submit at a time, so that no worker waits. Raises `RunnerError`."""
 
     def submit(self, task: Task) -> Future[Answer]:
-        """Hand over a run. Raises `Lost` from the future's result where it is to be handed over again."""
+        """Submit a run. The future's result raises `Lost` if the run must be submitted again."""
 
     def close(self) -> None:
-        """Stop what is still under way."""
+        """Stop all unfinished runs."""
 
 
 class Processes:
@@ -75,23 +75,23 @@ class Processes:
 
 
 class Want(NamedTuple):
-    """One job, and what is wanted of it beyond its figures."""
+    """One job, and the requested results beyond its figures."""
 
     job: Job
     detail: bool
     logs: tuple[Path, ...]
-    """Two cases may be one job: each has a log of its own."""
+    """Log files of the job. Two cases may share a job, and each has its own log."""
 
 
 class Made(NamedTuple):
-    """By key of the job."""
+    """Records, by key of the job."""
 
     records: dict[str, Record]
     failures: dict[str, Failure]
 
 
 def wanted(plans: list[RowPlan], detailed: set[str], logs: Path) -> dict[str, Want]:
-    """Every job once, floors too, by key. `detailed`: groups whose pictures show traces."""
+    """Return every job once, including floors, by key. `detailed`: groups whose pictures show traces."""
     wants: dict[str, Want] = {}
 
     def want(job: Job, detail: bool, *logs: Path) -> None:
@@ -113,12 +113,12 @@ def run_all(
     progress: Progress = lambda done, total: None,
     limits: Limits = ORDINARY,
 ) -> Made:
-    """Every job's record, or why it has none; a record that `folder` holds already is taken as it is.
+    """Return the record of every job, or its failure. Records that are already in `folder` are used.
 
     Raises:
-        RunnerError: there is no place left to make runs.
+        RunnerError: no workplace is left.
         OSError: a result cannot be written.
-        KeyboardInterrupt: after the runs that were under way have ended and been kept; at once when it comes twice.
+        KeyboardInterrupt: after the unfinished runs have ended and were kept; at once for a second signal.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(".*.new"):  # of a process that was killed
@@ -128,7 +128,7 @@ def run_all(
         for key, want in wants.items()
         if read(folder / f"{key}.json", want.detail) is None or not all(log.is_file() for log in want.logs)
     ]
-    # Long runs first, or one of them would keep a single core busy at the end.
+    # Long runs come first, so that the end of the sweep uses all cores.
     missing.sort(key=lambda key: _effort(wants[key].job), reverse=True)
     sweep = _Sweep(wants, folder, workplace, progress, limits, deque(missing))
     try:
@@ -179,7 +179,7 @@ class _Sweep:
                 time.sleep(POLL_S)
 
     def finish(self) -> None:
-        """Keep what is under way, and begin nothing."""
+        """Finish the runs in progress, and begin no others."""
         for future in list(self.under_way):
             if future.cancel():
                 del self.under_way[future]
@@ -233,6 +233,6 @@ def _effort(job: Job) -> float:
 
 
 def file_name(name: str) -> str:
-    """Two names are two files, also where what a file's name had better not have is replaced."""
+    """Return a file name. Special characters are replaced, and different names still give different files."""
     clean = "".join(c if c.isascii() and (c.isalnum() or c in "-_=.") else "-" for c in name)[:LONGEST_NAME]
     return clean if clean == name else f"{clean}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -27,7 +27,7 @@ class Timing(msgspec.Struct, frozen=True):
 
 
 def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
-    """What stands for all cases whose solver does the same work: oracle, horizon, network and rate."""
+    """Return the key of all cases with the same solver work: oracle, horizon, network and rate."""
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
     given = config.plant
@@ -50,13 +50,11 @@ def time_all(
     progress: Progress,
     limits: Limits = ORDINARY,
 ) -> dict[str, Timing]:
-    """Solve times by case name; one process, nothing beside it.
+    """Measure the solve times by case name, in one process without other load.
 
-    Those of this processor that `folder` holds already are taken as they are.
+    Times of this processor that are already in `folder` are used. A case whose run fails has none.
 
-    A case whose run fails has none.
-
-    repeats: runs of a case, at least; seconds: of control in each.
+    repeats: smallest number of runs of a case; seconds: duration of control in each.
     """
     folder.mkdir(parents=True, exist_ok=True)
     processor = provenance.describe()["processor"]

@@ -1,4 +1,4 @@
-"""One run: its record and its log, as bytes. Nothing is written here; the caller may be on another machine."""
+"""One run: its record and its log, as bytes. No file is written, because the caller may be on another machine."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from tandem.experiments.study.lemma import Lemma, measure
 from tandem.experiments.study.plan import Job, code_version
 
 Rests = tuple[np.ndarray, np.ndarray]
-"""Where the true plant rests at the set-points of each tick of a cycle, as of `wave.rests`."""
+"""Equilibria of the true plant at the set-points of each tick of a cycle, from `wave.rests`."""
 
 
 class Traces(msgspec.Struct, frozen=True, kw_only=True):
-    """n samples, from the start on."""
+    """Traces of n samples from the start."""
 
     x: list[list[float]]
-    """(n, p) the plant's performance states, its own units."""
+    """(n, p) performance states, plant units."""
     u: list[list[float]]
-    """(n - 1, m) commanded."""
+    """(n - 1, m) commanded input."""
     error: list[float | None]
     """(n - 1,) |h_hat - h| of the step that ended at each tick."""
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What one run came to; it depends on the job and the code alone."""
+    """Result of one run. It depends only on the job and the code."""
 
     job: Job
     lost: str | None
-    """Why the true motion could not be followed to the end."""
+    """Reason why the true motion could not be computed to the end."""
     episodes: list[Performance]
-    """Those that could be followed to their end; of set-points by turns the cycles."""
+    """Figures of the complete episodes; for periodic set-points, of the complete cycles."""
     performance: Performance
-    """Figures of the whole run, as far as it could be followed."""
+    """Figures of the run, up to a loss of the plant."""
     iteration_limit_ticks: int
     soft_ticks: int
     fallback_ticks: int
@@ -63,29 +63,29 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     traces: Traces | None
     lemma: Lemma | None
     arithmetic: str
-    """What may make another machine's last digits differ: processor, BLAS kernels, compiler of the solver."""
+    """Processor, BLAS kernels and compiler of the solver, on which the last digits depend."""
 
     @property
     def kept(self) -> bool:
-        """All constraints, at all samples, on the true plant."""
+        """Whether the true plant keeps all constraints at all samples."""
         return self.lost is None and self.performance.constraint_violations == 0
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """One run to be made, and what is wanted of it."""
+    """One run to be made, and its requested results."""
 
     job: Job
     detail: bool
-    """With its traces."""
+    """Whether to return the traces."""
     log: bool
-    """With its MCAP log."""
+    """Whether to return the MCAP log."""
     files: dict[str, str]
     """The sha256 of the files that its configuration names, by key, as `files_of` finds them."""
     limits: Limits = ORDINARY
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run leaves."""
+    """Results of a run."""
 
     record: bytes
     """A `Record`, as JSON."""
@@ -99,10 +99,10 @@ def work(task: Task, config: Config | None = None) -> Done:
 
     Args:
         task: what to run.
-        config: the task's configuration with the paths that its files have here; None: they are where it says.
+        config: the task's configuration with local paths of its files; None: the paths are valid here.
 
     Raises:
-        ConfigError: the configuration admits no controller, or names another file here than where the task was made.
+        ConfigError: the configuration does not give a controller, or a named file differs from that of the client.
     """
     here = task.job if config is None else msgspec.structs.replace(task.job, config=config)
     with one_blas_thread():
@@ -119,7 +119,7 @@ def work(task: Task, config: Config | None = None) -> Done:
 
 
 def _rename(run: Run, config: Config) -> None:
-    """Have the run name its files by the paths of the machine that asked for it."""
+    """Replace local paths in the run by those of the client."""
     run.config = config
     for topic in topics.RUN_INFO.values():
         for i, entry in enumerate(run.entries(topic)):
@@ -165,7 +165,7 @@ def _outcome(job: Job) -> Outcome:
 
 
 def _cycles(run: Run, job: Job, rests: Rests) -> list[Performance]:
-    """Figures of each whole cycle: dx and du are from where the true plant rests at the set-points."""
+    """Return the figures of each complete cycle, relative to the true plant's equilibria at the set-points."""
     plant, truth = plant_of(run), true_plant_of(job.config, get_plant, get_truth)
     motion, (x, u) = trajectory(run, plant), rests
     outputs = msgspec.structs.replace(job.config.reference, outputs=list(job.set_points or {}))
@@ -206,7 +206,7 @@ def _lemma(run: Run, config: Config) -> Lemma | None:
 
 
 def read(path: Path, detail: bool) -> Record | None:
-    """A finished run; None where there is none, or not all that is wanted of it."""
+    """Return a finished run; None if it is missing or lacks a requested result."""
     try:
         found = msgspec.json.decode(read_regular(path), type=Record)
     except (OSError, msgspec.DecodeError):

@@ -34,7 +34,7 @@ Rows = list[dict[str, Any]]
 
 
 def write_log(path: Path, config: Config, messages: list[Logged]) -> Path:
-    """A run, and beside it messages that are a user's, invalid, or on an unknown key."""
+    """Record a run, and user messages, invalid messages and messages on an unknown key."""
     with LogWriter(path, config, get_plant("moore_greitzer"), versions={"python": "3.11"}) as writer:
         for i, (topic, message, log_time) in enumerate(messages):
             writer.write(topic.name, codec.encode(message), log_time)
@@ -166,7 +166,7 @@ def test_rerun_has_series_events_and_a_layout(exported: Exported, out: Path, run
     assert found["/controller/tick/late"][1] == [float(tick.late) for tick in run.ticks]
     assert set(found["/bounds/x_max/z"][1]) == {1.0}
     assert len(found["/targets/x/z"][1]) == len(run.results)
-    # A text comes when it changes.
+    # A text is written only when it changes.
     assert found["/controller/result/status"][1] == ["converged", "iteration limit", "converged"]
     assert "plant: the input comes from: command (before: hold)" in found["/events"][1]
     reader = RrdReader(out / "run.rrd")

@@ -1,4 +1,4 @@
-"""The log of one run in lock-step, made once for all files of tests that replay it."""
+"""The log of one lock-step run for all test files that replay it."""
 
 from __future__ import annotations
 

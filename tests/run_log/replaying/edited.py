@@ -1,4 +1,4 @@
-"""The run that these tests replay, and copies of it in which something is another thing."""
+"""The run that these tests replay, and edited copies of it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from run_log.run import Entry, Run
 
 RUN = "controller-simulated"
 STEPS, EVERY = 90, 25
-"""How many ticks it has, and after how many of them there is a keyframe."""
+"""Number of its ticks, and ticks between two keyframes."""
 
 
 def edited(run: Run, topic: Topic, seq: int, change: Callable[[Any], m.Message | None]) -> Run:
-    """A copy in which one message is another one, or is missing (None)."""
+    """Return a copy in which one message is replaced or missing (None)."""
     other = copy.copy(run)
     entries = []
     for entry in run.entries(topic):

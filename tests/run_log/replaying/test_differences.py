@@ -1,4 +1,4 @@
-"""Nothing that was changed goes unseen, and what a difference may come from is said."""
+"""Replay finds every edit of a log, and reports possible causes of a difference."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_flipped_bit_that_the_step_does_not_use_is_reported_too(run: Run, fiel
 
 
 def test_one_flipped_bit_in_the_file_survives_a_rewrite_and_is_reported(run: Run, tmp_path: Path) -> None:
-    """The edited log is a whole file with valid checksums; only the replay can tell."""
+    """The edited log is a complete file with valid checksums. Only the replay finds the edit."""
     payload = bytearray(run.entries(topics.TICK)[33].payload)
     x = run.ticks[33].state
     assert x is not None
@@ -116,7 +116,7 @@ def test_an_edited_output_is_found(
 
 
 def test_bytes_count_even_where_fields_agree(run: Run) -> None:
-    """A command packed in another way reads the same, and is not the same bytes."""
+    """A command with another encoding has the same content and other bytes."""
     entries = list(run.entries(topics.COMMAND))
     tree = msgspec.msgpack.decode(entries[5].payload)
     other = msgspec.msgpack.encode(dict(reversed(tree.items())))
@@ -145,7 +145,7 @@ def test_difference_sees_signs_of_zero_and_types() -> None:
 
 
 def said(run: Run, **facts: str | None) -> Run:
-    """A copy whose controller says other things of where it ran; None: nothing."""
+    """Return a copy whose controller reports other facts about its machine; None removes a fact."""
 
     def change(info: m.RunInfo) -> m.RunInfo:
         versions = {name: then for name, then in {**info.versions, **facts}.items() if then is not None}
@@ -155,7 +155,7 @@ def said(run: Run, **facts: str | None) -> Run:
 
 
 def rounded(run: Run, by: float) -> Run:
-    """A copy with one input of a plan that is off by so much, in units of u."""
+    """Return a copy in which one input of a plan differs by this amount, in units of u."""
 
     def change(command: m.Command) -> m.Command:
         plan = [*command.plan[:-1], [command.plan[-1][0] + by]]
@@ -195,7 +195,7 @@ def test_a_log_has_the_facts_on_which_its_arithmetic_depends(run: Run) -> None:
             1e-12,
             True,
             None,
-            "the log does not contain its processor, blas: ",
+            "the log does not contain its processor, blas, so ",
         ),
         ({}, 1e-12, True, False, ""),
     ],

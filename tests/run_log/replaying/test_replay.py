@@ -1,4 +1,4 @@
-"""Replay: the log alone gives every command back, byte for byte; who is a stranger in it and what is refused."""
+"""Replay reproduces every command from the log alone, byte for byte, ignores strangers and refuses unfit logs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_other_oracles(config: Config, oracle: str) -> None:
 
 
 def test_the_real_time_iteration_replays_too_whether_it_was_prepared_in_time_or_not(config: Config) -> None:
-    """Live the next tick is prepared in the idle time; lock-step and replay prepare when the tick is there."""
+    """A live controller prepares the next tick in its idle time. Lock-step and replay prepare when the tick arrives."""
     fast = override(config, ["controller.solver.mode=real_time"])
     run = simulate(fast, 60)
     assert sum(result.status == "real-time iteration" for result in run.results) >= 55
@@ -61,7 +61,7 @@ def test_the_real_time_iteration_replays_too_whether_it_was_prepared_in_time_or_
 
 
 def test_bad_ticks_replay_too(config: Config) -> None:
-    """Stale and missing states, refused weights: whatever a tick held, the log has it."""
+    """Stale and missing states and refused weights are in the log and in the replay."""
     source = simulate(config, 40)
     core = ControllerCore(config, RUN)
     log: list[tuple[Topic, m.Message, int]] = [(topics.KEYFRAME, core.memory.keyframe(-1), 0)]
@@ -112,7 +112,7 @@ def test_a_stranger_does_not_damage_the_log(run: Run) -> None:
 
 
 def test_a_stranger_that_repeats_every_message_under_its_own_name_is_named_and_left_out(run: Run) -> None:
-    """On a plain endpoint anybody can publish: here all that the run said again, shifted, keyframes too."""
+    """On a plain endpoint any program can publish. Here a stranger repeats messages of the run with other numbers."""
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.KEYFRAME, topics.RUN_INFO["controller"]):
         for entry in run.entries(topic)[1::2]:
             shifted = {"run_id": "stranger", "seq": entry.message.seq // 2 + 40}
@@ -140,7 +140,7 @@ def test_asking_for_a_tick_that_is_not_there(run: Run) -> None:
 def test_two_records_of_one_tick_are_refused(run: Run) -> None:
     again = run.entries(topics.TICK)[12]
     run.streams[topics.TICK.name] = [*run.entries(topics.TICK), again]
-    assert replay(run).equal  # the same again is harmless
+    assert replay(run).equal  # an equal message is harmless
     liar = with_x(again.message, [0.5] * 4)
     run.streams[topics.TICK.name].append(Entry(0, codec.encode(liar), liar))
     with pytest.raises(

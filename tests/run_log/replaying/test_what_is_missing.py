@@ -69,7 +69,7 @@ def test_many_gaps_and_unreadable_ticks_are_named(run: Run) -> None:
     run.streams[topics.TICK.name] = [e for e in run.entries(topics.TICK) if e.message.seq % 2]
     run.bad["controller/tick: malformed"] = 45
     found = replay(run)
-    # One tick behind the keyframes of 24 and 74; there is none behind that of 49.
+    # One tick after the keyframes of 24 and 74; none after that of 49.
     assert (found.equal, found.ticks, found.lost_ticks) == (True, 2, STEPS - 2)
     gaps = [note for note in found.notes if note.startswith("gap of 1 tick at tick ")]
     assert len(gaps) == 3
@@ -103,7 +103,7 @@ def test_a_log_that_begins_late_names_its_first_replayable_tick(run: Run) -> Non
 
 
 def test_a_run_without_a_keyframe_does_not_keep_the_others_from_being_replayed(run: Run) -> None:
-    """A controller came back while its router was away, and died again before its next keyframe."""
+    """A controller restarted while its router was down, and died again before its next keyframe."""
     second, sums = "controller-second", {}
     for topic in (topics.TICK, topics.COMMAND, topics.RESULT, topics.RUN_INFO["controller"]):
         for entry in run.entries(topic)[:10]:
@@ -138,7 +138,7 @@ def test_a_cut_log_and_its_recovered_copy_replay_up_to_the_cut(log: Path, tmp_pa
 
 
 def test_a_killed_controller_may_leave_an_incomplete_tick(run: Run) -> None:
-    """Its last health is not "stopping"; then the last tick may lack what was still in the queue."""
+    """Its last health is not "stopping", so messages of the last tick may have been lost in the queue."""
     health = m.Health(run_id=RUN, seq=0, process="controller", status="running", counters={}, note="")
     died = edited(run, topics.RESULT, STEPS - 1, lambda _: None)
     assert any("result of tick 89" in note for note in replay(died).notes)

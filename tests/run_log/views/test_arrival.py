@@ -1,4 +1,4 @@
-"""When a message was sent, on the clock of its arrival."""
+"""The time at which a message was sent, on the clock of its arrival."""
 
 from __future__ import annotations
 

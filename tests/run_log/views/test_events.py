@@ -1,4 +1,4 @@
-"""Events: each change is told once, in a message of `foxglove.Log`; a flood of them is not."""
+"""Each change gives one event, a message of `foxglove.Log`. The rate of events is limited."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEALTH = m.Health(run_id="p-1", seq=0, process="plant", status="running", counte
 
 
 class Told:
-    """Feeds messages, and keeps the events."""
+    """Feeds messages and keeps the events."""
 
     def __init__(self) -> None:
         self.views = Views(Config(), get_plant("moore_greitzer"))
@@ -107,7 +107,7 @@ def test_what_drives_the_plant_and_processes_that_change() -> None:
     assert told.by(health, HEALTH) == []
     bad = {"bad_controller_command_foreign": 2, "samples": 3}
     (rejected,) = told.by(health, HEALTH, counters=bad)
-    assert rejected["message"] == "messages were ignored:  bad_controller_command_foreign"
+    assert rejected["message"] == "messages were ignored: bad_controller_command_foreign"
     assert told.by(health, HEALTH, counters=bad) == []
     assert [one["level"] for one in told.by(health, HEALTH, status="failed")] == [Level.ERROR]
 

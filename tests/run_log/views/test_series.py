@@ -24,7 +24,7 @@ STATE = next(message for topic, message, _ in LOGGED if topic is topics.PLANT_ST
 
 
 def shown(views: Views, name: str, message: m.Message, time_ns: int) -> dict[str, Any]:
-    """By channel, what a message shows."""
+    """Return the shown values of a message, by channel."""
     found = {}
     for channel, data in views.show(name, codec.encode(message), time_ns).shown:
         jsonschema.validate(json.loads(data), channel.schema)

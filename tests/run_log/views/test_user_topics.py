@@ -1,4 +1,4 @@
-"""Users' own topics: recorded bytes and all, shown without a schema, bounded, and passed over by a replay."""
+"""User topics are recorded byte for byte, shown without a schema, bounded, and ignored by a replay."""
 
 from __future__ import annotations
 

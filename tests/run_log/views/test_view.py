@@ -1,4 +1,4 @@
-"""What a log shows people: every view and its schema, byte for byte as plotting layouts of older logs know them."""
+"""Every view and its schema, byte for byte as plotting layouts of older logs expect them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from protocol.topics import Topic
 from run_log.views.view import LACKING, views
 
 RECORDED = Path(__file__).with_name("views.jsonl")
-"""A line for each of `messages`: topic, the JSON text of its view, the text of its schema; "" for the same again."""
+"""Return a line for each message: topic, JSON text of its view, and text of its schema ("" if repeated)."""
 VIEWS = views(get_plant("moore_greitzer"))
 
 
 def messages() -> list[tuple[Topic, m.Message]]:
-    """For each kind one that has everything, and one that lacks all that may be absent."""
+    """Return two messages of each kind: one with every field, and one without optional fields."""
     who = {"run_id": "c-1", "seq": 7}
     x, u, K = [0.5, 1.25, -3e-9, 20.0], [1.5], m.Array.of(np.arange(12.0).reshape(3, 4))
     state = m.PlantState(**who, t=1e22, x=x, applied=u, source="command", command_seq=6)

@@ -21,7 +21,7 @@ def known_pendulum(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache that has the regions of the pendulum, made where groups share what they write."""
+    """A cache with the regions of the pendulum, created with a umask that lets groups write."""
     home = tmp_path_factory.mktemp("home")
     before = os.umask(0o002)
     with pytest.MonkeyPatch.context() as patch:
@@ -36,7 +36,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def cached(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it, with sets.json beside; the folder of the test."""
+    """Copy the cache, with sets.json in the same folder; return the folder of the test."""
     shutil.copytree(home / "cache", tmp_path / "cache")
     shutil.copy(home / "sets.json", tmp_path / "sets.json")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

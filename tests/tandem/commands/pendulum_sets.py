@@ -1,4 +1,4 @@
-"""The configuration whose sets these tests compute, and what is said of them."""
+"""The configuration whose sets these tests compute, and the printed text about them."""
 
 from __future__ import annotations
 

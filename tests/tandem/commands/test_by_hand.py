@@ -1,4 +1,4 @@
-"""`tandem manual` and `tandem auto` at a gateway on a router; and what a session makes of what it hears."""
+"""`tandem manual` and `tandem auto` at a gateway on a router, and the messages that end a session."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ U = float(PLANT.u_e[0])
 
 
 class Machine:
-    """Stands still, whatever it is given."""
+    """A machine that does not move for any input."""
 
     def __init__(self) -> None:
         self.written: list[float] = []
@@ -59,7 +59,7 @@ def served(config: Config) -> Iterator[Machine]:
 
 @contextmanager
 def by_hand(*arguments: str) -> Iterator[list[int]]:
-    """`tandem manual` beside the block, which ends with it; its exit code, once there is one."""
+    """Run `tandem manual` during the block; yield a list that gets its exit code."""
     code: list[int] = []
     session = threading.Thread(target=lambda: code.append(main(["manual", *arguments])))
     session.start()
@@ -82,13 +82,13 @@ def test_manual_control_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert "given back" in said
         assert "manual" in said
         assert U + 0.02 in machine.written
-        # Where there is no way back from such an input, it never acts: the plant says which state and when.
+        # An input from which X could not be kept never acts: the plant names the state and the time.
         machine.x = PLANT.x0
         assert main(["manual", "u=99", "--seconds", "9", *at]) == 1
         assert "would leave X within" in capsys.readouterr().out
         assert PLANT.u_max[0] not in machine.written
         machine.x = PLANT.x_e
-        # From elsewhere.
+        # From another sender.
         with by_hand(f"u={U + 0.03}", "--seconds", "30", *at) as code:
             wait_for(lambda: machine.written[-1] == U + 0.03)
             assert main(["auto", *at]) == 0
@@ -97,7 +97,7 @@ def test_manual_control_of_a_machine(tmp_path: Path, capsys: pytest.CaptureFixtu
         states = ear.of(topics.PLANT_STATE)
         notes = {one.note for name, one in ear.heard if name == topics.HEALTH["plant"].name}
     assert {state.source for state in states} - {"hold"} == {"safe", "manual"}
-    # On a busy machine many periods are no whole ones.
+    # On a busy machine many periods are incomplete.
     assert [U + 0.02] in [state.applied for state in states if state.source == "manual"]
     assert any(note.startswith("under manual control (commander-") for note in notes)
 
@@ -183,7 +183,7 @@ def test_events_that_end_a_pause() -> None:
 
 def test_inputs_are_named_and_the_others_stay() -> None:
     assert assignments(["u=1.2"], PLANT) == {"u": 1.2}
-    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a number"), ("u=inf", "finite")):
+    for text, says in (("v=1", "no input 'v'; it has u"), ("u", "with a finite number"), ("u=inf", "finite")):
         with pytest.raises(Refused, match=says):
             assignments([text], PLANT)
     scale = {"x1": 1.0, "a": 1.0, "b": 1.0}

@@ -1,4 +1,4 @@
-"""`tandem health`: what it says and its exit code for each way a process can be."""
+"""`tandem health`: its text and exit code for every status of a process."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_one_health_thread_lets_many_speak_until_they_leave(config: Config) -> N
         runs = {bus.run_id for bus in buses}
 
         def spoke(at_least: int, among: set[str]) -> bool:
-            """Each says what it is, and how it is more than once."""
+            """Each process sends its run info, and its health more than once."""
             infos = {message.run_id for message in ear.of(topics.RUN_INFO["plant"])}
             healths = [(message.run_id, message.seq) for message in ear.of(topics.HEALTH["plant"])]
             return among <= infos and all((run, at_least) in healths for run in among)

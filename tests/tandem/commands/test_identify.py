@@ -1,4 +1,4 @@
-"""`tandem identify`: what a log says of A, B and W, how good that is in the loop, and what it cannot say."""
+"""`tandem identify`: A, B and W from logs, their quality in the loop, and the logs that it refuses."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ QUICK = ["controller.oracle=constant", "controller.solver.compile=never", "train
 TANKS_FILE = ROOT / "examples" / "tanks" / "tanks.toml"
 QUADROTOR_FILE = ROOT / "examples" / "quadrotor" / "quadrotor.toml"
 LEAKING = TANKS.varied(**load(TANKS_FILE).plant.truth)
-"""The true plant: outlets a quarter larger than the model has them, and a leak."""
+"""The true plant: its outlets are a quarter larger than in the model, and it has a leak."""
 FEEDBACKS = (("[2, 4]", 0.01), ("[15, 15]", 0.1), ("[3, 12]", 0.001))
-"""x0 and R: three starts, each under another feedback."""
+"""x0 and R: three starts, each with another feedback."""
 QUADROTOR_FEEDBACKS = (
     ("[0.3, 0.3, 0.1, 0, 0, 0]", "[25, 25, 10, 1, 1, 0.1]", 0.7),
     ("[-0.3, 0.3, -0.1, 0.5, 0, 0]", "[100, 25, 1, 1, 1, 1]", 0.07),
@@ -86,7 +86,7 @@ def test_tanks_are_found_within_their_errors_and_better_than_the_model_they_ran_
     assert np.array(found["held_out"]["rms"])[0] < 0.1 * np.array(found["log_model"]["rms"])[0]
     assert (np.array(found["held_out"]["rms"]) < 0.1 * np.array(found["nothing_changes"]["rms"])).all()
     assert (np.array(found["W"]) >= 1.25 * np.array(found["held_out"]["largest"]) * TANKS.x_scale).all()
-    # What acts at x_e and the model does not know, cm in 5 s: the leak and the larger outlets.
+    # Effect at x_e that the model does not contain, cm in 5 s: the leak and the larger outlets.
     slope = np.array(LEAKING.function()(TANKS.x_e, TANKS.u_e))[:, 0]
     np.testing.assert_allclose(found["offset"], 5.0 * slope, atol=0.05)
 
@@ -122,7 +122,7 @@ def test_the_plant_file_passes_its_check_and_controls_better_than_the_wrong_mode
         run = ran(TANKS_FILE, [*linear, f"plant.model={model}"], 150)
         costs.append(summarise(run).J)
         misses.append(abs(run.plant_states[-1].x[1] - TANKS.x_e[1]))
-    # It knows the leak, so that there is no offset, and the outlets.
+    # It knows the outlets and the leak, so that there is no offset.
     assert costs[1] < 0.9 * costs[0]
     assert misses[1] < 0.1 * misses[0]
 
@@ -134,10 +134,10 @@ def test_a_quadrotor_in_wind_is_found_from_five_short_flights(tmp_path: Path, ca
         own = [f"plant.x0={x0}", f"controller.Q={q}", f"controller.R=[{r}, {r}]"]
         save(ran(QUADROTOR_FILE, [*own, "controller.horizon_seconds=0.4"], 70), files[-1])
     found = identified(capsys, *files)
-    # Positions follow from speeds exactly; accelerations are what the model does not know.
+    # Positions follow from speeds exactly; only accelerations differ from the model.
     for state in (3, 4):
         assert found["held_out"]["rms"][state] < 0.25 * found["log_model"]["rms"][state]
-    # 7 % less thrust, on the torque that nothing else disturbs.
+    # 7 % less thrust, seen in the torque, which has no other disturbance.
     nominal = build_model(QUADROTOR, 0.02).B
     np.testing.assert_allclose(np.array(found["B"])[5], 0.93 * nominal[5], rtol=1e-6)
     assert main(["identify", *files]) == 0
@@ -167,7 +167,7 @@ def test_one_linear_feedback_is_refused_with_its_equation(tmp_path: Path, capsys
 
 
 def test_a_constant_input_is_refused_by_its_name(tmp_path: Path, capsys: Capture) -> None:
-    """The pump cannot make up for the leak: it is at its end from the first sample on."""
+    """The pump cannot compensate the leak: it is at its limit from the first sample on."""
     bounds = ["plant.bounds={ q = [0.0, 8.0] }", "controller.oracle=linear"]
     save(ran(TANKS_FILE, bounds, 80), tmp_path / "run.mcap")
     text = refused(capsys, str(tmp_path / "run.mcap"))

@@ -1,4 +1,4 @@
-"""`tandem keys`: an authority and a certificate a role; who may do what is one table."""
+"""`tandem keys`: an authority, one certificate for each role, and the table of rights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tandem.cli import main
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of jet1, made once; not to be changed."""
+    """Shared keys of jet1; tests must not change them."""
     folder = tmp_path_factory.mktemp("keys") / "jet1"
     assert (
         main(
@@ -38,7 +38,7 @@ def test_each_role_has_a_certificate_that_only_its_owner_can_read(keys: Path):
     for path in [keys, *keys.rglob("*")]:
         mode = stat.S_IMODE(path.stat().st_mode)
         assert mode == (0o700 if path.is_dir() else 0o600), f"{path}: {mode:o}"
-    # The authority's key is in its own folder alone.
+    # The authority's key is only in its own folder.
     secret = (keys / "authority" / "key.pem").read_bytes()
     assert [path for path in keys.rglob("*.pem") if path.read_bytes() == secret] == [
         keys / "authority" / "key.pem"
@@ -86,7 +86,7 @@ def test_renewing_one_role_leaves_the_others_and_keeps_the_hosts(
     assert set(after["router"].hosts) == {"localhost", "127.0.0.1", "router", "10.0.0.5", "gw"}
     credentials.of_process(str(folder / "router"), "router", "jet2")
     assert not list(folder.rglob("*.new"))
-    # The authority may lie in a drawer.
+    # The authority may be in another folder.
     (folder / "authority").rename(tmp_path / "drawer")
     capsys.readouterr()
     assert main(["keys", "renew", str(folder), "--role", "trainer"]) == 2
@@ -162,7 +162,7 @@ def test_show_prints_a_whole_fingerprint_prefix_whatever_it_spells(
     )
 
 
-# -- what a process says of its own keys before it asks anybody ----------------------------------------------------
+# -- faults of its own keys that a process reports before it connects --------------------------------------------
 
 
 def _copy(keys: Path, role: str, to: Path) -> Path:

@@ -1,4 +1,4 @@
-"""`tandem model check`: a look at a plant that names all that is wrong with it, and what is worth a look."""
+"""`tandem model check` reports all faults of a plant, and notes on unusual properties."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def a_small_terminal_in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 @pytest.fixture
 def mine(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Make a plant known as "mine"."""
+    """Register a plant under the name "mine"."""
     return lambda plant: monkeypatch.setitem(PLANTS, "mine", plant)
 
 
@@ -43,13 +43,13 @@ def checked(capsys: Capture, *words: str) -> tuple[int, dict[str, Any]]:
 
 
 def refused(capsys: Capture, plant: str) -> str:
-    """The faults, without the time that parsing a command line takes."""
+    """Return the faults, without parsing a command line."""
     assert ModelCheck(plant=plant, json=True).run() == 2
     return " ".join(json.loads(capsys.readouterr().out)["faults"])
 
 
 def said(capsys: Capture, *words: str) -> tuple[int, str]:
-    """As one line, for a table breaks its sentences."""
+    """Return the output as one line, because a table breaks its sentences."""
     code = main(["model", "check", *words])
     seen = capsys.readouterr()
     assert all(len(line) <= 80 for line in seen.out.splitlines())
@@ -144,7 +144,7 @@ def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, caps
     code, found = checked(capsys, "mine")
     assert (code, found["period"]) == (0, 0.02)
     assert found["A"] == A.tolist()
-    # Of numbers that are their own truth h is zero, and no figure.
+    # For matrices that are their own truth, h is zero and not shown.
     assert found["h_sampled"] is None
     code, found = checked(capsys, "mine", "--rate", "10")
     assert code == 2
@@ -155,7 +155,7 @@ def test_matrices_in_discrete_time_are_checked_at_their_own_rate(mine: Any, caps
 
 
 def beside(**extra: Any) -> Plant:
-    """A pendulum beside a temperature that cools down by itself."""
+    """A pendulum, and a temperature that decays without input."""
     fields: dict[str, Any] = {
         "states": ("angle", "rate", "heat"),
         "units": {**PENDULUM.units, "heat": "K"},
@@ -172,15 +172,15 @@ def beside(**extra: Any) -> Plant:
 
 
 NOTES: dict[str, tuple[Plant | Known, tuple[str, ...], str, str]] = {
-    "W that h exceeds": (PENDULUM, TEN, "W", r"h exceeds W somewhere in X and U:  .*rate by a factor of \d"),
+    "W that h exceeds": (PENDULUM, TEN, "W", r"h exceeds W somewhere in X and U: .*rate by a factor of \d"),
     "W that h exceeds by far": (
         replace(PENDULUM, W=np.array([0.01, 0.001])),
         TEN,
         "W",
-        r"rate by a factor of \d\d0\. What",
+        r"rate by a factor of \d\d0\. Tightening",
     ),
     "W of zero": (beside(), TEN, "W", r"angle by a factor of infinity \(W is 0\)"),
-    "x0 outside of X": (
+    "x0 outside X": (
         replace(PENDULUM, x0=np.array([1.5, 0.0])),
         TEN,
         "x0",

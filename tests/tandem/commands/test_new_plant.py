@@ -1,4 +1,4 @@
-"""`tandem model new`: a file of two plants that is well, runs, converges and replays as it is."""
+"""`tandem model new` writes a file of two plants that passes the check, runs, converges and replays unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def checked(capsys: Capture, *words: str) -> dict[str, Any]:
-    """What `tandem model check` says, in JSON, of a plant that is well."""
+    """Return the JSON result of `tandem model check` of a plant without faults."""
     assert main(["model", "check", *words, "--json"]) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -57,7 +57,7 @@ def test_a_new_plant_file_overwrites_nothing(tmp_path: Path, capsys: Capture) ->
     Path("my.py").write_text("kept")
     for name, message in (
         ("my.py", "my.py: exists already and is not overwritten"),
-        ("my.txt", "ends in .py"),
+        ("my.txt", "end in .py"),
         ("away/my.py", "there is no folder"),
         (f"{'x' * 300}.py", "File name too long"),
     ):

@@ -1,4 +1,4 @@
-"""A plant in a file of one's own, at the command line: named, simulated, logged, and replayed without the file."""
+"""A user's plant file at the command line: named, simulated, logged, and replayed without the file."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from tests.helpers.plants.tanks import OPTIONS, TRUE, write_tanks
 
 STEPS = ("--steps", "30")
 CHUNKS = ("--set", "log.chunk_bytes=4096")
-"""Small ones, so that a log that is cut holds some."""
+"""Small chunks, so that a cut log contains some."""
 PERFECT = ("--set", "controller.oracle=perfect")
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder, and a search path that this test may have changed."""
+    """An empty folder, and a module search path that is restored after the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     return tmp_path
@@ -51,7 +51,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def elsewhere(made: Path, here: Path) -> Path:
-    """A folder with the logs alone, while the file that they name would end the process that loads it."""
+    """A folder with the logs alone. The plant file that they name would end a process that loads it."""
     for log in made.glob("*.mcap"):
         shutil.copy(log, here)
     file = made / "tanks.py"
@@ -62,7 +62,7 @@ def elsewhere(made: Path, here: Path) -> Path:
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:
-    """All that was printed, lines joined."""
+    """Return the printed output with joined lines."""
     captured = capsys.readouterr()
     return " ".join((captured.out + captured.err).split())
 
@@ -195,7 +195,7 @@ def test_bounds_and_equilibrium_of_the_configuration_are_in_the_log(
     run = read_run(here / "run.mcap")
     assert run.plant is not None
     assert (run.plant.x_e.tolist(), run.plant.u_max.tolist()) == ([1.21, 1.21], [0.12])
-    # -0.1 / (2 sqrt(x)): the equations are linear there and not where the file says.
+    # The slope -0.1 / (2 sqrt(x)) at the configured x_e, which is not the file's.
     assert run.plant.A[0, 0] == pytest.approx(-0.05 / 1.1)
     assert max(command.u[0] for command in run.commands) == pytest.approx(0.12)
     (here / "tanks.py").unlink()
@@ -274,7 +274,7 @@ def test_an_experiment_finds_the_plant_file_beside_itself_in_all_its_processes(
     assert job.key != before
 
 
-# -- what moves in the plant's place --------------------------------------------------------------------------
+# -- a user's simulator as the true plant ------------------------------------------------------------------------
 
 
 def test_an_object_with_step_moves_in_the_plants_place(here: Path, capsys: pytest.CaptureFixture[str]):

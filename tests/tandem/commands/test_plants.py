@@ -1,4 +1,4 @@
-"""A plant of one's own at the command line: a faulty one is refused by all alike, one without bounds works."""
+"""A user's plant at the command line: every command refuses a faulty one, and one without bounds works."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ COMMANDS = {
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of a run, made while the plant was sound."""
+    """The log of a run, recorded before the plant file became faulty."""
     file = tmp_path_factory.mktemp("log") / "good.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PLANTS, "integrator", INTEGRATOR)
@@ -138,7 +138,7 @@ def test_without_bounds_there_is_a_policy_for_the_controllers_silence(
     config = override(Config(), ON_TRACK)
     controller, _ = build_controller(config, build_model(config))
     seen = Observation(np.array([-0.9, 0.0]), None, 1, 0, None)
-    # A state's rows count violations in its half-widths, and in the plant's own scale where it has a bound on one side.
+    # Violations of a row count in the state's half-widths, or in the plant's scale if it has a bound on one side only.
     weighed = Rows(controller.problem).penalty.scale
     np.testing.assert_array_equal(weighed[-2:], controller.model.plant.x_scale)
     state, _ = controller.step(controller.initial_state(0), seen)

@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("known_pendulum")
 
 
 def test_a_w_that_h_leaves_only_between_samples_is_refused(cached: Path, capsys: pytest.CaptureFixture[str]):
-    """A few states in a corner of X are enough, which none of 100 samples met."""
+    """A few states in a corner of X suffice, although none of 100 samples is there."""
     sets = read_sets(cached / "sets.json")
     base = sets.certificate.pieces[0]
     W = np.array(base.W)

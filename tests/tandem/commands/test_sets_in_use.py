@@ -1,4 +1,4 @@
-"""`tandem sets` as a person meets it, and runs with the tightening `invariant`, on a plant with quick sets."""
+"""`tandem sets` at the command line, and runs with the tightening `invariant`, on a plant with quick sets."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_plant_of_numbers_has_sets_of_a_given_w(
     assert "The plant has no equations with which to check this." in capsys.readouterr().out
     assert main(["sets", "check", "given.json", *options, "--json"]) == 0
     assert told(capsys)["W"].startswith("not checked: the plant has matrices only")
-    # In force, with the pendulum's equations as the truth, replayed from numbers.
+    # The sets are in use, the pendulum's equations are the truth, and the replay has numbers only.
     monkeypatch.setitem(PLANTS, "rod", replace(PENDULUM, name="rod"))
     config = invariant("controller.sets=given.json", "plant.truth=rod", "plant.x0=[0.3,0.0]")
     ran = follow(config, 30, Faults(command_seconds=0.03)).run
@@ -147,7 +147,7 @@ def test_a_run_is_replayed_from_its_log_alone(cached: Path):
     again = replay(read_run(log))
     assert again.equal
     assert again.ticks == 30
-    # Proof that the sets matter: without them the commands differ.
+    # The sets have an effect: without them the commands differ.
     assert not replay(read_run(log), overrides=["controller.tightening=first_step"]).equal
 
 

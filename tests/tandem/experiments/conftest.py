@@ -1,4 +1,4 @@
-"""The small experiment, in a file of its own."""
+"""The small experiment as a file."""
 
 from __future__ import annotations
 

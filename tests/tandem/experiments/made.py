@@ -1,4 +1,4 @@
-"""Records and results made by hand, without a run."""
+"""Constructed records and results, without a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small experiment that several files of tests declare, run or read."""
+"""A small experiment that several test files declare, run or read."""
 
 from __future__ import annotations
 

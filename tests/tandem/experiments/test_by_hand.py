@@ -1,4 +1,4 @@
-"""By hand in lock-step and in Python: what acts, what is learned from, what is in the log, and that X is kept."""
+"""Manual control in lock-step and in Python: the acting input, learning, the log, and that X is kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tandem import Loop
 
 @pytest.fixture(scope="module")
 def loop() -> Loop:
-    """40 periods by its controller, then by hand until X would be left, then 20 by its controller, and 5 by hand."""
+    """40 periods under the controller, manual control until X would be left, 20 under the controller, 5 manual."""
     loop = Loop(config="compressor-cheap", train=False, oracle="constant")
     loop.run(40)
     loop.manual({"u": float(loop.plant.u_e[0]) + 0.2})
@@ -33,7 +33,7 @@ def test_the_acting_input_is_reported_learned_and_shown(loop: Loop) -> None:
     by_hand = [state for state in states if state.source == "manual"]
     assert {state.applied[0] for state in by_hand if state.applied} == {1.1, float(loop.plant.u_e[0]) + 0.2}
     assert [state.source for state in states[-11:]] == ["command"] * 1 + ["manual"] * 5 + ["command"] * 5
-    # Each of these periods has its label, made of what was applied.
+    # Each of these periods has a label from the applied input.
     assert len(result.run.samples) == len(result.run.ticks) - 1
     spans = result.traces.motion.by_hand
     assert len(spans) == 2

@@ -1,8 +1,8 @@
-"""Features together, in short runs in lock-step: what holds for each of them holds for all at once.
+"""Features in combination, in short lock-step runs: the requirements of each feature hold for all together.
 
-Each case is a plant with a set of features, and each run is asked for set-points, taken by hand and started again. Its
-log must replay byte for byte, from the beginning and from the middle. No input may leave U or its rate. A controller
-that goes on from its memory must have an answer to samples that are lost, late, wild or of another plant.
+Each case is a plant with a set of features. Each run gets set-points, manual control and a restart. Its log must replay
+byte for byte, from the beginning and from the middle. No input may leave U or its rate. A controller that continues
+from its memory must handle samples that are lost, late, invalid or of another plant.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ NOISY = {"noise": 0.01, "dropouts": 0.15}
 
 
 def compressor() -> Built:
-    """The network behind a dead time that is wrong, filtered, with a sensor that dies, in real-time iteration."""
+    """The network with a wrong dead time, a filter, a sensor that fails, and real-time iteration."""
     loop = Loop(
         config="compressor",
         train=False,
@@ -78,7 +78,7 @@ def compressor() -> Built:
 
 
 def quadrotor() -> Built:
-    """Two inputs with rows, one with a rate; a network with a memory; not all is measured, and a sensor sticks."""
+    """Two inputs with rows, one with a rate; a recurrent network; an unmeasured state, and a sensor that sticks."""
     loop = Loop(
         config=ROOT / "examples/quadrotor/quadrotor.toml",
         train=False,
@@ -100,7 +100,7 @@ def quadrotor() -> Built:
 
 
 def unbounded() -> Built:
-    """X and U without an end; a dead time of two and a half periods, and gaps that no estimator fills."""
+    """Unbounded X and U; a dead time of two and a half periods, and gaps without an estimator."""
     loop = Loop(
         UNBOUNDED,
         rate=10.0,
@@ -112,7 +112,7 @@ def unbounded() -> Built:
 
 
 def slow() -> Built:
-    """Six seconds a period, in discrete time, and a horizon of one."""
+    """A period of six seconds, a model in discrete time, and a horizon of one."""
     loop = Loop(
         SLOW,
         rate=1.0 / 6.0,
@@ -126,7 +126,7 @@ def slow() -> Built:
 
 
 def driven(loop: Loop, seed: int) -> Run:
-    """Asked for this and that."""
+    """Run the loop with set-points, manual control and other requests at fixed steps; return its run."""
     rng, plant, period = np.random.default_rng(seed), loop.plant, loop.config.period
     loop._lockstep.faults = Faults(command_seconds=0.3 * period)
     near, name = plant.x_e + 0.2 * plant.x_scale, plant.states[0]
@@ -162,7 +162,7 @@ def require_in_u(u: np.ndarray, plant: Description) -> None:
 
 
 def require_inputs(run: Run, plant: Description, period: float) -> None:
-    """What acted is in U, and each input within its rate of the one before it."""
+    """Assert that every applied input is in U and within its rate of the previous one."""
     step, before, who = plant.input_rates * period * (1.0 + 1e-5), None, ""
     for state in run.plant_states:
         before, who = before if state.run_id == who else None, state.run_id

@@ -1,4 +1,4 @@
-"""A dead time in the whole loop: what it costs where it is declared, that labels have no bias, that a log replays."""
+"""A dead time in the whole loop: its cost if it is declared, labels without bias, and a replay of the log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def compressor(*more: str) -> Config:
 
 
 def tanks(*more: str) -> Config:
-    """Wrong tanks behind one and a half periods, with noise and lost samples."""
+    """Wrong tanks with a dead time of one and a half periods, noise and lost samples."""
     settings = ["controller.solver.compile=never", "controller.keyframe_every=20", "plant.dead_time=7.5"]
     noisy = ["plant.sensors.noise=0.003", "estimator.kind=kalman", "plant.sensors.dropouts=0.08"]
     small = [
@@ -108,11 +108,11 @@ def test_labels_of_a_plant_that_is_as_known_are_zero(dead_time: float) -> None:
     h = np.array([result.h for result in run.results if result.h is not None])
     assert len(h) > 35
     assert np.abs(h).max() < 1e-12
-    # And so is what `tandem identify` fits.
+    # The same holds for the fit of `tandem identify`.
     model = build_model(run.config, GivenPlant(replace(CART, dead_time=dead_time)))
     found = observed(run, model)
     np.testing.assert_allclose(found.missed, 0.0, atol=1e-12)
-    # Which is not so where the dead time is not declared.
+    # It does not hold if the dead time is not declared.
     hidden = moved(CART, f"plant.truth.dead_time={dead_time}")
     assert max(np.abs(result.h).max() for result in hidden.results if result.h) > 1e-3
 
@@ -120,7 +120,7 @@ def test_labels_of_a_plant_that_is_as_known_are_zero(dead_time: float) -> None:
 def test_two_declared_periods_cost_little_and_undeclared_ones_much() -> None:
     def J(*more: str) -> float:
         found = summarise(simulate(compressor("controller.oracle=linear", *more), 120))
-        # Between samples the true motion is that of what really acted.
+        # Between samples the true motion follows from the applied input.
         assert found.excess_between_samples == 0.0
         return found.J
 

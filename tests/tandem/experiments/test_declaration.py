@@ -1,4 +1,4 @@
-"""What a file declares: strict keys, the nearest level counts, and which cases, jobs and logs follow from it."""
+"""Declarations of experiments: strict keys, precedence of the innermost level, the cases, jobs and logs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_cases_spread_over_seeds_states_and_values(small: Path) -> None:
     assert found["dnn"].x0s == [[0.4, 1.6, 1.1547, 0.0], [0.6, 1.6, 1.1547, 0.0]]
     assert found["gamma: gamma = 0.5"].config.adaptation.gamma == 0.5
     plans = list(rows(list(found.values())))
-    # linear draws nothing: one seed stands for both; so does the floor of every controller from one state.
+    # linear uses no random numbers: one seed stands for both, as does the floor of every controller from one state.
     assert len(plans) == 2 + 2 + 2 * 2 + 2
     assert len({plan.floor.key for plan in plans}) == 3
 
@@ -120,7 +120,7 @@ def test_the_innermost_setting_has_precedence(tmp_path: Path) -> None:
     assert (network.config.adaptation.gamma, network.config.adaptation.start) == (0.4, "zero")
     assert (linear.seeds, linear.label, linear.family) == ([0], "linear MPC", "own")
     assert (others.steps, others.episodes) == (20, 4)
-    # The configuration that it starts from has a horizon too, in seconds and in steps.
+    # The base configuration has a horizon too, in seconds and in steps.
     assert (others.config.controller.horizon, others.config.controller.R) == (7, [0.1])
     assert seconds.config.controller.horizon == 40
     assert seconds.config.plant.truth == {"slope": 1.4}
@@ -142,7 +142,7 @@ def test_the_shipped_experiment_is_valid_whole_and_quick() -> None:
     assert {case.group for case in quick} <= {case.group for case in whole}
     seeds = {case.name: case.seeds for case in whole}
     assert seeds["compressor: oracle = dnn"] == list(range(20))
-    # What draws nothing is the same for every seed.
+    # A case without random numbers is the same for every seed.
     assert seeds["compressor: oracle = linear"] == [0]
     assert any(len(case.x0s) == 25 for case in whole)
 
@@ -171,7 +171,7 @@ def test_cases_with_names_alike_have_a_log_each(tmp_path: Path) -> None:
     )
     wants = wanted(list(rows(cases(path))), set(), tmp_path)
     logs = [log.name for want in wants.values() for log in want.logs]
-    assert len(wants) == 2  # one job, and the floor that all are compared with
+    assert len(wants) == 2  # one job, and the floor for the comparison
     assert len(set(logs)) == len(logs) == len(names)
     assert "a-b-seed0.mcap" in logs
     assert all(log.isascii() and len(log) < 200 for log in logs)

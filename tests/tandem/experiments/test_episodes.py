@@ -91,7 +91,7 @@ def test_a_plant_that_has_drifted_starts_again_as_it_is() -> None:
     faults = Faults(drift=Drift(to={"slope": 1.4}, at=0.5))
     settings = config("controller.oracle=linear")
     first, second = incarnations(follow(settings, 20, faults, episodes=2).run).values()
-    # Until something has moved at all both are equal.
+    # Both are equal until the plant has moved.
     assert first[0].x == second[0].x
     changed = follow(settings, 20, Faults(drift=Drift(to={"slope": 1.4}, at=0.0)), episodes=1).run
     np.testing.assert_allclose(second[1].x, changed.plant_states[1].x, rtol=0.0, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Noise and an estimator in the whole loop: what is judged is the truth, and a log says all again, byte for byte."""
+"""Noise and an estimator in the whole loop: figures come from the true motion, and a log replays byte for byte."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_samples_have_the_variance_of_their_labels(lossy: Run) -> None:
 def test_a_result_has_the_weight_of_the_network_and_the_deviation_of_the_state(lossy: Run) -> None:
     after = [result for result in lossy.results if result.seq >= 5]
     deviations = np.array([result.deviation for result in after])
-    # Better than one sample, worse where there was none.
+    # Better than one sample, and worse after a missing one.
     known = np.array([lossy.ticks[result.seq].state is not None for result in after])
     assert (deviations[known] < 0.01 * PLANT.x_scale).all()
     assert deviations[~known].mean() > deviations[known].mean()
@@ -100,7 +100,7 @@ def test_the_memory_outlives_its_process_without_the_plan(lossy: Run) -> None:
     again.memory.go_on(core.memory.lasting(), "controller-a")
     for name in ("x", "disturbance", "covariance", "sample"):
         np.testing.assert_array_equal(again.memory.state.estimator[name], core.memory.state.estimator[name])
-    # From there both go on alike, and a log of either replays.
+    # From there both continue equally, and a log of either replays.
     for tick in lossy.ticks[60:70]:
         core.step(tick)
         again.step(tick)
@@ -115,7 +115,7 @@ def test_noise_that_is_found_is_in_every_tick_in_keyframes_and_in_checkpoints() 
     np.testing.assert_allclose(last / PLANT.x_scale, 0.002, rtol=0.5)
     assert summarise(run).noise == dict(zip(PLANT.states, last, strict=True))
     assert replay(run).equal
-    # In the middle of finding.
+    # While the noise is being estimated.
     assert replay(run, from_tick=45).equal
     core = ControllerCore(settings, "controller-a")
     core.memory.restore(run.keyframes[3])
@@ -149,7 +149,7 @@ def test_learning_costs_little_more_than_the_nominal_model_where_noise_exceeds_h
     linear = J("controller.oracle=linear")
     assert J() < 1.05 * linear
     assert J("adaptation.law=kalman") < 1.05 * linear
-    # What it was without any of it.
+    # The value without any of these.
     assert J("estimator.kind=none") > 3.0 * linear
 
 
@@ -167,7 +167,7 @@ def test_a_stuck_and_a_dead_sensor_are_named_in_the_log_and_not_learned_from(mis
     assert named[-1] == {"y", "rdot"}
     lost = [tick.state for tick in misled.ticks if tick.t > 0.99]
     assert all(state is not None and state.missing == ["rdot"] for state in lost)
-    # Of a stuck y the label would be what the model says it should have moved.
+    # The label of a stuck y would be the motion that the model predicts.
     labels = np.array([sample.h for sample in misled.samples if sample.seq > 12])[:, 1]
     assert np.abs(labels).max() < 0.02 * PLANT.x_scale[1]
     assert np.abs(true(misled)[:, 1] - PLANT.x_e[1]).max() < PLANT.x_scale[1]

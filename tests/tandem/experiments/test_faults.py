@@ -1,4 +1,4 @@
-"""What goes wrong in a lock-step run, the oracle that knows h, K refitted at an adoption, and Lemma 1 on a real run."""
+"""Faults in lock-step runs, the oracle with the true h, K refitted at an adoption, and Lemma 1 on a real run."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_a_late_command_acts_later_and_the_controller_knows_it() -> None:
 def test_a_late_trainer_is_late_and_trains_once_at_a_time() -> None:
     run = follow(config(), 60, Faults(training_seconds=1.0)).run
     arrived = [tick.seq for tick in run.ticks if tick.weights is not None]
-    # 20 samples are there at tick 20; what is trained then takes 20 ticks.
+    # 20 samples exist at tick 20; the training then takes 20 ticks.
     assert arrived == [40]
 
 
@@ -175,7 +175,7 @@ def test_the_true_plant_moves_by_its_own_parameters_and_only_perfect_knows() -> 
         np.testing.assert_allclose(
             truth.step(np.array(state.x), np.array(command.u), 0.05), after.x, atol=1e-12
         )
-    # The model is the nominal one: its first plan is made of the same numbers, whatever the truth.
+    # The model is the nominal one: its first plan does not depend on the truth.
     assert runs["linear", 1.4].commands[0].plan == runs["linear", 1.5].commands[0].plan
     assert np.abs(states(runs["linear", 1.4]) - states(runs["linear", 1.5])).max() > 1e-2
     assert prediction_errors(runs["perfect", 1.4]).max() < 1e-8

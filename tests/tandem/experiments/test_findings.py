@@ -1,4 +1,4 @@
-"""Verdicts of the report: each follows from the rows by a rule, and few runs give no verdict."""
+"""Verdicts of the report follow from the rows by rules, and too few runs give no verdict."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TAIL = "The p99 of the solve time of the network is less than that of L2NW"
 
 
 def compared(costs: list[float], **changes: Any) -> dict[str, findings.Claim]:
-    """The claims, by statement, of a network with these J; linear MPC has a regret of 50 %."""
+    """Return the claims of a network with these J, by statement; linear MPC has a regret of 50 %."""
     others: list[CaseResult] = [
         a_result("linear MPC", [30.0], oracle="linear"),
         a_result("L2NW", [25.0], overshoot=0.4, oracle="l2nw"),

@@ -1,4 +1,4 @@
-"""A call in a process of its own: whatever it does ends that process, and the caller goes on."""
+"""A call in a separate process: any failure ends only that process, and the caller continues."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def test_an_exception_is_told_with_its_traceback_and_the_process_goes_on(child: 
     ("what", "why"),
     [
         ((os._exit, 3), "ended with exit code 3"),
-        ((os.abort,), "ended by SIGABRT"),
-        ((exec, "import os; os.kill(os.getpid(), 9)"), "ended by SIGKILL, perhaps by the system for want of memory"),
+        ((os.abort,), "killed by SIGABRT"),
+        ((exec, "import os; os.kill(os.getpid(), 9)"), "killed by SIGKILL, perhaps by the system because memory"),
     ],
     ids=["exit", "abort", "kill"],
 )  # fmt: skip
-def test_a_crash_is_told(child: Child, what: tuple[Any, ...], why: str) -> None:
+def test_a_crash_is_reported(child: Child, what: tuple[Any, ...], why: str) -> None:
     failed = call(child, *what)
     assert isinstance(failed, Failure)
     assert failed.kind == "crash"
@@ -73,7 +73,7 @@ def test_a_crash_is_told(child: Child, what: tuple[Any, ...], why: str) -> None:
 def test_a_call_that_never_ends_is_stopped(child: Child, endless: str) -> None:
     failed = call(child, exec, endless, limits=Limits(seconds=0.5))
     assert failed.kind == "time"
-    assert failed.text == "stopped: it had not ended after 0.5 s"
+    assert failed.text == "stopped: it did not end within 0.5 s"
     assert not child.usable
 
 

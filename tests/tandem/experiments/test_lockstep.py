@@ -1,4 +1,4 @@
-"""The closed loop in lock-step: what the paper claims, on every seed, and bit for bit the same twice."""
+"""The closed loop in lock-step: the paper's claims on every seed, and bitwise equal repetitions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run_summary(case: tuple[str, int, bool]) -> Summary:
 
 @pytest.fixture(scope="module")
 def results() -> dict[tuple[str, int, bool], Summary]:
-    """Every run that these tests compare, on both cores; a run is the same in any process."""
+    """All runs that these tests compare, on both cores; a run is the same in any process."""
     cases = [("linear", 0, False), ("l2nw", 0, False)]
     cases += [("dnn", seed, adapt_only) for seed in SEEDS for adapt_only in (False, True)]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -92,7 +92,7 @@ def test_a_run_is_bit_identical_for_a_seed_and_differs_for_another() -> None:
 
 @pytest.mark.long
 def test_another_rate_settles_too() -> None:
-    # To compile a solver that nothing else uses takes longer than the run without.
+    # Compiling a solver for one run takes longer than the run without it.
     settings = ["rate=30", "controller.horizon=90", "controller.solver.compile=never"]
     summary = summarise(simulate(load(None, settings), 300))
     assert summary.constraint_violations == 0

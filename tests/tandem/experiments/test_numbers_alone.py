@@ -27,7 +27,7 @@ SETTINGS = [
 
 
 def matrices(period: float | None = None) -> Known:
-    """The pendulum's, beside all else that it has."""
+    """Return the matrices of the pendulum with all its other fields."""
     _rest, a, b = PENDULUM.linearised()
     if period is not None:
         a, b = discretise(a, b, period)
@@ -48,7 +48,7 @@ def configured(model: str, *settings: str) -> Config:
 
 
 def said(run: Run) -> tuple[list[bytes], list[bytes]]:
-    """What the plant and the controller said, as it travels."""
+    """Return the encoded messages of plant and controller."""
     return [codec.encode(state) for state in run.plant_states], [codec.encode(one) for one in run.commands]
 
 
@@ -87,7 +87,7 @@ def test_features_that_need_equations_say_so() -> None:
 
 
 def test_a_known_wind_leaves_no_offset() -> None:
-    """The linear oracle learns nothing: where the model has the wind the plant comes to rest where it should."""
+    """The linear oracle does not learn. With the wind in the model the plant still settles at its target."""
     weights = "controller.Q=[25.0, 25.0, 10.0, 1.0, 1.0, 0.1]", "controller.R=[0.7, 0.7]"
     start = "plant.x0=[-0.5,0,0,0,0,0]"
     ends = {}

@@ -1,4 +1,4 @@
-"""The page: its words follow from the rows, its plots have data, and it needs no other file."""
+"""The page: its texts follow from the rows, its plots have data, and it needs no other file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STRANGE = "network </script><b>"
 
 
 class Parsed(HTMLParser):
-    """The page as text, verdicts, links and the JSON of its charts."""
+    """Text, verdicts, links and chart data of the page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ def of_group(result: CaseResult, group: str) -> CaseResult:
 
 
 def made(seeds: int, quick: bool, solves: int = 40) -> Parsed:
-    """The page of the paper's comparison with so many seeds of the network."""
+    """Return the page of the paper's comparison with this number of seeds of the network."""
     traced = {"traces": TRACES, "solve_ms": [1.0] * solves}
     results = [
         a_result("linear MPC", [30.0], oracle="linear", **traced),

@@ -31,7 +31,7 @@ def test_figures_of_several_episodes_are_those_with_a_memory() -> None:
     assert row.J_by_episode == [30.0, 21.0, 23.0]
     assert row.regret_by_episode == pytest.approx([0.5, 0.05, 0.15])
     assert (row.J, row.regret, row.deviation) == pytest.approx((22.0, 0.1, 0.8 * 22.0))
-    # Lost in the second episode: only the first one is known.
+    # The plant was lost in the second episode: only the first is known.
     (row,) = collected(job, [first], floor, lost="at step 3 of 200 in episode 2 of 3").rows
     assert row.J_by_episode == [30.0, None, None]
     assert (row.J, row.regret, row.J_first) == (None, None, 30.0)

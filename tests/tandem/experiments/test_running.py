@@ -1,4 +1,4 @@
-"""Running: the same figures for any number of processes and after an interruption; a page that needs nothing else."""
+"""Runs give the same figures for any number of processes and after an interruption; the page needs no other file."""
 
 from __future__ import annotations
 
@@ -128,13 +128,13 @@ def test_only_what_is_missing_or_damaged_runs_again(finished: tuple[Path, Finish
 
 @pytest.mark.long
 def test_an_interrupted_experiment_continues(small: Path, tmp_path: Path) -> None:
-    # The other process reads the code anew; so must this one, if a file is edited while tests run.
+    # The other process reads the code again. This one must too, because files may be edited while tests run.
     code_version.cache_clear()
     small.write_text(SMALL.replace("steps = 30", "steps = 150"))
     out = tmp_path / "out"
     command = [sys.executable, "-m", "tandem", "experiment", str(small), "--out", str(out), "--jobs", "1"]
     command += ["--only", "comparison"]
-    # Who runs the tests in the background of a shell runs them with SIGINT ignored, and that is inherited.
+    # Tests in the background of a shell run with SIGINT ignored, and child processes inherit that.
     started = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -166,7 +166,7 @@ def test_workers_import_nothing_from_the_current_folder(small: Path, tmp_path: P
     here = tmp_path / "here"
     here.mkdir()
     write_namesakes(here)
-    # As the installed `tandem`, whose own path begins with its folder.
+    # As with the installed `tandem`, whose module path begins with its own folder.
     program = "import sys; sys.path.remove(''); from tandem.cli import main; sys.exit(main())"
     arguments = ("experiment", str(small), "--only", "rows", "--out", "out", "--jobs", "1")
     done = python("-c", program, *arguments, cwd=here)

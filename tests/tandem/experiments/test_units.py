@@ -1,4 +1,4 @@
-"""The unit that a state or an input is counted in changes no decision: the same plant in others is the same loop."""
+"""The units of states and inputs change no decision: the same plant in other units gives the same loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.helpers.rescaled import rescaled
 
 STEPS = 50
 ORACLES = ("linear", "constant", "l2nw", "dnn", "dnn adaptation.law=kalman", "perfect")
-"""Names, with what else is set behind them."""
+"""Oracles, each with its settings."""
 COMPRESSOR = PLANTS["moore_greitzer"]
 TWO = (2.0**20, 2.0**-20, 2.0**7, 2.0**-11), (2.0**-17,)
 TEN = (1e6, 1e-6, 1e-3, 1e4), (1e5,)
@@ -27,7 +27,7 @@ Q, R = np.array([1.0, 2.0, 0.1, 0.01]), np.array([0.5])
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """What a run did, in shares of the half-widths."""
+    """Results of a run, in shares of the half-widths."""
 
     x: np.ndarray
     u: np.ndarray
@@ -87,7 +87,7 @@ def test_in_units_of_powers_of_ten_the_loop_is_the_same_up_to_rounding(oracle: s
 
 @pytest.mark.parametrize("oracle", ["linear", "dnn"])
 def test_a_violated_state_constraint_has_the_same_share_in_any_units(oracle: str) -> None:
-    """From where X cannot be kept: the penalty decides, and the row with the largest share is named."""
+    """From a state where X cannot be kept, the penalty decides, and the row with the largest share is named."""
     low = [0.1, 1.2, COMPRESSOR.x0[2], 0.0]
     plant = replace(COMPRESSOR, x0=np.array(low))
     here, there = run(plant, np.ones(4), np.ones(1), oracle, 20), run(plant, *map(np.array, TWO), oracle, 20)

@@ -1,4 +1,4 @@
-"""Set-points by turns: what is asked, where the true plant rests, and what a cycle costs."""
+"""Periodic set-points: the references, the equilibria of the true plant, and the cost of a cycle."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def test_an_episode_is_a_cycle_and_the_plant_continues(tmp_path: Path) -> None:
         assert len(record.episodes) == CYCLES
         assert len(record.traces.x) == STEPS * CYCLES + 1
         y = np.array(record.traces.x)[:, 1]
-        assert np.abs(np.diff(y)).max() < 0.1  # it is not put back to x0
+        assert np.abs(np.diff(y)).max() < 0.1  # it is not reset to x0
         found[plan.case.config.controller.oracle] = [one.J for one in record.episodes]
         assert record.episodes[1].overshoot == {"y": None}
-    # About the true plant's rests, nothing costs less for long than what knows h.
+    # Relative to the true plant's equilibria, no oracle has a lasting lower cost than the true h.
     assert found["perfect"][1] < 0.5 * found["linear"][1]
 
 
@@ -89,7 +89,7 @@ def test_to_stay_where_the_true_plant_rests_costs_nothing(tmp_path: Path) -> Non
     job = msgspec.structs.replace(next(rows(cases(path))).job, steps=6, episodes=1)
     record = record_of(job)
     assert record.episodes[0].J < 1e-9
-    assert record.performance.J > 1e-5  # about (x_e, u_e) it is something
+    assert record.performance.J > 1e-5  # relative to (x_e, u_e) the cost is positive
 
 
 @pytest.mark.parametrize(

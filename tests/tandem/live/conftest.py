@@ -1,4 +1,4 @@
-"""A monitor that has heard of everything once."""
+"""A monitor that has received every kind of message once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.tandem.live.heard import CONFIG, PLANT, START, command, delivery, hea
 
 @pytest.fixture
 def monitor() -> Monitor:
-    """Two and a half seconds of a run in which everything happened once."""
+    """Two and a half seconds of a run with every kind of event."""
     seen = Monitor(CONFIG, PLANT, 20.0)
     for process in topics.PROCESSES:
         counters = (

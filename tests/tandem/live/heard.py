@@ -1,4 +1,4 @@
-"""Messages of a run as a live view hears them."""
+"""Messages of a run as a live view receives them."""
 
 from __future__ import annotations
 

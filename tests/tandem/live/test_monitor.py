@@ -1,4 +1,4 @@
-"""What the monitor of a run makes of messages: counts, events, and who is silent."""
+"""The monitor of a run: counts, events, and silent processes."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_plant_that_publishes_only_states_counts_as_running() -> None:
     seen.feed(delivery(topics.PLANT_STATE, state(0), START))
     assert plant_row(seen.snapshot(START + 1.0)) == ("running", "publishes only states")
     assert plant_row(seen.snapshot(START + 3.0)) == ("silent", "")
-    # One that was chatty may be followed by one that is not.
+    # A plant that sends health may be followed by one that does not.
     seen.feed(delivery(topics.HEALTH["plant"], health("plant", {}, "as usual"), START + 3.0))
     assert plant_row(seen.snapshot(START + 3.0)) == ("running", "as usual")
     assert plant_row(seen.snapshot(START + 6.0)) == ("silent", "as usual")
@@ -140,9 +140,9 @@ def test_begin_and_end_of_manual_control_are_reported() -> None:
         seen.feed(delivery(topics.PLANT_STATE, driven, START + k))
         seen.feed(delivery(topics.COMMAND, command(k), START + k))
         now = seen.snapshot(START + k)
-        # What is shown of the input is what acts.
+        # The display shows the acting input.
         assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
-    assert [event.text for event in now.events if "hand" in event.text] == [
+    assert [event.text for event in now.events if "manual" in event.text] == [
         "the plant is under manual control",
         "the plant is no longer under manual control; the input comes from: plan",
     ]

@@ -1,4 +1,4 @@
-"""`tandem run --no-plant`: it waits for a plant, takes one that uses none of its code, and another after that."""
+"""`tandem run --no-plant` waits for a plant, accepts one without Tandem's code, and then another one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`tandem run` with its real processes: what it leaves, what it survives, and that nothing is left running."""
+"""`tandem run` with its real processes: its files, the failures that it survives, and that no process remains."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.live
 
 
 def live() -> list[str]:
-    """Arguments for a run that browsers can look at."""
+    """Return the arguments for a run with a live view in the browser."""
     pytest.importorskip("websockets", reason="pip install 'tandem-control[live]'")
     return ["--live", "--set", f"live.port={free_endpoint().rpartition(':')[2]}"]
 
@@ -67,7 +67,7 @@ def test_a_run_leaves_figures_log_and_picture_and_restarts_its_trainer(tmp_path:
 
 def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
     with socket.socket() as other:
-        # A live view that finds its port taken is no reason not to run.
+        # A run starts even if the port of the live view is in use.
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
@@ -91,7 +91,7 @@ def test_a_closed_terminal_ends_the_display_and_not_the_loop(tmp_path: Path, out
     done = subprocess.run(
         ["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
-    # A full disk is said by the exit code: the figures are lost. A reader may leave.
+    # The exit code reports a full disk, because the figures are lost. A closed pipe is not an error.
     assert done.returncode == (1 if "full" in output else 0), done.stderr
     assert done.stderr == ""
     ran = read_run(log)
@@ -126,7 +126,7 @@ def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
         time.sleep(0.5)  # sooner it would count as the same Ctrl-C
         run.signal(signal.SIGINT)
         code, result = run.ends()
-    # Had it waited for them to stop, as after a first Ctrl-C, it would have ended otherwise.
+    # After a first Ctrl-C it would have waited for them to stop, with another exit code.
     assert code == 130, run.said
     assert "tandem recover" in result["error"]
 

@@ -1,4 +1,4 @@
-"""What the live view shows of what the monitor knows, and that it fits every terminal."""
+"""The live view shows the monitor's data and fits every terminal."""
 
 from __future__ import annotations
 

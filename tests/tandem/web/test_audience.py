@@ -1,4 +1,4 @@
-"""Viewers and channels: who gets what, in bounded memory, and what is refused."""
+"""Viewers and channels: delivery in bounded memory, and refused requests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATE, EVENTS = channel("plant/state", "t"), channel("events", "text")
 
 @pytest.fixture
 def audience() -> Audience:
-    """Keeps two events and no state."""
+    """Two channels: the server keeps two events, and no state."""
     there = Audience("a name", "a session", {"plant": "jet1"}, lambda topic: 2 if "events" in topic else 0)
     for one in (STATE, EVENTS):
         there.advertise(one)
@@ -30,7 +30,7 @@ def audience() -> Audience:
 
 
 def frames(viewer: Viewer) -> list[Any]:
-    """All that waits: text as objects, messages as (subscription, time in ns, payload)."""
+    """Return the waiting data: text as objects, messages as (subscription, time in ns, payload)."""
 
     def drain() -> Iterator[str | bytes]:
         while viewer._words or viewer._data:
@@ -102,7 +102,7 @@ def test_a_channel_with_more_fields_takes_the_place_of_the_former(audience: Audi
     assert now["id"] not in (1, 2)
     assert json.loads(now["schema"]) == wider.schema
     assert viewer.subscriptions == {}
-    # The viewer has to subscribe again, and misses nothing of what is kept.
+    # The viewer must subscribe again, and receives every kept message.
     subscribe(audience, viewer, (9, now["id"]))
     assert frames(viewer) == [(9, 1, b"old"), (9, 2, b"new")]
     late = audience.enter()

@@ -1,4 +1,4 @@
-"""The layout for Foxglove and Lichtblick: it leads to fields that there are, for the names of any plant."""
+"""The layout for Foxglove and Lichtblick names existing fields, for any plant."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_every_series_is_a_number_that_is_in_the_schema_of_its_channel(plant: An
             schema = schema["properties"].get(field, {"type": "nothing", "properties": {}})
         if schema["type"] != "number":
             missing.add(path)
-    # A state or an input that is not bounded has no bound to show.
+    # An unbounded state or input has no series of bounds.
     assert all(".x_m" in path or ".u_m" in path for path in missing), missing
     shown = {path for path in paths if path not in missing}
     for name in plant.states:

@@ -1,4 +1,4 @@
-"""`tandem live` on a real bus: a client of its socket hears the bus, and the bus hears nothing of the client."""
+"""`tandem live` on a real bus: a client of its socket receives the bus, and sends nothing to it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ async def connected(config: Config) -> ClientConnection:
 
 
 async def subscribed(socket: ClientConnection) -> dict[int, str]:
-    """Subscribe to what is in `TOPICS`; the topics by the numbers of the subscriptions."""
+    """Subscribe to `TOPICS`; return the topics by subscription number."""
     assert json.loads(await socket.recv())["op"] == "serverInfo"
     advertised = json.loads(await socket.recv())["channels"]
     numbers = {one["id"]: one["topic"] for one in advertised if one["topic"] in TOPICS}
@@ -55,7 +55,7 @@ async def subscribed(socket: ClientConnection) -> dict[int, str]:
 
 
 async def hear(socket: ClientConnection, numbers: dict[int, str], topic: str) -> dict:
-    """The next message of a topic."""
+    """Return the next message of a topic."""
     async with asyncio.timeout(HANG_S):
         while True:
             frame = await socket.recv()
@@ -90,7 +90,7 @@ def test_the_bus_is_heard_across_a_restart_and_what_a_client_publishes_goes_nowh
         first = await hear(socket, numbers, "view/plant/state")
         said.cancel()
         assert first["x"] == {"z": 0.5, "y": 1.6, "r": 1.1, "rdot": 0.0}
-        # Who comes late has the bounds at once: nothing is published meanwhile.
+        # A late viewer gets the bounds at once, although nothing is published meanwhile.
         late = await connected(config)
         assert (await hear(late, await subscribed(late), "view/bounds"))["x_min"]["z"] == 0.0
         await late.close()
@@ -102,7 +102,7 @@ def test_the_bus_is_heard_across_a_restart_and_what_a_client_publishes_goes_nowh
         while refused < 2:
             frame = await asyncio.wait_for(socket.recv(), HANG_S)
             refused += isinstance(frame, str) and json.loads(frame)["op"] == "status"
-        # A payload that is no message is passed over.
+        # An invalid payload is ignored.
         bus._put(topics.PLANT_STATE, b"nonsense")
         bus.publish(topics.PLANT_STATE, state(bus, LAST))
         while (await hear(socket, numbers, "view/plant/state"))["seq"] != LAST:

@@ -1,4 +1,4 @@
-"""Which pages of a browser may read the socket."""
+"""The web pages that may read the socket."""
 
 from __future__ import annotations
 

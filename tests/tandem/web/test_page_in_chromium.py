@@ -1,4 +1,4 @@
-"""The page of `tandem live` in headless Chromium, before a real system whose processes are started again."""
+"""The page of `tandem live` in headless Chromium, with a real system whose processes restart."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ COLOURED = """() => plots.filter((plot) => plot.visible).map(({u}) => {
   for (let i = 0; i < pixels.length; i += 4) found += pixels[i + 3] > 0 && pixels[i] !== pixels[i + 2];
   return found;
 })"""
-"""Pixels of each plot in sight that are neither empty nor grey: lines and bounds."""
+"""Number of coloured pixels of each visible plot: lines and bounds."""
 
 
 class System:
-    """A running system whose processes can be started again, one by one."""
+    """A running system whose processes can be restarted one by one."""
 
     def __init__(self, stack: ExitStack, config: Config):
         self._stack, self.config = stack, config
@@ -64,7 +64,7 @@ def system() -> Iterator[System]:
 
 @pytest.fixture
 def page() -> Iterator[Any]:
-    """A page that remembers what went wrong on it, and what it asked for."""
+    """A page that keeps its errors and its requests."""
     with playwright.sync_playwright() as chromium:
         browser = chromium.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         there = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -77,12 +77,12 @@ def page() -> Iterator[Any]:
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait for it to be true. Playwright's own way needs eval, which the page's policy denies."""
+    """Wait until it is true. Playwright's own function needs eval, which the page's policy denies."""
     wait_for(lambda: page.evaluate(expression), every=0.1)
 
 
 def plots_on(page: Any) -> None:
-    """Wait until more comes than there is now, and is drawn."""
+    """Wait until new data arrive and are drawn."""
     rows = page.evaluate(ROWS)
     until(page, f"{ROWS} > {rows} + 20")
     until(page, f"({COLOURED})().every((found) => found > 100)")
@@ -94,7 +94,7 @@ def test_it_plots_and_survives_a_restart_of_every_process(system: System, page: 
         try:
             page.goto(at)
             break
-        except playwright.Error:  # the server is not there yet
+        except playwright.Error:  # the server is not running yet
             page.wait_for_timeout(200)
     until(page, "plots.length > 0")
     plots_on(page)

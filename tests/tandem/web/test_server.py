@@ -1,4 +1,4 @@
-"""The server on a port of this machine, and clients that are a browser, a program, or neither."""
+"""The server on a port of this machine, with browsers, programs and invalid clients."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_page_of_another_origin_or_name_is_refused_before_it_hears_anything():
                 assert refused.value.response.status_code == 403
             async with client(at, origin=f"http://{at}") as socket:
                 assert json.loads(await socket.recv())["op"] == "serverInfo"
-            # The page of a name that was made to lead here: it has an origin of its own, and no page either.
+            # A foreign host name that resolves to this machine: its origin is refused, and it gets no page.
             status, _, _ = await asyncio.to_thread(get, at, "/", Host="example.com:8765")
             assert status == 403
             with pytest.raises(InvalidStatus) as refused:

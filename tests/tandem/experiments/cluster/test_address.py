@@ -1,4 +1,4 @@
-"""Which addresses of a scheduler are used."""
+"""The addresses of a scheduler that are accepted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files that travel with a sweep, and the configuration that finds them where they arrive."""
+"""The files that a sweep sends to workers, and the configuration with their paths there."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_every_reference_finds_its_file_where_it_was_unpacked(folder: Path, tmp_
         assert str(text).startswith(str(root))
     assert here.plant.model.endswith("tanks.py:TANKS")
     assert Path(str(here.controller.sets)).read_bytes() == b"sets"
-    # Of certified sets the file alone travels; here its folder is that of a file with code as well.
+    # Only the file of certified sets is sent; here its folder also contains a file with code.
     assert moved(config(folder), root) == config(folder)
 
 
@@ -70,7 +70,7 @@ def test_packages_and_shipped_plants_stay_as_they_are(folder: Path, tmp_path: Pa
 
 def test_a_folder_that_is_too_large_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bundle, "LARGEST", 10)
-    with pytest.raises(ConfigError, match=f"{folder}: its files would travel .* folder of its own"):
+    with pytest.raises(ConfigError, match=f"{folder}: its files must be sent .* folder of its own"):
         gather([config(folder, plant={"model": "tanks.py:TANKS"})])
 
 

@@ -1,4 +1,4 @@
-"""A sweep on a real scheduler and two workers: the rows of one process, bit by bit, and what fails stays alone."""
+"""A sweep on a real scheduler with two workers gives the rows of one process, bit by bit; failed runs stay alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tandem.experiments.study.runner import Made, Processes, Workplace, run_all,
 from tests.helpers.dask_cluster import DaskCluster, dask_cluster
 
 pytestmark = pytest.mark.live
-# A true plant that comes from a file, with a neighbour; a case that kills its process, and one that raises.
+# A true plant from a file that imports another; a case that kills its process, and one that raises.
 TRUTH = """
 import os
 from lbmpc.plants import get_plant
@@ -130,7 +130,7 @@ def test_a_cluster_makes_the_rows_of_one_process_and_a_run_that_fails_fails_alon
         assert failure.where in ("first", "second")
     (killed,) = by_kind["crash"]
     assert "SIGKILL" in killed.text
-    # One for each of both with the true h, which cannot be had of a plant without equations.
+    # One for each of both with the true h, which a plant without equations does not have.
     raised = [failure for failure in by_kind["error"] if failure.text.startswith("SystemExit")]
     assert (len(raised), len(by_kind["error"])) == (1, 3)
     assert raised[0].text == "SystemExit: this plant cannot be moved"

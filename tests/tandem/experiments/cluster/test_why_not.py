@@ -1,4 +1,4 @@
-"""Which workers are refused, and what is said of them."""
+"""The workers that are refused, and the reasons that are reported."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_worker_like_this_process_is_taken() -> None:
         ),
         (msgspec.structs.replace(OURS, missing=["mcap"]), "mcap is missing"),
         (msgspec.structs.replace(OURS, code="0"), "the same version of Tandem with other code"),
-        (Failure(kind="error", text="ImportError: x", traceback=""), "Tandem does not run there: ImportError: x"),
+        (Failure(kind="error", text="ImportError: x", traceback=""), "Tandem does not run on it: ImportError: x"),
     ],
     ids=["version", "torch", "mcap", "code", "broken"],
 )  # fmt: skip
