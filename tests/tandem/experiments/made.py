@@ -9,7 +9,7 @@ import msgspec
 from run_log.reporting.performance import Performance
 from tandem.experiments.study import results
 from tandem.experiments.study.plan import Job, rows
-from tandem.experiments.study.runner import Timing
+from tandem.experiments.study.timing import Timing
 from tandem.experiments.study.work import Record
 from tests.tandem.experiments.small import PLANT, SHIPPED, cases
 
