@@ -68,12 +68,16 @@ def test_each_change_of_a_result_is_reported_once_with_its_level() -> None:
         ({"weights_rolled_back": "worse than before"}, Level.WARNING, "rolled back: worse than before"),
         ({"sensor_faults": {"y": "stuck; estimated"}}, Level.ERROR, "sensor y is stuck"),
         ({}, Level.INFO, "sensor y is trusted again"),
-        ({"reference_verdict": "taken", "reference_from": "h-1"}, Level.INFO, "reference taken"),
+        (
+            {"reference_verdict": "taken", "reference_from": "h-1", "reference": {"y": 1.7}},
+            Level.INFO,
+            "reference taken; now y 1.7",
+        ),
         ({"reference_verdict": "refused: outside X", "reference_from": "h-1"}, Level.WARNING, "outside X"),
         ({"set_margin": -0.1}, Level.ERROR, "outside the certified sets"),
         ({"set_margin": 0.1}, Level.INFO, "inside the certified sets again"),
-        ({"target_status": "no rest"}, Level.WARNING, "target: no rest"),
-        ({}, Level.INFO, "target: none"),
+        ({"target_status": "no rest"}, Level.WARNING, "no steady state was found"),
+        ({}, Level.INFO, "the plan aims at the equilibrium"),
     ]:  # fmt: skip
         (event,) = (
             one for one in told.by(topics.RESULT, RESULT, 600.0, **changes) if words in one["message"]

@@ -144,5 +144,5 @@ def test_begin_and_end_of_manual_control_are_reported() -> None:
         assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
     assert [event.text for event in now.events if "manual" in event.text] == [
         "the plant is under manual control",
-        "the plant is no longer under manual control: plan",
+        "the plant is no longer under manual control; the input comes from: plan",
     ]
