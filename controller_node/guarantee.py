@@ -41,12 +41,12 @@ def _of_known_states(config: Config, model: Model, sets: CertifiedSets | None) -
             return "guaranteed: nothing; the constraints of the nominal prediction are not tightened"
         case "first_step":
             return (
-                "guaranteed: the next state, at its sample, is in X for every disturbance in W, from states where the "
+                "guaranteed: the next state, at its sample, is in X for every h in W, from states where the "
                 "plan satisfies its first constraint; nothing for later steps"
             )
         case "tube":
             return (
-                "guaranteed: X and U at every sample, for all time and every disturbance in W, from every state from "
+                "guaranteed: X and U at every sample, for all time and every h in W, from every state from "
                 "which the problem is feasible once; W is assumed, not proved"
             )
     return _of_sets(find_sets(config, model) if sets is None else sets, start_of(config, model))

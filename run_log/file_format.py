@@ -12,7 +12,7 @@ from run_log.errors import LogError
 
 PROFILE = "tandem"
 """The MCAP profile, which distinguishes logs of Tandem from other MCAP files."""
-VERSIONS = {1: "0.1.0", 2: "0.2.0", 3: "0.2.0"}
+VERSIONS = {1: "0.1.0", 2: "0.2.0", 3: "0.3.0"}
 """First version of Tandem with each format. A new format is due when an older reader would misread a log."""
 FORMAT = max(VERSIONS)
 """Number of the format that is written: it determines channels, attachments and metadata."""

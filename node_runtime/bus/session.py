@@ -198,7 +198,9 @@ def _connect(config: Config, stop: threading.Event, process: str, tls: TlsClient
             raise ConfigError(f"no link to the router at {endpoint}: {reason}")
         if not told and clock.now() - started > 2.0:
             told = True
-            log.warning("no router at %s yet; waiting for it (start it with `tandem router`)", endpoint)
+            log.warning(
+                "no router at %s yet; waiting for it. `tandem run` and `tandem router` start one", endpoint
+            )
     try:
         return result.result()
     except zenoh.ZError as error:

@@ -187,8 +187,8 @@ class ControllerConfig(Section, frozen=True):
     """Time from when a plant sample is due until the controller's slot. Without it 1 ms, and at most a quarter of a
     period."""
     input_delay_ms: Annotated[float, msgspec.Meta(ge=0, le=500.0 * LONGEST_PERIOD), unit("ms")] | None = None
-    """Time from a sample until its command acts, until the plant has shown it. Without it 0 in lock-step, and live
-    the phase plus the usual time of an answer."""
+    """First value of the time from a sample until its command acts; the samples of the plant then show the real one.
+    Without it 0 in lock-step, and live the phase plus the usual time of an answer."""
     checkpoint: str = ""
     """File from which a controller that starts again takes its memory. "": none."""
     solver: SolverConfig = SolverConfig()

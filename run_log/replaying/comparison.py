@@ -35,7 +35,7 @@ class Comparison:
         self.keyframes = 0
         self.first: Difference | None = None
         self.differing: set[tuple[str, int]] = set()
-        """(run, tick)."""
+        """(run, tick); tick -1 is the memory before the first tick."""
         self.largest: float | None = 0.0
         """See `ReplayResult.largest_difference`."""
 

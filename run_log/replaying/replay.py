@@ -112,7 +112,7 @@ def replay(
         ticks=comparison.ticks,
         equal=equal,
         first_difference=comparison.first,
-        differing_ticks=len(comparison.differing),
+        differing_ticks=sum(tick >= 0 for _, tick in comparison.differing),
         largest_difference=largest,
         keyframes=comparison.keyframes,
         first_tick=segments[0].start + 1,

@@ -17,6 +17,13 @@ BURST = 10
 """Number of events of one kind that are shown at once. Then one is shown every `APART_NS`, with the omitted number."""
 APART_NS = 500_000_000
 MOST_SENDERS = 100
+TARGETS = {
+    "none": "the plan aims at the equilibrium",
+    "reached": "the plan aims at the set-point",
+    "nearest": "the set-point is out of reach, and the plan aims at the nearest steady state",
+    "no rest": "no steady state was found inside X and U",
+}
+"""Status of the target, in words."""
 
 
 class Level(IntEnum):
@@ -176,7 +183,7 @@ class Events:
             adopted = verdict == "adopted"
             text = f"version {result.hidden_version} adopted" if adopted else verdict
             level = Level.INFO if adopted else Level.WARNING
-            yield self._say("weights", level, "controller", f"{who}: hidden weights: {text}")
+            yield self._say("weights", level, "controller", f"{who}: hidden weights {text}")
         if result.weights_rolled_back:
             text = f"{who}: hidden weights rolled back: {result.weights_rolled_back}"
             yield self._say("rolled back", Level.WARNING, "controller", text)
@@ -185,13 +192,14 @@ class Events:
         renewed = result.reference_verdict == "taken" and result.reference_from == self._was.get("asked by")
         if result.reference_verdict != "none" and not renewed:
             level = Level.INFO if result.reference_verdict == "taken" else Level.WARNING
-            text = f"{who}: reference {result.reference_verdict}"
+            now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
+            text = f"{who}: reference {result.reference_verdict}{f'; now {now}' if now else ''}"
             yield self._say("reference", level, "controller", text)
         if result.reference_from:
             self._was["asked by"] = result.reference_from
         if self._change("target", result.target_status, "none") is not None:
             level = Level.WARNING if result.target_status == "no rest" else Level.INFO
-            yield self._say("target", level, "controller", f"{who}: target: {result.target_status}")
+            yield self._say("target", level, "controller", f"{who}: {TARGETS[result.target_status]}")
         if result.set_margin is not None:
             outside = result.set_margin < 0.0
             if self._change("outside", outside, False) is not None:

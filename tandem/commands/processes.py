@@ -69,8 +69,10 @@ class Trainer(Process):
 
     EXTRAS = "trainer"
 
-    plants: str | None = None
-    """Train for all plants whose names match, e.g. 'jet*'; default: the one named in the configuration."""
+    plants: Annotated[
+        str | None, arg(metavar="PATTERN", help_behavior_hint="(default: the one named in the configuration)")
+    ] = None
+    """Train for all plants whose names match, for example 'jet*'."""
 
     def run(self) -> int:
         config, _ = self.resolve()

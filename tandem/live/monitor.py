@@ -139,7 +139,9 @@ class Monitor:
         before = self._seen.source
         if before and (state.source == "manual") != (before == "manual"):
             by_hand = state.source == "manual"
-            what = "under manual control" if by_hand else f"no longer under manual control: {state.source}"
+            what = "under manual control"
+            if not by_hand:
+                what = f"no longer under manual control; the input comes from: {state.source}"
             self.say(f"the plant is {what}", now, "note" if by_hand else "good")
         if state.source == "manual":
             self._u = state.acting

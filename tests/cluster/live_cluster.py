@@ -1,7 +1,7 @@
 """Sweeps on a real scheduler under faults, and their cost.
 
-`make cluster-test`; about 20 minutes; root for the full disk. Environment: `GROUP` is a group of the paper's
-experiment, `TRIVIAL` the number of trivial runs over which the client's memory is measured.
+`make cluster-test` takes about 20 minutes, and needs root for the full disk. Environment: `GROUP` is a group of the
+paper's experiment, `TRIVIAL` the number of trivial runs over which the client's memory is measured.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def cluster(tmp_path: Path) -> Iterator[DaskCluster]:
 
 
 class Command:
-    """One `tandem experiment` in a process of its own."""
+    """One `tandem experiment` in a separate process."""
 
     def __init__(self, *arguments: str | Path, cwd: Path | None = None):
         self.popen = subprocess.Popen(
@@ -119,7 +119,7 @@ def runs(out: Path) -> int:
 
 
 def figures(out: Path) -> list[dict[str, object]]:
-    """The rows of a summary, without the solve times."""
+    """Return the rows of a summary, without the solve times."""
     found = json.loads((out / "summary.json").read_text())
     assert found["failed"] == []
     return [{key: value for key, value in row.items() if key != "solve_ms"} for row in found["rows"]]
@@ -159,7 +159,7 @@ def test_rows_survive_dead_late_and_new_workers_and_a_new_scheduler(
 
 
 def test_the_overhead_is_below_5_percent(cluster: DaskCluster, tmp_path: Path) -> None:
-    """Of runs that sleep, so that the machine's other work counts little; alternating, and the median of the ratios."""
+    """Measure the overhead with sleeping runs, which other load affects little: alternating, with the median ratio."""
     (tmp_path / "slow.py").write_text(SLOW + f"S = [Sleeps({SLEEPS} + i * 1e-9) for i in range(1000)]\n")
     names = "".join(f"S{i} = S[{i}]\n" for i in range(120))
     with open(tmp_path / "slow.py", "a") as file:
@@ -171,7 +171,9 @@ def test_the_overhead_is_below_5_percent(cluster: DaskCluster, tmp_path: Path) -
         + '[[group]]\nname = "g"\ntitle = "G"\n[[case]]\nname = "c"\ngroup = "g"\n'
         + f'vary."plant.truth" = [{truths}]\n'
     )
-    wants = list(_wants(path, tmp_path).items())[::2]  # without the floors, which such a truth has not
+    wants = list(_wants(path, tmp_path).items())[
+        ::2
+    ]  # without the floors, which do not exist for such a truth
     bundle = gather(want.job.config for _key, want in wants)
     ratios = []
     for number in range(3):
@@ -196,7 +198,7 @@ def _wants(path: Path, folder: Path) -> dict[str, Want]:
 
 
 def _seconds(workplace: Workplace, wants: dict[str, Want], out: Path) -> float:
-    """From the first result to the last: starting processes is not what is compared."""
+    """Return the duration from the first to the last result, which excludes the start of the processes."""
     times: list[float] = []
     with closing(workplace):
         made = run_all(wants, out, workplace, lambda done, total: times.append(time.monotonic()))
@@ -283,7 +285,7 @@ def test_a_worker_without_torch_is_refused_by_name(cluster: DaskCluster, tmp_pat
 
 
 def _environment_without(package: str, folder: Path) -> Path:
-    """Python of an environment that has this one's packages but for one."""
+    """Return the Python of an environment with all packages of this one except one."""
     venv.create(folder, with_pip=False, symlinks=True)
     (theirs,) = folder.glob("lib/python*/site-packages")
     for path in Path(pytest.__file__).parents[1].iterdir():

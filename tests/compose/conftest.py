@@ -1,4 +1,4 @@
-"""A failed test shows how the containers were and what they said last."""
+"""A failed test shows the state of the containers and the end of their output."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def test_the_version_is_in_the_changes_and_in_the_citation() -> None:
 
 
 @pytest.mark.parametrize("package", INSTALLED)
-def test_a_package_says_that_it_has_types(package: str) -> None:
+def test_the_package_declares_its_types(package: str) -> None:
     assert (ROOT / package / "py.typed").read_bytes() == b""
 
 

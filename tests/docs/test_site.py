@@ -44,7 +44,7 @@ def test_links_out_of_docs_lead_to_pages_of_the_site() -> None:
     assert outside.with_site_links(code, "docs/tutorials/x.md") == code
 
 
-def test_what_is_linked_outside_of_docs_is_found_through_other_pages() -> None:
+def test_files_outside_docs_are_found_through_the_links_of_pages() -> None:
     pages = {"docs/tutorials/x.md": "[a](../../examples/tanks/README.md) [b](../../no/such/file.md)"}
     found = outside.linked_files(pages)
     assert {"examples/tanks/README.md", "examples/tanks/tanks.py", "examples/tanks/tanks.png"} <= set(found)

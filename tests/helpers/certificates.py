@@ -1,4 +1,4 @@
-"""Certificates that `tandem keys` would not make."""
+"""Certificates that `tandem keys` would not create."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers on this machine's loopback, each a process of its own, as `dask` starts them."""
+"""A Dask scheduler and workers on this machine's loopback, in separate processes, as `dask` starts them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 START_S = 120.0
-"""A limit only ends a hang."""
+"""Limit in seconds that only ends a hang."""
 QUIET = {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error"}
 
 
@@ -43,12 +43,12 @@ class DaskCluster:
         raise AssertionError("the scheduler does not answer")
 
     def start_worker(self, name: str, python: str = sys.executable, nanny: bool = False) -> None:
-        """python: of the environment that it runs in."""
+        """python: interpreter of its environment."""
         options = ["--nthreads", "1", "--name", name, "--local-directory", str(self.folder / name)]
         self._start(name, ["worker", self.address, *options, *([] if nanny else ["--no-nanny"])], python)
 
     def kill(self, name: str) -> None:
-        """With SIGKILL, as a machine that fails."""
+        """Kill it with SIGKILL, as in a failure of its machine."""
         process = self.processes.pop(name)
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -84,7 +84,7 @@ def free_port() -> int:
 
 @contextmanager
 def dask_cluster(folder: Path, *workers: str) -> Iterator[DaskCluster]:
-    """With these workers, one thread each."""
+    """Run a scheduler with these workers, one thread each."""
     folder.mkdir(parents=True, exist_ok=True)
     cluster = DaskCluster(folder)
     try:

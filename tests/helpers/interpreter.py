@@ -1,4 +1,4 @@
-"""Python in an interpreter of its own."""
+"""Python in a separate interpreter."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 
 def python(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """With these arguments, in this folder; what it wrote, and how it ended."""
+    """Run Python with these arguments in this folder; return its output and exit code."""
     return subprocess.run(
         [sys.executable, *arguments], capture_output=True, text=True, timeout=300, cwd=cwd, check=False
     )
 
 
 def imported(code: str) -> set[str]:
-    """The top-level names of all that is loaded once `code` has run."""
+    """Return the top-level names of all modules that are loaded after `code` has run."""
     told = "import sys\nprint('\\n' + ' '.join({name.split('.')[0] for name in sys.modules}), end='')"
     done = python("-c", f"{code}\n{told}")
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""(e:LBMPC) handed to IPOPT: the judge of `lbmpc.solver.gauss_newton`, not a controller."""
+"""Problem (e:LBMPC) solved by IPOPT, as the reference for `lbmpc.solver.gauss_newton`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lbmpc.solver.solution import Solution, Status
 
 
 class ReferenceSolver:
-    """The same problem, written out whole with slacks, exact Hessians, tight tolerances."""
+    """The same problem in full, with slacks, exact Hessians and tight tolerances."""
 
     def __init__(self, problem: Problem, tolerance: float = 1e-10):
         self.problem = problem
@@ -62,10 +62,10 @@ class ReferenceSolver:
             "ipopt.print_level": 0,
             "print_time": False,
             "ipopt.sb": "yes",
-            # Of the cost, which shrinks with the period.
+            # Scale of the cost, which shrinks with the period.
             "ipopt.tol": tolerance * model.period,
             "ipopt.constr_viol_tol": tolerance,
-            # IPOPT otherwise solves a problem whose bounds it has moved by 1e-8.
+            # By default IPOPT relaxes the bounds by 1e-8.
             "ipopt.bound_relax_factor": 0.0,
             "ipopt.max_iter": 500,
         }
@@ -83,9 +83,9 @@ class ReferenceSolver:
         within: float = np.inf,
         previous: np.ndarray | None = None,
     ) -> Solution:
-        """As `lbmpc.solver.gauss_newton.Solver.solve`; `within` keeps every input that close to the warm start.
+        """Solve as `lbmpc.solver.gauss_newton.Solver.solve`; `within` limits the distance from the warm start.
 
-        A nonconvex problem has several minima, and an interior-point method may leave the one it was started in.
+        A nonconvex problem has several minima, and an interior-point method may leave the one near its start.
         """
         n, m = self.problem.horizon, self.problem.model.m
         model = self.problem.model

@@ -1,4 +1,4 @@
-"""One `tandem run` in a process of its own, listened to."""
+"""One `tandem run` in a separate process, whose output is followed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 PATIENCE_S = 180.0
-"""A limit only ends a hang: torch alone takes half a minute to load where four others want the same core."""
+"""Limit in seconds that only ends a hang: torch alone loads for half a minute beside four other processes."""
 SMALL = {
     "network.hidden": "[16, 16]",
     "trainer.steps": "50",
@@ -21,7 +21,7 @@ SMALL = {
     "controller.solver.compile": "never",
 }
 RUN = [sys.executable, "-P", "-m", "tandem", "run"]
-"""As the installed `tandem run`: it imports nothing from the current folder either."""
+"""Command line of `tandem run`; like the installed command, it imports nothing from the current folder."""
 
 
 def small(**more: str) -> list[str]:
@@ -30,7 +30,7 @@ def small(**more: str) -> list[str]:
 
 
 class Launched:
-    """One `tandem run` in a process of its own, its last lines followed as they come."""
+    """One `tandem run` in a separate process; its output is read line by line."""
 
     def __init__(self, folder: Path, *arguments: str):
         self.folder = folder
@@ -54,7 +54,7 @@ class Launched:
                 self._news.notify_all()
 
     def hears(self, text: str, times: int = 1, after: str = "") -> None:
-        """Wait until it has said this so often, counted from the first line with `after`."""
+        """Wait until `times` lines contain this text, counted from the first line with `after`."""
 
         def heard() -> bool:
             begin = next((k for k, line in enumerate(self.said) if after in line), len(self.said))
@@ -67,7 +67,7 @@ class Launched:
         self._popen.send_signal(number)
 
     def pids(self, command: str = "") -> list[int]:
-        """Processes that it started, of one tandem command or of all."""
+        """Return the processes that it started, of one tandem command or of all."""
         config = str(self.folder / "run.processes" / "config.toml").encode()
         found = []
         for entry in Path("/proc").iterdir():
@@ -86,7 +86,7 @@ class Launched:
         os.kill(pid, signal.SIGKILL)
 
     def ends(self) -> tuple[int, dict]:
-        """The exit code, and the one object on standard output."""
+        """Return the exit code, and the JSON object on standard output."""
         assert self._popen.stdout is not None
         hangs = threading.Timer(PATIENCE_S, self._popen.kill)
         hangs.start()

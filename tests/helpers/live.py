@@ -1,8 +1,8 @@
-"""For tests with real processes over a real router on loopback: free ports, processes, waiting for a message.
+"""Helpers of tests with real processes at a real router on loopback: free ports, processes, waiting for messages.
 
-A machine takes its cores away for a while, now and then, and other work may take a share of them: another such test
-runs beside each. So a test here waits for what must come, and compares orders and the stamps that the processes
-themselves give; how long something took is for `make faults` and `make bench`. A limit only ends a hang.
+Other tests run at the same time, and the machine may pause a process. So these tests wait for events that must occur,
+and compare the order and the time stamps of messages. Durations are measured by `make faults` and `make bench`. A time
+limit only ends a hang.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def free_endpoint() -> str:
 def live_config(*assignments: str) -> Config:
     """Defaults on a free port, at ordinary priority, with `section.key=value` assignments.
 
-    A link is cut after half a minute of silence only: a process without a core says nothing. What ends closes its link.
+    A link is cut only after half a minute of silence, because a process without processor time sends nothing.
     """
     patient = "bus.lease_ms=30000"
     return override(
@@ -64,7 +64,7 @@ HANG_S = 120.0
 
 
 class Process:
-    """One node in a process of its own; always ended at the end of the block."""
+    """One node in a separate process, which ends with the block."""
 
     def __init__(self, module: str, config: Config):
         self._popen = subprocess.Popen(
@@ -78,12 +78,12 @@ class Process:
         self._popen.send_signal(number)
 
     def lines(self) -> Iterator[str]:
-        """What the process says, line by line, while it runs."""
+        """Read the output of the process line by line while it runs."""
         assert self._popen.stderr is not None
         return iter(self._popen.stderr)
 
     def end(self, timeout_s: float = HANG_S) -> int:
-        """Wait for the end; the exit code. What the process said is in `said` afterwards."""
+        """Wait for the end; return the exit code. Afterwards `said` contains the output."""
         _, self.said = self._popen.communicate(timeout=timeout_s)
         return self._popen.returncode
 
@@ -102,19 +102,19 @@ def matched(bus: Bus, topic: Topic) -> bool:
 
 
 def connected(bus: Bus) -> bool:
-    """Whether both lanes have the router at this moment."""
+    """Whether both lanes are connected to the router now."""
     return all(list(bus._lanes.session(lane).info.routers_zid()) for lane in get_args(Lane))
 
 
 class BusListener:
-    """Remembers every message that it hears, in order of arrival."""
+    """Keeps every received message, in order of arrival."""
 
     def __init__(self, bus: Bus):
         self._mailbox: Mailbox = bus.everything()
         self.heard: list[tuple[str, m.Message]] = []
 
     def listen(self, timeout_s: float = 0.0) -> m.Message | None:
-        """Hear one more message of a topic that we know and that decodes."""
+        """Receive one more valid message of a known topic."""
         while (delivery := self._mailbox.get(timeout_s)) is not None:
             topic = topic_of(delivery.key)
             if topic is None:
@@ -128,7 +128,7 @@ class BusListener:
         return None
 
     def until(self, wanted: Callable[[m.Message], bool], timeout_s: float = HANG_S) -> m.Message:
-        """Hear on until a message is the wanted one."""
+        """Receive until a message satisfies the condition."""
         deadline = clock.now() + timeout_s
         while (remaining := deadline - clock.now()) > 0.0:
             message = self.listen(remaining)
@@ -137,14 +137,14 @@ class BusListener:
         raise AssertionError(f"not heard within {timeout_s} s, but {len(self.heard)} other messages")
 
     def of(self, topic: Topic) -> list:
-        """All messages of one topic heard so far."""
+        """Return all messages of one topic so far."""
         while self.listen() is not None:
             pass
         return [message for name, message in self.heard if name == topic.name]
 
 
 def health_of(process: str, **expected: object) -> Callable[[m.Message], bool]:
-    """A predicate: a `Health` of that process with these fields."""
+    """Return a condition: a `Health` of that process with these fields."""
 
     def wanted(message: m.Message) -> bool:
         return (
@@ -157,7 +157,7 @@ def health_of(process: str, **expected: object) -> Callable[[m.Message], bool]:
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = HANG_S, every: float = 0.005) -> None:
-    """Wait for something that has no event of its own, and look so often; seconds."""
+    """Wait until a condition holds, and check it at this interval in seconds."""
     deadline = clock.now() + timeout_s
     while not condition():
         assert clock.now() < deadline, f"not so within {timeout_s} s"

@@ -1,4 +1,4 @@
-"""Where things are in the repository."""
+"""Paths of the repository."""
 
 from pathlib import Path
 
@@ -20,6 +20,6 @@ NAMESAKES = ("signal", "queue", "protocol", "lbmpc", "tandem")
 
 
 def write_namesakes(folder: Path) -> None:
-    """Files with the names of modules that every process imports; none can be imported without a complaint."""
+    """Files with the names of modules that every process imports. Importing one of them raises an error."""
     for name in NAMESAKES:
         (folder / f"{name}.py").write_text("raise SystemExit('imported from the current folder')\n")

@@ -1,4 +1,4 @@
-"""The same plant in other units: every state and input times a factor, and all that is given in them with it."""
+"""The same plant in other units: states, inputs and all values in their units times a factor."""
 
 from __future__ import annotations
 

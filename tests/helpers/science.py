@@ -1,4 +1,4 @@
-"""What several tests of the science share: small problems, random networks."""
+"""Helpers of several tests of the science: small problems, random networks."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def oracle_named(name: str, model: Model, hidden: list[int] | None = None) -> Or
 def trained_theta(
     oracle: Oracle, rng: np.random.Generator, samples: int = 20, size: float = 0.01
 ) -> np.ndarray:
-    """Parameters after a few random samples with labels of that size."""
+    """Return the parameters after a few random samples with labels of that size."""
     state = oracle.initial_state(rng)
     for _ in range(samples):
         x = rng.uniform(-1, 1, oracle.d) * [0.4, 0.4, 0.5, 5.0]
@@ -86,7 +86,7 @@ def adapt(
     gamma: float | np.ndarray,
     bounds: np.ndarray,
 ) -> np.ndarray:
-    """One step of the law, as the paper writes it. `lbmpc.oracles.dnn.last_layer` is held to this.
+    """One step of the law as in the paper, the reference for `lbmpc.oracles.dnn.last_layer`.
 
     Args:
         K: output weights K_t, (n, d).

@@ -1,4 +1,4 @@
-"""What a trainer's network gives, put together of the parts that a training uses."""
+"""Output of a trainer's network, computed with the parts that a training uses."""
 
 from __future__ import annotations
 

@@ -294,7 +294,7 @@ def test_reading_needs_neither_torch_nor_a_display() -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("elsewhere"), Path.mkdir])
-def test_a_picture_replaces_files_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_a_picture_replaces_only_files(tmp_path: Path, make: Callable[[Path], None]) -> None:
     (tmp_path / "elsewhere").write_text("another file")
     make(tmp_path / "run.png")
     kind = (tmp_path / "run.png").lstat().st_mode

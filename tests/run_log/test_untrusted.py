@@ -190,7 +190,7 @@ def test_a_deeply_nested_configuration_of_a_log_is_refused_or_read() -> None:
         from_json('{"plant": ' + "[" * 100_000 + "]" * 100_000 + "}")
 
 
-def test_a_log_that_names_code_and_carries_no_plant_loads_nothing(tmp_path: Path) -> None:
+def test_a_log_that_names_code_without_its_plant_loads_no_code(tmp_path: Path) -> None:
     mark = tmp_path / "loaded"
     (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w')\nPLANT = 1\n")
     config = override(
@@ -233,7 +233,7 @@ def bombed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("command", ["replay", "report", "recover"])
-def test_a_hostile_log_writes_and_runs_nothing(command: str, tmp_path: Path, bombed: Path) -> None:
+def test_a_hostile_log_writes_no_file_and_runs_no_code(command: str, tmp_path: Path, bombed: Path) -> None:
     """The command has little memory, and its folder contains the files that the log names."""
     folder = tmp_path / "a" / "b"
     folder.mkdir(parents=True)

@@ -222,7 +222,7 @@ def test_replay_refuses_a_tick_that_is_not_there(simulated: tuple[Path, subproce
     assert "no tick 99" in shown.stderr
 
 
-def test_report_draws_where_it_is_told(
+def test_report_draws_into_the_given_folder(
     simulated: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ):
     log, _ = simulated

@@ -68,7 +68,7 @@ def simulated() -> Run:
     return simulate(load(None, AS_SET), STEPS)
 
 
-def test_it_is_the_run_of_tandem_simulate_to_the_bit(simulated: Run) -> None:
+def test_a_loop_equals_tandem_simulate_to_the_bit(simulated: Run) -> None:
     assert any(result.weights_outcome == "adopted" for result in simulated.results)
     result = Loop(**QUICK).run(STEPS)
     assert result.lost is None

@@ -81,6 +81,7 @@ def test_the_controllers_answer_is_printed_in_words() -> None:
         words(result)
         == "taken in tick 7: y 2.18 now, out of reach: the nearest steady state differs by 9.17 % of a half-width"
     )
+    assert words(result, "y=1.7 in 5 s").endswith("of a half-width; y=1.7 in 5 s")
 
 
 def test_a_simulation_follows_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

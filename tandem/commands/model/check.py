@@ -32,8 +32,8 @@ class ModelCheck(Configured):
 
     KEYS = (("plant", "plant.model"), ("rate", "rate"))
 
-    plant: Annotated[Positional[str], arg(metavar="FILE:NAME")]
-    """A plant file and the name in it, which may be left out if there is one; or a shipped plant."""
+    plant: Annotated[Positional[str | None], arg(metavar="FILE:NAME", help_behavior_hint=FROM_CONFIG)] = None
+    """A plant file and the name in it, which may be left out if the file has one plant; or a shipped plant."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint=FROM_CONFIG)] = None
     """Samples a second."""
     prove: bool = False
@@ -59,7 +59,7 @@ class ModelCheck(Configured):
                 cause = cause.__cause__
             if cause is None:
                 raise
-            return self._refuse(str(cause.args[0]))
+            return self._refuse(config, str(cause.args[0]))
         if isinstance(plant, Known) and plant.period is not None and "rate" not in tree:
             config, _ = replace(self, rate=1.0 / plant.period).resolve()
         settings = config.controller
@@ -68,13 +68,13 @@ class ModelCheck(Configured):
             model = build_model(plant, config.period, Q, R, settings.terminal)
             build_estimator(config, model)
         except (ModelError, ConfigError) as error:
-            return self._refuse(str(error))
+            return self._refuse(config, str(error))
         return self._look(config, model, plant)
 
-    def _refuse(self, text: str) -> int:
+    def _refuse(self, config: Config, text: str) -> int:
         terminal.complain(text, as_json=False)
         faults = [line.removeprefix("  - ") for line in text.splitlines()]
-        self.emit({"plant": self.plant, "faults": faults[1:] or faults})
+        self.emit({"plant": config.plant.model, "faults": faults[1:] or faults})
         return 2
 
     def _look(self, config: Config, model: Model, plant: Known | Plant) -> int:
@@ -112,7 +112,8 @@ class ModelCheck(Configured):
         moved = reach(model, horizon)
         self.say(
             "",
-            f"moved: by full inputs over the horizon ({horizon * model.period:.3g} s), half-widths; W, h: per second",
+            f"moved: half-widths that full inputs move a state within the horizon ({horizon * model.period:.3g} s)",
+            "W and h: per second",
         )
         self.console.print(_state_table(known, x0, moved, W, sampled, bound))
         self.console.print(_input_table(known))

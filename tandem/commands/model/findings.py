@@ -86,7 +86,7 @@ def disturbance_finding(plant: Known, W: np.ndarray, found: SampledDisturbance) 
         "note",
         "W",
         f"h exceeds W somewhere in X and U: {', '.join(above)}. Tightening guarantees "
-        f"nothing where h is outside W{lost}",
+        f"nothing where h is outside W; enlarge W or reduce the bounds{lost}",
     )
 
 

@@ -60,7 +60,8 @@ class SetPoint(Configured):
         if verdict != "taken":
             terminal.complain(f"the controller refused the reference: {why}", self.json)
             return 1
-        self.say(words(results[-1]))
+        course = f"{where} in {self.over:g} s" if self.over else ""
+        self.say(words(results[-1], course))
         self.emit(answer(results[-1]))
         return 0
 
@@ -87,8 +88,8 @@ def answer(result: m.TickResult) -> dict[str, object]:
     }
 
 
-def words(result: m.TickResult) -> str:
-    """Return the answer as text for a person."""
+def words(result: m.TickResult, course: str = "") -> str:
+    """Return the answer as text for a person; `course` says where a moving reference goes."""
     now = ", ".join(f"{name} {value:.6g}" for name, value in result.reference.items())
     if not now:
         return f"taken in tick {result.seq}: the target is the equilibrium again"
@@ -98,4 +99,5 @@ def words(result: m.TickResult) -> str:
         "of a half-width",
         "no rest": "no steady state was found inside X and U",
     }
-    return f"taken in tick {result.seq}: {now} now, {rest.get(result.target_status, result.target_status)}"
+    said = f"taken in tick {result.seq}: {now} now, {rest.get(result.target_status, result.target_status)}"
+    return f"{said}; {course}" if course else said

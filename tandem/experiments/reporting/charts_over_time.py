@@ -13,7 +13,7 @@ from tandem.experiments.study.results import CaseResult
 from tandem.experiments.study.work import Traces
 
 TIME = "time (s)"
-BAND = "Line: the run, or the median where a case has several runs. Band: all runs of the case."
+BAND = "Line: the run, or the median if a case has several runs. Band: all runs of the case."
 
 
 def trajectories(results: list[CaseResult], plant: Description) -> list[Picture]:

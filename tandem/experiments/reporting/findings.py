@@ -203,7 +203,7 @@ def below_perfect(results: list[CaseResult]) -> list[str]:
     return [
         f"J is below that of the true h in {counted(runs, 'run')} of {counted(len(below), 'case')}, by up to "
         f"{_figure('regret', -below[most].min())} ({most}). This is possible because the horizon is finite and the "
-        "constraints are tightened."
+        "constraints are tightened, and because J weighs u from u_e although the plant may need another input to rest."
     ]
 
 

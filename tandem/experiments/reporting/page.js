@@ -97,10 +97,17 @@
         if (level.y <= u.scales.y.min || level.y >= u.scales.y.max) continue;
         line(level.y, GREY, [2, 3]);
         ctx.fillStyle = css("--soft");
-        ctx.fillText(level.label, bbox.left + 4 * ratio, across(level.y) - 2 * ratio);
+        const at = across(level.y), above = at - 16 * ratio > bbox.top;
+        ctx.fillText(level.label, bbox.left + 4 * ratio, above ? at - 2 * ratio : at + 16 * ratio);
       }
       ctx.restore();
     };
+  }
+
+  // The style of a line as that of a border, for the legend.
+  function borderOf(dash) {
+    if (!dash?.length) return "solid";
+    return dash[0] < 4 ? "dotted" : "dashed";
   }
 
   function optionsOf(chart, width, linked) {
@@ -151,7 +158,7 @@
       },
       axes: [axis(x), axis(y)],
       cursor: { drag: { x: true, y: false, setScale: true }, dataIdx: nearest, points: { size: 7 } },
-      legend: { live: true, dash: (u, index) => (u.series[index].dash?.length ? "dashed" : "solid") },
+      legend: { live: true, markers: { dash: (u, index) => borderOf(u.series[index].dash) } },
       hooks: {
         drawAxes: [background(chart)],
         setScale: [(u, key) => { if (key === "x") linked.zoom(u); }],

@@ -67,7 +67,7 @@ def rows(results: list[CaseResult], reference: str | None) -> list[Picture]:
     ax.set_xlabel("J above that of the true h (%)" if name == "regret" else "J: sum of the stage costs")
     caption = f"{name[0].upper()}{name[1:]} of every run (strokes) and the median (dot)."
     if any(result.case.name == reference for result in shown):
-        caption += " Diamond and dashed line: the case that the others are compared with."
+        caption += " Diamond and dashed line: the reference case of the comparison."
     if any(not record.kept for result in shown for record in result.records):
         caption += " At the right: runs that leave the bounds."
     if left_out:

@@ -209,8 +209,8 @@ def terms(plant: Description) -> list[tuple[str, str]]:
     bands = [(plant.states[i], SETTLED * plant.x_scale[i]) for i in plant.performance]
     within = " and ".join(f"{name} within {band:g} {_unit(plant, name)}".rstrip() for name, band in bands)
     return [
-        ("median, worst", "Over the runs of the case. A column without either word is a median."),
-        ("J", "Sum of the stage costs with the weights Q and R per second. Of several episodes, the mean."),
+        ("median, worst", "Statistic over the runs of the case. A column without either word is a median."),
+        ("J", "Sum of the stage costs with the weights Q and R per second. With several episodes, the mean."),
         (
             "regret",
             "J above that of the true h from the same start with the same settings, in percent. It is negative where J "
@@ -225,10 +225,10 @@ def terms(plant: Description) -> list[tuple[str, str]]:
             "Largest distance of the true motion from X in the worst run, between samples too, as a share of the "
             "half-width. – where it is not known.",
         ),
-        ("deviation", f"Integral of {squares}. Of several episodes, the mean from the second one on."),
+        ("deviation", f"Integral of {squares}. With several episodes, the mean from the second one on."),
         (
             "overshoot",
-            f"How far {state} goes beyond its equilibrium, as a share of its initial deviation. Of several episodes, "
+            f"How far {state} goes beyond its equilibrium, as a share of its initial deviation. With several episodes, "
             "the worst from the second one on.",
         ),
         (
@@ -244,7 +244,7 @@ def terms(plant: Description) -> list[tuple[str, str]]:
             "solve time",
             "Measured alone, from the plant's own x0, once for every oracle, horizon, network and rate.",
         ),
-        ("lost", "The true motion could not be followed to the end of the run."),
+        ("lost", "The true motion could not be computed to the end of the run."),
     ]
 
 

@@ -224,7 +224,7 @@ class _Sweep:
         if made.code != code_version():
             raise RunnerError(
                 "Tandem's code or a package was changed while the experiment ran; the finished runs are kept, and the "
-                "same command makes those again that depend on it"
+                "same command repeats those that depend on it"
             )
         for log in self.wants[key].logs:
             write_whole(log, made.log or b"")

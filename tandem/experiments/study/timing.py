@@ -27,7 +27,7 @@ class Timing(msgspec.Struct, frozen=True):
 
 
 def timing_job(case: Resolved, seed: int, seconds: float) -> Job:
-    """Return the key of all cases with the same solver work: oracle, horizon, network and rate."""
+    """Return the job that stands for all cases with the same solver work: oracle, horizon, network and rate."""
     config = case.config
     controller = msgspec.structs.replace(config.controller, W=None)
     given = config.plant

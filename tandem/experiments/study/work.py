@@ -111,7 +111,7 @@ def work(task: Task, config: Config | None = None) -> Done:
         found = files_read(here.config)
         for key, sha256 in task.files.items():
             if found.get(key) != sha256:
-                raise ConfigError(f"{key}: the file that it names is another one here, or is gone")
+                raise ConfigError(f"{key}: the named file is missing here or has other content")
         record = msgspec.structs.replace(_record(here, outcome, rests, task.detail), job=task.job)
     _rename(outcome.run, task.job.config)
     log = _log(outcome.run) if task.log else None

@@ -1,8 +1,8 @@
-"""A mass pushed along a track with an end on one side only, and no limit to its speed.
+"""A mass that is pushed along a track with a bound on one side only, without a bound on its speed.
 
 | parameter | value | source |
 | --- | --- | --- |
-| friction, 1/m | 0.3 | chosen: the linear model does not know it, since it is quadratic in the speed |
+| friction, 1/m | 0.3 | chosen: the linear model does not contain it, because it is quadratic in the speed |
 """
 
 from __future__ import annotations

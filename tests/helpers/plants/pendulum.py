@@ -2,8 +2,8 @@
 
     th'' = stiffness sin th + gain u
 
-`PENDULUM` is a slow one. `inverted(length)` is the point mass on a rod of that length with the torque as a share of
-that which holds it level: stiffness = gain = g / length.
+`PENDULUM` is slow. `inverted(length)` is a point mass on a rod of that length. Its torque is a share of the torque that
+holds it horizontal: stiffness = gain = g / length.
 
 | parameter | PENDULUM | inverted(length) | source |
 | --- | --- | --- | --- |
@@ -58,7 +58,7 @@ PENDULUM = Plant(
 
 
 def inverted(length: float) -> Plant:
-    """A pendulum of this length, metres, from 0.3 rad; u = 1 holds it level, and more there is not."""
+    """Return a pendulum of this length, metres, from 0.3 rad; u = 1 holds it horizontal and is the largest input."""
     fastest = np.sqrt(GRAVITY / length)
     parameters = {"stiffness": GRAVITY / length, "gain": GRAVITY / length}
     return replace(

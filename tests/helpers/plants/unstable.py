@@ -1,8 +1,8 @@
-"""One state that runs away from rest at any rate: dx/dt = rate x + rate u, linear, with X = U = [-1, 1].
+"""One unstable state with any growth rate: dx/dt = rate x + rate u, linear, with X = U = [-1, 1].
 
 | parameter | value | source |
 | --- | --- | --- |
-| rate, 1/s | any | it grows by exp(rate t), so that the horizon times the rate says how hard it is |
+| rate, 1/s | any | it grows by exp(rate t); the horizon times the rate measures the difficulty |
 """
 
 from __future__ import annotations

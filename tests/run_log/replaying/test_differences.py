@@ -68,6 +68,13 @@ def test_one_flipped_bit_in_the_file_survives_a_rewrite_and_is_reported(run: Run
     assert first.tick == 33
 
 
+def test_no_more_ticks_differ_than_there_are(run: Run) -> None:
+    found = replay(run, overrides=["controller.horizon=7"])
+    assert found.first_difference is not None
+    assert found.first_difference.tick == -1  # the memory before the first tick
+    assert 0 < found.differing_ticks <= found.ticks
+
+
 def test_a_changed_tolerance_is_reported_with_its_tick(run: Run) -> None:
     found = replay(run, overrides=["controller.solver.tolerance=0.1"])
     assert not found.equal

@@ -20,7 +20,7 @@ def state(t: float, run_id: str = "p") -> StateHead:
     return StateHead(run_id, 0, t, "command")
 
 
-def test_what_is_late_was_sent_when_the_quickest_message_says() -> None:
+def test_the_quickest_message_gives_the_sending_time_of_late_ones() -> None:
     times = SendTimes()
     delays = [0.010, 0.002, 0.050, 0.002, 0.700]
     for k, delay in enumerate(delays):

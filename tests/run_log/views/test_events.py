@@ -56,7 +56,7 @@ def test_a_status_that_follows_at_once_is_told_however_few_views_are_made() -> N
         assert json.loads(shown[1].data)["status"] == status
 
 
-def test_each_change_of_a_result_is_told_once_and_with_its_level() -> None:
+def test_each_change_of_a_result_is_reported_once_with_its_level() -> None:
     told = Told()
     assert told.by(topics.RESULT, RESULT) == []
     for changes, level, words in [
@@ -68,12 +68,16 @@ def test_each_change_of_a_result_is_told_once_and_with_its_level() -> None:
         ({"weights_rolled_back": "worse than before"}, Level.WARNING, "rolled back: worse than before"),
         ({"sensor_faults": {"y": "stuck; estimated"}}, Level.ERROR, "sensor y is stuck"),
         ({}, Level.INFO, "sensor y is trusted again"),
-        ({"reference_verdict": "taken", "reference_from": "h-1"}, Level.INFO, "reference taken"),
+        (
+            {"reference_verdict": "taken", "reference_from": "h-1", "reference": {"y": 1.7}},
+            Level.INFO,
+            "reference taken; now y 1.7",
+        ),
         ({"reference_verdict": "refused: outside X", "reference_from": "h-1"}, Level.WARNING, "outside X"),
         ({"set_margin": -0.1}, Level.ERROR, "outside the certified sets"),
         ({"set_margin": 0.1}, Level.INFO, "inside the certified sets again"),
-        ({"target_status": "no rest"}, Level.WARNING, "target: no rest"),
-        ({}, Level.INFO, "target: none"),
+        ({"target_status": "no rest"}, Level.WARNING, "no steady state was found"),
+        ({}, Level.INFO, "the plan aims at the equilibrium"),
     ]:  # fmt: skip
         (event,) = (
             one for one in told.by(topics.RESULT, RESULT, 600.0, **changes) if words in one["message"]
@@ -105,7 +109,7 @@ def test_late_ticks_skipped_slots_and_samples_that_do_not_come() -> None:
     assert [one["level"] for one in told.by(topics.TICK, TICK)] == [Level.INFO]
 
 
-def test_what_drives_the_plant_and_processes_that_change() -> None:
+def test_changes_of_the_input_source_and_of_processes_are_events() -> None:
     told = Told()
     assert told.by(topics.PLANT_STATE, STATE) == []
     assert [one["level"] for one in told.by(topics.PLANT_STATE, STATE, source="safe")] == [Level.WARNING]
@@ -130,7 +134,7 @@ def test_lost_ticks_are_an_event() -> None:
     assert told.views.lost == {"controller/tick": 4}
 
 
-def test_a_flood_is_cut_and_its_last_event_is_told_in_the_end() -> None:
+def test_a_flood_of_events_is_limited_and_its_last_event_is_shown() -> None:
     told = Told()
     events = [
         one for k in range(1000) for one in told.by(topics.TICK, TICK, 1.0, late=True, lateness=k * 1e-3)

@@ -44,7 +44,7 @@ def test_bounds_come_once_a_second_and_have_the_units() -> None:
     assert schema["properties"]["x_max"]["properties"]["rdot"]["unit"] == "1/s"
 
 
-def test_a_target_is_shown_or_the_equilibrium_where_there_is_none() -> None:
+def test_the_target_is_shown_or_else_the_equilibrium() -> None:
     views = Views(Config(), PLANT)
     rest = shown(views, "controller/result", RESULT, 0)["view/targets"]
     assert (rest["status"], rest["x"]) == ("none", dict(zip(PLANT.states, PLANT.x_e.tolist(), strict=True)))

@@ -54,7 +54,7 @@ def shown(view: UserView, payload: bytes) -> Any:
         (b"{}", None),
     ],
 )
-def test_what_is_shown_of_a_payload(payload: bytes, expected: Any) -> None:
+def test_the_view_of_a_payload(payload: bytes, expected: Any) -> None:
     assert shown(UserView("user/x"), payload) == expected
 
 

@@ -55,7 +55,7 @@ def test_the_exit_code_follows_the_status(
     assert (shown["process"], shown["run_id"], shown["status"]) == ("plant", "plant-1", status)
 
 
-def test_another_process_does_not_answer_for_it(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_of_another_process_do_not_count(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
     with (
         Bus(config, "plant", "plant-1") as bus,
         HealthPublisher(bus, run_info(config, "plant", "plant-1")) as said,

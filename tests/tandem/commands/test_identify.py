@@ -193,7 +193,7 @@ def test_contradicting_arguments_are_refused(logs: list[str], tmp_path: Path, ca
     (tmp_path / "found.py").write_text("kept")
     for out, message in (
         ("found.py", "exists already and is not overwritten"),
-        ("found.txt", "ends in .py"),
+        ("found.txt", "must end in .py"),
         ("away/found.py", "there is no folder"),
     ):
         assert message in refused(capsys, *logs, "--out", str(tmp_path / out))

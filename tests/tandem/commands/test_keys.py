@@ -109,7 +109,7 @@ def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: p
     elsewhere.mkdir()
     authority = str(folder / "authority")
     assert main(["keys", "renew", str(elsewhere), "--role", "viewer", "--authority", authority]) == 2
-    assert "no certificate.pem in it" in capsys.readouterr().err
+    assert "contains a certificate.pem" in capsys.readouterr().err
     assert list(elsewhere.iterdir()) == []
 
 
@@ -117,7 +117,7 @@ def test_renew_adds_a_role_that_older_keys_do_not_have(tmp_path: Path, capsys: p
     ("arguments", "says"),
     [
         (["create", "--plant", "jet 1", "--out", "new"], "letters"),
-        (["create", "--plant", "jet1", "--out", "new", "--host", "10.0.0.5:7448"], "no port"),
+        (["create", "--plant", "jet1", "--out", "new", "--host", "10.0.0.5:7448"], "omit port"),
         (["create", "--plant", "jet1", "--out", "new", "--days", "4000"], "--days 4000"),
         (["renew", "nowhere", "--role", "boss"], "one of router"),
         (["renew", "nowhere", "--role", "trainer"], "nowhere"),
@@ -209,7 +209,7 @@ def test_every_topic_has_exactly_one_role_that_may_publish_it():
         assert may == [topic.writer], topic.name
 
 
-def test_only_a_controller_commands_and_a_trainer_sends_weights_alone():
+def test_only_a_controller_sends_commands_and_only_a_trainer_sends_weights():
     publishes = {role: set(rights.rights_of(role).publish_keys("jet1")) for role in rights.ROLES}
     assert [role for role in rights.ROLES if "tandem/jet1/controller/command" in publishes[role]] == [
         "controller"

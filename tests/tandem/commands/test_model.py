@@ -74,6 +74,13 @@ def test_a_plant_without_faults_is_shown_with_its_numbers(mine: Any, capsys: Cap
         assert word not in text
 
 
+def test_without_a_name_the_plant_of_the_configuration_is_checked(mine: Any, capsys: Capture) -> None:
+    mine(TANKS)
+    code, found = checked(capsys, "--set", "plant.model=mine", "--rate", "1")
+    assert code == 0
+    assert found["plant"] == "tanks"
+
+
 def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     rows = {"stop": {"x1": 1.0, "x2": 0.5, "max": 0.7, "priority": 1}}
@@ -87,7 +94,7 @@ def test_rows_are_listed_and_one_that_x_e_violates_is_a_fault(mine: Any, capsys:
     assert "row stop is 0 at x_e" in found["faults"][0]
 
 
-def test_a_plant_whose_poles_are_all_zero_does_not_come_back(mine: Any, capsys: Capture) -> None:
+def test_a_plant_whose_poles_are_all_zero_does_not_return(mine: Any, capsys: Capture) -> None:
     limits = {"x_min": [-1, -1], "x_max": [1, 1], "u_min": [-1], "u_max": [1]}
     mine(Known.from_matrices([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], W=[0.1, 0.1], **limits))
     assert "poles, 1/s: 0, 0; without input it does not return" in said(capsys, "mine")[1]

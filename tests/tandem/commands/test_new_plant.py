@@ -74,7 +74,7 @@ def test_a_name_with_special_characters_does_not_break_the_file(capsys: Capture)
     checked(capsys, f"{strange}:PLANT")
 
 
-def test_the_name_may_be_left_out_where_there_is_one(capsys: Capture) -> None:
+def test_the_name_may_be_left_out_if_there_is_only_one(capsys: Capture) -> None:
     main(["model", "new", "my.py"])
     capsys.readouterr()
     assert main(["model", "check", "my.py"]) == 2

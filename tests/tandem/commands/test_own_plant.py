@@ -106,7 +106,7 @@ def test_replay_report_and_recover_load_nothing_that_a_log_names(
     assert as_json(capsys, "replay", "whole.mcap")["equal"]
 
 
-def test_a_replay_that_needs_equations_says_how_to_give_them(
+def test_a_replay_that_needs_equations_names_the_option_for_them(
     elsewhere: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert main(["replay", "perfect.mcap"]) == 2

@@ -75,7 +75,7 @@ def test_ctrl_c_loses_nothing_and_names_the_command_to_continue(
     assert again.certificate == before.certificate
 
 
-def test_a_plant_without_sets_ends_with_3_and_says_what_would_help(
+def test_a_plant_without_sets_gives_exit_code_3_and_a_remedy(
     cached: Path, capsys: pytest.CaptureFixture[str]
 ):
     options = [*OPTIONS, "--set", "controller.W=[5.0,10.0]"]

@@ -53,7 +53,7 @@ def test_it_replays_byte_for_byte(loop: Loop) -> None:
     assert replay(loop.result.run).first_difference is None
 
 
-def test_a_plant_that_moves_elsewhere_is_given_the_input_by_hand() -> None:
+def test_an_external_plant_gets_the_manual_input() -> None:
     loop = Loop(config="compressor-cheap", train=False, oracle="linear")
     for _ in range(3):
         loop.control(loop.plant.x_e)

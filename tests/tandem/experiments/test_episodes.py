@@ -87,7 +87,7 @@ def test_a_log_with_episodes_replays_byte_for_byte(run: Run) -> None:
     assert replay(run, from_tick=STEPS + 15).equal
 
 
-def test_a_plant_that_has_drifted_starts_again_as_it_is() -> None:
+def test_a_drifted_plant_restarts_with_its_present_parameters() -> None:
     faults = Faults(drift=Drift(to={"slope": 1.4}, at=0.5))
     settings = config("controller.oracle=linear")
     first, second = incarnations(follow(settings, 20, faults, episodes=2).run).values()

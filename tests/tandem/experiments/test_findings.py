@@ -64,7 +64,7 @@ def timed(solves: int, network: list[float]) -> dict[str, str]:
     return {claim.statement: claim.verdict for claim in findings.claims(results)}
 
 
-def test_a_slow_tail_is_against_the_claim_about_the_p99_alone() -> None:
+def test_a_slow_tail_affects_only_the_claim_about_the_p99() -> None:
     slow_tail = [1.0] * 19 + [9.0]
     assert timed(600, slow_tail)[MEDIAN] == "held"
     assert timed(600, slow_tail)[TAIL] == "not held"
@@ -98,7 +98,7 @@ def test_cases_that_draw_nothing_need_no_repetition() -> None:
     assert findings.compare([one, other], "other")[0].verdict == "differs"
 
 
-def test_regret_is_signed_and_a_page_says_where_j_is_below_that_of_the_true_h() -> None:
+def test_regret_is_signed_and_a_page_names_cases_below_the_true_h() -> None:
     better, worse = a_result("better", [19.0, 23.0]), a_result("worse", [20.0, 21.0])
     assert better.values("regret") == pytest.approx([-0.05, 0.15])
     (said,) = findings.below_perfect([better, worse])
@@ -108,7 +108,7 @@ def test_regret_is_signed_and_a_page_says_where_j_is_below_that_of_the_true_h() 
     assert findings.below_perfect([worse]) == []
 
 
-def test_what_varies_in_a_family_need_not_be_a_number() -> None:
+def test_the_varied_value_of_a_family_need_not_be_a_number() -> None:
     members = [a_result(name, [21.0]) for name in ("a", "b")]
     members = [
         one._replace(case=msgspec.structs.replace(one.case, varied={"plant.truth": {"slope": value}}))

@@ -43,7 +43,7 @@ def test_calls_share_a_process_and_return_their_values(child: Child) -> None:
     assert call(child, os.getpid) == first != os.getpid()
 
 
-def test_an_exception_is_told_with_its_traceback_and_the_process_goes_on(child: Child) -> None:
+def test_an_exception_is_reported_with_its_traceback_and_the_process_continues(child: Child) -> None:
     failed = call(child, exec, "def f():\n    raise ValueError('not\\nthis')\nf()")
     assert isinstance(failed, Failure)
     assert (failed.kind, failed.text) == ("error", "ValueError: not this")

@@ -79,7 +79,7 @@ def full() -> Parsed:
     return made(20, quick=False, solves=600)
 
 
-def test_a_page_of_one_seed_holds_no_claim(quick: Parsed) -> None:
+def test_a_page_of_one_seed_gives_no_verdict(quick: Parsed) -> None:
     assert "held" not in quick.verdicts
     assert quick.verdicts.count("not enough runs") >= 8
     assert "no basis for conclusions" in quick.text
@@ -88,7 +88,7 @@ def test_a_page_of_one_seed_holds_no_claim(quick: Parsed) -> None:
         assert word not in quick.text
 
 
-def test_a_page_of_many_seeds_says_how_many_and_gives_verdicts(full: Parsed) -> None:
+def test_a_page_of_many_seeds_has_their_number_and_verdicts(full: Parsed) -> None:
     assert "20 seeds (0 to 19)" in full.text
     assert {"held", "not held"} <= set(full.verdicts)
     assert "not enough runs" not in full.verdicts
@@ -112,7 +112,7 @@ def test_every_plot_has_data_and_units_on_its_axes(full: Parsed) -> None:
             assert any(value is not None for value in line["y"])
 
 
-def test_every_table_says_its_command(quick: Parsed) -> None:
+def test_every_table_has_its_command(quick: Parsed) -> None:
     assert "tandem experiment paper --out DIR --quick --only comparison" in quick.text
     assert "3 cases, 3 runs, made by" in quick.text
 

@@ -68,7 +68,7 @@ def test_a_users_own_topic_is_no_bad_message(monitor: Monitor) -> None:
     assert monitor.snapshot(START + 2.5).bad_messages == before + 1
 
 
-def test_of_simultaneous_messages_every_tick_counts_and_only_the_newest_state_is_read() -> None:
+def test_every_simultaneous_tick_counts_and_only_the_newest_state_is_read() -> None:
     seen = Monitor(CONFIG, PLANT, 20.0)
     seen.feed_all([delivery(topics.COMMAND, command(0), START)])
     assert seen.first_command == pytest.approx(START)
@@ -144,5 +144,5 @@ def test_begin_and_end_of_manual_control_are_reported() -> None:
         assert (now.inputs[0].value == 1.5 + k) == (source == "manual")
     assert [event.text for event in now.events if "manual" in event.text] == [
         "the plant is under manual control",
-        "the plant is no longer under manual control: plan",
+        "the plant is no longer under manual control; the input comes from: plan",
     ]

@@ -54,7 +54,7 @@ def subscribe(audience: Audience, viewer: Viewer, *pairs: tuple[int, int]) -> No
     audience.obey(viewer, json.dumps({"op": "subscribe", "subscriptions": asked}))
 
 
-def test_a_new_viewer_is_told_the_server_and_all_channels(audience: Audience):
+def test_a_new_viewer_receives_the_server_info_and_all_channels(audience: Audience):
     info, advertised = frames(audience.enter())
     assert info["op"] == "serverInfo"
     assert (info["name"], info["sessionId"], info["metadata"]) == ("a name", "a session", {"plant": "jet1"})
@@ -78,7 +78,7 @@ def test_a_viewer_gets_what_it_subscribed_to_under_its_own_numbers(audience: Aud
     assert frames(viewer) == []
 
 
-def test_who_comes_late_gets_the_latest_of_what_is_kept(audience: Audience):
+def test_a_late_viewer_gets_the_latest_kept_messages(audience: Audience):
     for time_ns in (1, 2, 3):
         audience.publish(EVENTS, time_ns, b"%d" % time_ns)
         audience.publish(STATE, time_ns, b"%d" % time_ns)
@@ -164,7 +164,7 @@ def test_nothing_else_is_offered(audience: Audience, asked: str | bytes):
         '{"op":"unsubscribe","subscriptionIds":5}',
     ],
 )
-def test_what_is_no_request_is_refused_and_changes_nothing(audience: Audience, asked: str):
+def test_an_invalid_request_is_refused_and_changes_nothing(audience: Audience, asked: str):
     viewer = audience.enter()
     frames(viewer)
     audience.obey(viewer, asked)
@@ -190,7 +190,7 @@ def test_refusals_that_a_viewer_does_not_read_take_bounded_memory(audience: Audi
     assert len(frames(viewer)) == WAITING_REFUSALS
 
 
-def test_who_has_left_costs_nothing(audience: Audience):
+def test_a_viewer_that_has_left_receives_nothing(audience: Audience):
     viewer = audience.enter()
     subscribe(audience, viewer, (1, 1))
     audience.leave(viewer)

@@ -82,7 +82,7 @@ async def keep_saying(bus: Bus) -> None:
         await asyncio.sleep(0.05)
 
 
-def test_the_bus_is_heard_across_a_restart_and_what_a_client_publishes_goes_nowhere(config: Config):
+def test_the_bus_is_received_across_a_restart_and_clients_publish_nothing_on_it(config: Config):
     async def look(bus: Bus, heard: BusListener) -> None:
         socket = await connected(config)
         numbers = await subscribed(socket)
@@ -120,7 +120,7 @@ def test_the_bus_is_heard_across_a_restart_and_what_a_client_publishes_goes_nowh
         assert live.end() == 0
 
 
-def test_a_second_one_says_that_the_port_is_taken_and_the_page_is_there_before_a_router(config: Config):
+def test_a_second_server_reports_the_used_port_and_the_page_is_served_before_a_router(config: Config):
     async def first_is_there() -> None:
         socket = await connected(config)
         assert json.loads(await socket.recv())["metadata"]["plant"] == config.name

@@ -96,7 +96,7 @@ def test_a_page_of_another_origin_or_name_is_refused_before_it_hears_anything():
     asyncio.run(run())
 
 
-def test_a_client_that_publishes_is_told_no_and_stays():
+def test_a_client_that_publishes_is_refused_and_stays_connected():
     async def run() -> None:
         async with served() as (audience, at), client(at) as socket:
             await subscribed(socket, audience)
@@ -158,7 +158,7 @@ def test_too_large_a_request_closes_its_own_connection_only():
     asyncio.run(run())
 
 
-def test_there_are_at_most_so_many_viewers(monkeypatch: pytest.MonkeyPatch):
+def test_the_number_of_viewers_is_limited(monkeypatch: pytest.MonkeyPatch):
     async def run() -> None:
         monkeypatch.setattr(server, "MOST_VIEWERS", 1)
         async with served() as (_, at), client(at) as socket:

@@ -33,7 +33,7 @@ def test_an_address_beyond_this_machine_without_tls_is_refused(address: str) -> 
     "address",
     ["", "head", "tcp://head", "http://127.0.0.1:8786", "tcp://127.0.0.1:8786/x", "::", "tcp://[::1"],
 )
-def test_what_is_no_address_is_refused_with_an_example(address: str) -> None:
+def test_an_invalid_address_is_refused_with_an_example(address: str) -> None:
     with pytest.raises(ConfigError, match=r"not the address of a Dask scheduler; for example tcp://127"):
         checked(address)
 

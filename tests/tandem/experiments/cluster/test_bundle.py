@@ -74,7 +74,7 @@ def test_a_folder_that_is_too_large_is_named(folder: Path, monkeypatch: pytest.M
         gather([config(folder, plant={"model": "tanks.py:TANKS"})])
 
 
-def test_sets_that_only_this_machine_has_are_asked_for(folder: Path) -> None:
+def test_certified_sets_must_be_named_for_a_cluster(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"name their file, controller\.sets"):
         gather([config(folder, controller={"tightening": "invariant"})])
 

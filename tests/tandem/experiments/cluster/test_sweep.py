@@ -113,7 +113,7 @@ def on(cluster: DaskCluster, path: Path, said: list[str]) -> Cluster:
     return Cluster(cluster.address, bundle, said.append, patience=300.0)
 
 
-def test_a_cluster_makes_the_rows_of_one_process_and_a_run_that_fails_fails_alone(
+def test_a_cluster_gives_the_rows_of_one_process_and_a_failed_run_affects_no_other(
     experiment: Path, cluster: DaskCluster, tmp_path: Path
 ) -> None:
     said: list[str] = []
