@@ -83,7 +83,9 @@ def of_runs(result: CaseResult, look: Look, values: list[np.ndarray]) -> Line | 
     """
     if not values:
         return None
-    runs = np.array(values, dtype=float)
+    # A timed run in which the plant was lost is shorter.
+    shortest = min(map(len, values))
+    runs = np.array([run[:shortest] for run in values], dtype=float)
     t = np.arange(runs.shape[1]) * result.case.config.period
     differ = len(runs) > 1 and bool((np.ptp(runs, axis=0) > 0).any())
     if not differ:

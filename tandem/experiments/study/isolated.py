@@ -148,6 +148,7 @@ class Children:
         self._idle: list[Child] = []
         self._busy: set[Child] = set()
         self._lock = Lock()
+        self._killed = False
 
     @contextlib.contextmanager
     def one(self) -> Iterator[Child]:
@@ -155,6 +156,9 @@ class Children:
         child = self._free() or Child()
         with self._lock:
             self._busy.add(child)
+            killed = self._killed
+        if killed:  # while this one was being started
+            child.kill()
         try:
             yield child
         finally:
@@ -175,6 +179,7 @@ class Children:
     def kill(self) -> None:
         """End all processes. A call in progress then gives a `Failure`."""
         with self._lock:
+            self._killed = True
             idle, self._idle = self._idle, []
             busy = list(self._busy)
         for child in busy:

@@ -8,7 +8,7 @@ import pytest
 
 from protocol import codec, topics
 from protocol import messages as m
-from run_log.views.arrival import SendTimes
+from run_log.views.arrival import MOST_RUNS, LostTicks, SendTimes
 from run_log.views.heads import StateHead, head_of
 
 NAME = topics.PLANT_STATE.name
@@ -54,3 +54,12 @@ def test_a_tick_was_sent_when_it_really_began_and_others_have_no_time() -> None:
     assert times.of(topics.TICK.name, head, START) == START
     timing = m.TickTiming(run_id="c", seq=0, solve_ms=1.0, tick_ms=1.0, lateness_ms=0.0, state_age_ms=0.0)
     assert times.of(topics.TIMING.name, timing, START + 5) == START + 5
+
+
+def test_lost_ticks_are_counted_after_any_number_of_restarts() -> None:
+    lost = LostTicks(follow_silence=1.0)
+    for run in range(2 * MOST_RUNS):
+        at = (10 * run) * SECOND
+        assert lost.take(topics.TICK.name, f"c-{run}", 0, at) == 0
+        assert lost.take(topics.TICK.name, f"c-{run}", 3, at + 1000) == 2
+    assert lost.count == {topics.TICK.name: 4 * MOST_RUNS}

@@ -106,6 +106,14 @@ def test_a_crash_leaves_a_new_process_for_the_next_call() -> None:
         children.kill()
 
 
+def test_a_process_that_is_started_while_all_are_ended_is_ended_too() -> None:
+    children = Children()
+    children.kill()
+    with children.one() as child:
+        assert call(child, time.sleep, 600).kind == "crash"
+    children.kill()
+
+
 def test_a_child_ends_with_its_parent() -> None:
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None

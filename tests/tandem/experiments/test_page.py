@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tandem.experiments import experiment
-from tandem.experiments.reporting.charts import Chart, Line, reduced, to_page
+from tandem.experiments.reporting.charts import Chart, Line, of_runs, reduced, to_page
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study.declaration import load
 from tandem.experiments.study.results import CaseResult
@@ -134,6 +134,13 @@ def test_a_plot_without_a_line_is_words_and_the_others_are_drawn() -> None:
     )
     assert [chart["title"] for chart in found.charts] == ["Solve time"]
     assert found.text.count("There is no line to draw.") == 2
+
+
+def test_timed_runs_of_different_lengths_share_a_line() -> None:
+    result = a_result("network", [30.0])
+    line = of_runs(result, {"color": "#000000"}, [np.arange(5.0), np.arange(3.0)])
+    assert line is not None
+    assert line.y.tolist() == [0.0, 1.0, 2.0]
 
 
 def a_line(n: int) -> Line:
