@@ -90,7 +90,7 @@ def _of_hidden_weights(weights: m.HiddenWeights) -> Json:
     return {"newest": newest, "layer_norms": norms}
 
 
-def _norm(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+def _norm(values: np.ndarray, axis: int | None = None) -> Any:
     """Norms, at most the largest float: JSON has no infinity."""
     with np.errstate(over="ignore"):
         found = np.linalg.norm(values, axis=axis)

@@ -27,10 +27,14 @@ CODE = (
     "run_log/reporting/motion.py",
     "run_log/reporting/between_samples.py",
     "run_log/reporting/performance.py",
-    "tandem/experiments/simulation/lockstep.py",
-    "tandem/experiments/simulation/person.py",
-    "tandem/experiments/simulation/wave.py",
+    "run_log/reporting/summary.py",
+    "node_runtime/config/plant.py",
+    "tandem/operating",
+    "tandem/experiments/simulation",
+    "tandem/experiments/study/lemma.py",
+    "tandem/experiments/study/work.py",
 )
+"""Folders and files."""
 PACKAGES = (*provenance.SCIENCE, "torch")
 """Packages on which a result depends, beside the code."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import os
 import re
@@ -14,14 +15,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from node_runtime.config.plant import plant_of
 from run_log.reading.reader import read_run
 from run_log.replaying.replay import replay
+from run_log.reporting.summary import summarise
 from tandem.experiments import experiment
 from tandem.experiments.experiment import Finished
+from tandem.experiments.simulation.faults import Faults
+from tandem.experiments.simulation.lockstep import follow
 from tandem.experiments.study.declaration import load
-from tandem.experiments.study.plan import code_version, rows
+from tandem.experiments.study.lemma import measure
+from tandem.experiments.study.plan import CODE, code_version, rows
 from tandem.experiments.study.runner import Made, Processes, Progress, RunnerError, Want, run_all, wanted
-from tandem.experiments.study.work import read
+from tandem.experiments.study.work import read, work
 from tests.helpers.interpreter import python
 from tests.helpers.paths import write_namesakes
 from tests.tandem.experiments.small import PLANT, SMALL, cases
@@ -193,6 +199,12 @@ def test_a_plant_that_is_edited_during_the_experiment_ends_it(tmp_path: Path) ->
     kept = {path.stem for path in (tmp_path / "runs").iterdir()}
     assert len(kept) == 1
     assert not kept & {job.key for job in jobs}
+
+
+@pytest.mark.parametrize("made_by", [work, measure, summarise, Faults, follow, plant_of])
+def test_code_that_makes_a_record_is_part_of_its_key(made_by: object) -> None:
+    file = str(inspect.getsourcefile(made_by))  # type: ignore[arg-type]
+    assert any(f"/{part}/" in file or file.endswith(f"/{part}") for part in CODE)
 
 
 def test_other_certified_sets_in_the_same_file_are_another_run(tmp_path: Path) -> None:
