@@ -111,8 +111,13 @@ class Views:
             except codec.BadMessage as error:
                 bad = error
             else:
-                self._due[name] = time_ns + self._every_ns[name]
+                self._wait(name, time_ns, self._every_ns[name])
         return Seen(shown, max(head.seq, 0), self._times.of(name, head, time_ns), bad)
+
+    def _wait(self, name: str, time_ns: int, every_ns: int) -> None:
+        # Where every message has a view, one that is out of order has one too.
+        if every_ns:
+            self._due[name] = time_ns + every_ns
 
     def _beside(self, name: str, message: object, time_ns: int) -> list[Shown]:
         """The series that go with a topic."""
@@ -134,6 +139,6 @@ class Views:
             if len(self._users) >= MOST_USER_TOPICS:
                 return []
             view = self._users[name] = UserView(name)
-        self._due[name] = time_ns + self._user_every_ns
+        self._wait(name, time_ns, self._user_every_ns)
         shown = view.render(payload)
         return [] if shown is None else [shown]

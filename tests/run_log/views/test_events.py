@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import jsonschema
@@ -153,3 +154,12 @@ def test_no_event_is_missed_where_a_fast_loop_has_fewer_views(rate: int) -> None
     for k in range(rate):
         events += told.by(topics.TICK, TICK, 1e3 / rate, late=k % (rate // 5) == 3, lateness=0.001)
     assert len(events) == 5
+
+
+def test_at_full_rate_messages_out_of_order_have_views_too() -> None:
+    views = Views(Config(), get_plant("moore_greitzer"), most_hz=math.inf)
+    sent = {"plant/state": codec.encode(STATE), "plant/health": codec.encode(HEALTH), "user/wind": b"1"}
+    for name, payload in sent.items():
+        for time_ns in (9 * MS, 7 * MS):
+            shown = views.show(name, payload, time_ns).shown
+            assert f"view/{name}" in [one.channel.topic for one in shown]
