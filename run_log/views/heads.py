@@ -39,6 +39,7 @@ class ResultHead(Head):
     weights_rolled_back: str = ""
     target_status: str = "none"
     sensor_faults: dict[str, str] = msgspec.field(default_factory=dict)
+    reference: dict[str, float] = msgspec.field(default_factory=dict)
     reference_verdict: str = "none"
     reference_from: str = ""
 

@@ -52,7 +52,7 @@ def test_a_w_that_h_leaves_by_a_few_percent_is_refuted(family: Certificate, inde
     piece = family.pieces[index]
     # A piece with a slope has a W of 1 to 2 times the necessary size; a hull is accurate to one percent.
     found = prove(MODEL, changed(family, index, W=shrunk(piece, 0.97 if index == 0 else 0.4)))
-    assert f"in piece {piece.name},  from x = " in found.reason
+    assert f"in piece {piece.name}, from x = " in found.reason
     assert "h is outside W by" in found.reason
 
 

@@ -57,6 +57,20 @@ def test_a_status_that_follows_at_once_is_told_however_few_views_are_made() -> N
         assert json.loads(shown[1].data)["status"] == status
 
 
+def test_a_reference_between_two_views_is_reported() -> None:
+    views = Views(Config(), get_plant("moore_greitzer"), most_hz=1.0)
+    views.show("controller/result", codec.encode(RESULT), 0)
+    taken = msgspec.structs.replace(
+        RESULT,
+        seq=RESULT.seq + 1,
+        reference={"y": 1.8},
+        reference_verdict="taken",
+        reference_from="commander-1",
+    )
+    (shown,) = views.show("controller/result", codec.encode(taken), MS).shown
+    assert json.loads(shown.data)["message"] == f"tick {taken.seq}: reference taken; now y 1.8"
+
+
 def test_each_change_of_a_result_is_reported_once_with_its_level() -> None:
     told = Told()
     assert told.by(topics.RESULT, RESULT) == []
