@@ -65,5 +65,5 @@ def test_an_external_plant_gets_the_manual_input() -> None:
 
 @pytest.mark.parametrize("u", [[1.0, 2.0], [float("nan")], {"v": 1.0}])
 def test_an_invalid_input_is_refused(loop: Loop, u: object) -> None:
-    with pytest.raises(ValueError, match="is not an input|has no input"):
+    with pytest.raises(ValueError, match=r"is not an input|has no input"):
         loop.manual(u)
