@@ -73,8 +73,8 @@ def test_ctrl_c_stops_cleanly_with_log_and_picture(tmp_path: Path):
         port = other.getsockname()[1]
         there = ("--live", "--set", f"live.port={port}")
         with launched(tmp_path, "--oracle", "linear", *there) as run:
-            run.hears(f"no live view: live.port {port} is taken")
-            run.hears("the first command")
+            run.hears(f"no live view: live.port {port} is in use")
+            run.hears("first command: the run begins")
             run.signal(signal.SIGINT)
             code, result = run.ends()
     assert code == 0, run.said
@@ -104,7 +104,7 @@ def test_only_a_plant_file_is_loaded_from_the_current_folder(tmp_path: Path):
     write_namesakes(tmp_path)
     file = write_tanks(tmp_path)
     with launched(tmp_path, *small(), "--set", "plant.model=tanks.py:TANKS") as run:
-        run.hears("the first command")
+        run.hears("first command: the run begins")
         run.signal(signal.SIGINT)
         code, result = run.ends()
     assert code == 0, run.said
@@ -119,7 +119,7 @@ def test_only_a_plant_file_is_loaded_from_the_current_folder(tmp_path: Path):
 
 def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
     with launched(tmp_path, "--oracle", "linear") as run:
-        run.hears("the first command")
+        run.hears("first command: the run begins")
         for pid in run.pids():
             os.kill(pid, signal.SIGSTOP)
         run.signal(signal.SIGINT)
@@ -133,7 +133,7 @@ def test_ctrl_c_twice_ends_every_process(tmp_path: Path):
 
 def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
     with launched(tmp_path, *small(), *live()) as run:
-        run.hears("the first command")
+        run.hears("first command: the run begins")
         started = run.pids()
         assert len(started) == 6
         run.signal(signal.SIGKILL)
@@ -143,7 +143,7 @@ def test_a_killed_supervisor_leaves_nothing_running(tmp_path: Path):
 
 def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
     with launched(tmp_path, "--oracle", "linear") as run:
-        run.hears("the first command")
+        run.hears("first command: the run begins")
         run.kill("plant")
         code, result = run.ends()
     assert code == 1
@@ -154,7 +154,7 @@ def test_a_dead_plant_ends_the_run_and_is_named(tmp_path: Path):
 def test_a_dead_recorder_or_live_view_is_reported_and_the_loop_continues(tmp_path: Path):
     loudly = "NOT LOGGED from here on: the recorder died (killed by SIGKILL); the loop continues"
     with launched(tmp_path, "--oracle", "linear", *live()) as run:
-        run.hears("the first command")
+        run.hears("first command: the run begins")
         run.kill("live")
         run.hears("the live-view died (killed by SIGKILL); the run continues without it")
         run.kill("record")
@@ -179,7 +179,7 @@ def test_a_process_that_cannot_start_is_named_with_its_own_message(tmp_path: Pat
             code, result = run.ends()
     assert code == 1
     assert "the router was not ready" in result["error"]
-    assert f"127.0.0.1:{port} is taken" in result["error"]
+    assert f"127.0.0.1:{port} is in use" in result["error"]
 
 
 def test_a_configuration_that_admits_no_controller_is_a_configuration_error(tmp_path: Path):
