@@ -108,7 +108,7 @@ class LogWriter:
         identity = {"format": str(FORMAT), "name": config.name, "plant": plant.name, "part": str(part)}
         self._mcap.add_metadata(IDENTITY, {**identity, "clock": clock, **TIMES})
         for name, values in _metadata(config, plant, versions).items():
-            self._mcap.add_metadata(name, values)
+            self._mcap.add_metadata(name, {key: readable(value) for key, value in values.items()})
         for name, kind, text in _attachments(config, plant, files or {}, versions):
             self._mcap.add_attachment(start_ns, start_ns, name, kind, text.encode())
         self.flush()
