@@ -130,7 +130,7 @@ def test_a_second_server_reports_the_used_port_and_the_page_is_served_before_a_r
         asyncio.run(first_is_there())
         with Process("tandem.web.main", override(config, ["name=jet2"])) as second:
             assert second.end() == 2
-            assert f"live.port {config.live.port} is taken" in second.said
+            assert f"live.port {config.live.port} is in use" in second.said
             assert f"--set live.port={config.live.port + 1}" in second.said
         first.signal(signal.SIGTERM)
         assert first.end() == 0
