@@ -30,9 +30,8 @@ from run_log.run import Run
 from run_log.writing.parts import PartedLog, existing_parts
 from run_log.writing.writer import LogWriter
 from tandem.cli import main
-from tests.run_log.samples import Logged, synthetic
+from tests.run_log.samples import STEPS, Logged
 
-STEPS = 80
 Rows = list[dict[str, Any]]
 
 
@@ -46,21 +45,11 @@ def write_log(path: Path, config: Config, messages: list[Logged]) -> Path:
             if topic is topics.PLANT_STATE:
                 wind: dict[str, Any] = {"speed": 0.1 * message.seq, "from": "N", "ok": True}
                 # The first rows do not have these fields.
-                wind |= {"gust": {"speed, peak": 3}, "a.b": [1, 2.5]} if message.seq > 60 else {}
+                wind |= {"gust": {"speed, peak": 3}, "a.b": [1, 2.5]} if message.seq > 40 else {}
                 writer.write("user/wind", json.dumps(wind).encode(), log_time)
         writer.write(topics.PLANT_STATE.name, b"no message", log_time)
         writer.write("plant/unheard_of", b"\x00", log_time)
     return path
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return override(Config(), ["log.chunk_bytes=8192", "controller.keyframe_every=20", "seed=7"])
-
-
-@pytest.fixture(scope="module")
-def messages(config: Config) -> list[Logged]:
-    return synthetic(config, STEPS)[1]
 
 
 @pytest.fixture(scope="module")
@@ -234,9 +223,9 @@ READ: dict[pa.DataType, Callable[[str], Any]] = {
 
 def test_fields_that_come_late_are_empty_before(exported: Exported, out: Path) -> None:
     rows = read_csv(out / "csv", "user/wind")
-    assert [row["gust.speed, peak"] for row in rows] == [""] * 61 + ["3.0"] * (STEPS - 61)
+    assert [row["gust.speed, peak"] for row in rows] == [""] * 41 + ["3.0"] * (STEPS - 41)
     table = read_parquet(out / "parquet", "user/wind")
-    assert table["a.b"].to_pylist() == [None] * 61 + [[1.0, 2.5]] * (STEPS - 61)
+    assert table["a.b"].to_pylist() == [None] * 41 + [[1.0, 2.5]] * (STEPS - 41)
     assert table["speed"].to_pylist() == [0.1 * i for i in range(STEPS)]
     assert not list(out.rglob("*.old"))
 
