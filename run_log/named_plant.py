@@ -58,7 +58,7 @@ def _named(run: Run, reference: str) -> tuple[Known | Plant, list[str]]:
     if named is None:
         raise ConfigError(f"{reference}: Tandem has no plant of that name; for a file, write tanks.py:TANKS")
     sha256 = sha256_of(whole)
-    theirs = sorted(text for key, text in run.files.items() if key.startswith("plant."))
+    theirs = sorted(text for key, text in run.files.items() if key in ("plant.model", "plant.truth"))
     if not theirs or sha256 is None or sha256 in theirs:
         return named, []
     logged = " and ".join(text[:12] for text in theirs)

@@ -54,6 +54,8 @@ COLUMNS = (
     "replay",
 )
 FIRST = ("controller", "plant", "router")
+START = "plant.x0=[0.4,1.6,1.1547,0]"
+"""Well inside X. Twenty steps are too short at these rates to keep the paper's x0, even in lock-step."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def main(settings: Rates) -> int:
 
 def _table(settings: Rates) -> Iterator[str]:
     command = shlex.join(["python", "-m", "benchmarks.live.rates", *sys.argv[1:]])
-    overrides = " ".join(f"--set {override}" for override in _overrides(settings, "SOLVER"))
+    overrides = " ".join(f"--set {shlex.quote(override)}" for override in _overrides(settings, "SOLVER"))
     run = f"tandem run --rate RATE --seconds {settings.seconds:g} {overrides}"
     head = [
         *conditions(command, "Each row is the run"),
@@ -111,7 +113,8 @@ def _said(line: str) -> str:
 
 
 def _overrides(settings: Rates, mode: str) -> list[str]:
-    return [f"controller.horizon={settings.horizon}", f"controller.solver.mode={mode}", *settings.set]
+    ours = [f"controller.horizon={settings.horizon}", f"controller.solver.mode={mode}", START]
+    return [*ours, *settings.set]
 
 
 def _row(settings: Rates, rate: int, mode: SolverMode, log: Path) -> list[str]:
@@ -154,7 +157,7 @@ def _beside(
     for line in running.stderr:
         if "the run begins" in line:
             break
-    module = ["-m", "benchmarks.live.wakeups", "--rate", str(rate), "--seconds", str(0.8 * seconds)]
+    module = ["-m", "benchmarks.live.wakeups", "--rate", str(rate), "--seconds", str(0.6 * seconds)]
     priority = ["--priority", str(Config().realtime.priority + 1)]
     before, began = process_usage.busy(running.pid), clock.now()
     done = subprocess.run([sys.executable, *module, *priority], capture_output=True, text=True, check=False)
@@ -189,9 +192,11 @@ def _beside_misses(run: Run, empty: dict[str, Any]) -> list[str]:
 
 
 def _replayed(log: Path) -> str:
-    replay = _tandem("replay", str(log))
-    replay.communicate()
-    return "exact" if replay.returncode == 0 else "DIFFERS"
+    told, _ = _tandem("replay", str(log), "--json").communicate()
+    replay = json.loads(told)
+    if not replay["equal"]:
+        return "DIFFERS"
+    return f"exact, {replay['lost_ticks']} ticks not in the log" if replay["lost_ticks"] else "exact"
 
 
 def _tandem(*arguments: str) -> subprocess.Popen[str]:

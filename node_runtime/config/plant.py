@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self, TypeVar
 import msgspec
 import numpy as np
 
-from node_runtime.config.reference import is_reference, load, sha256_of
+from node_runtime.config.reference import is_reference, load, sha256_of, sha256_of_imports
 from node_runtime.config.sections import DEAD_TIME, Config, ReferenceConfig, Shares
 from node_runtime.config.strict import ConfigError, did_you_mean
 
@@ -162,14 +162,22 @@ def load_plant(reference: str) -> Any:
 
 
 def files_of(config: Config) -> dict[str, str]:
-    """Return the SHA-256 of the user's files in `config`, by key, for files that exist here."""
+    """Return the SHA-256 of the user's files in `config`, for files that exist here.
+
+    The key of a file is its key in `config`. Files that it imports from its folder have "plant.model: NAME.py".
+    """
     named = {
         "plant.model": config.plant.model,
         "plant.truth": config.plant.truth,
         "network.architecture": config.network.architecture,
     }
     references = {key: text for key, text in named.items() if isinstance(text, str) and is_reference(text)}
-    return {key: found for key, text in references.items() if (found := sha256_of(text)) is not None}
+    found = {}
+    for key, text in references.items():
+        if (sha256 := sha256_of(text)) is not None:
+            found[key] = sha256
+            found |= {f"{key}: {name}": theirs for name, theirs in sha256_of_imports(text).items()}
+    return found
 
 
 def spelt_out(config: Config, plant: Described) -> Config:

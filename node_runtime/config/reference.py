@@ -5,6 +5,7 @@ Only a configuration may name code. Code named in a log is never loaded.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import os
@@ -12,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -92,6 +94,41 @@ def sha256_of(reference: str) -> str | None:
         return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
     except (OSError, ValueError):
         return None
+
+
+def sha256_of_imports(reference: str) -> dict[str, str]:
+    """Return the SHA-256 of the files that a file imports from its own folder, by path relative to that folder.
+
+    Imports of these files count too. Nothing is run. References to packages have none.
+    """
+    place, _name = _parts(reference)
+    first = Path(os.path.expanduser(place))
+    found: dict[Path, str] = {}
+    todo = [first] if place.endswith(".py") else []
+    while todo:
+        try:
+            source = todo.pop().read_bytes()
+        except (OSError, ValueError):
+            continue
+        for name in _imports(source):
+            module, package = first.parent / f"{name}.py", first.parent / name
+            for path in [module] if module.is_file() else sorted(package.rglob("*.py")):
+                if path not in found and path != first:
+                    found[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+                    todo.append(path)
+    return {str(path.relative_to(first.parent)): found[path] for path in sorted(found)}
+
+
+@lru_cache(maxsize=256)
+def _imports(source: bytes) -> frozenset[str]:
+    """Return the first names of all modules that a source imports."""
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError):
+        return frozenset()
+    names = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+    return frozenset(name.partition(".")[0] for name in names)
 
 
 def is_reference(text: str) -> bool:

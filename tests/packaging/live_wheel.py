@@ -63,7 +63,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
-    return Environment(wheel, tmp_path_factory.mktemp("whole"), "trainer,log,experiment")
+    return Environment(wheel, tmp_path_factory.mktemp("whole"), "trainer,log,live,export,experiment,cluster")
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +78,7 @@ def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
         ("config show", ""),
         ("run --seconds 5", "run.mcap"),
         ("run --seconds 5 --set controller.tightening=invariant", "run.png"),
+        ("run --seconds 5 --live", "run.mcap"),
         ("simulate --steps 20 --log simulated.mcap", "simulated.mcap"),
         ("experiment list", ""),
         ("experiment paper --quick --out paper --only lemma", "paper/report.html"),
@@ -93,7 +94,8 @@ def test_a_users_plant_in_an_empty_folder(whole: Environment, tmp_path: Path):
     file = write_tanks(tmp_path)
     mine = ("--set", "plant.model=tanks.py:TANKS", "--set", "rate=20", "--set", "controller.horizon=20")
     sets = ("sets", "compute", "--kind", "box", "--set", "plant.model=tanks.py:TANKS", "--set", "rate=1")
-    for command in (("run", *mine, "--seconds", "5"), ("replay", "run.mcap"), sets):
+    exports = [("export", "run.mcap", f"--{kind}", f"run.{kind}") for kind in ("csv", "parquet", "rrd")]
+    for command in (("run", *mine, "--seconds", "5"), ("replay", "run.mcap"), *exports, sets):
         done = whole.tandem(tmp_path, *command)
         assert done.returncode == 0, done.stderr
     shown = whole.tandem(tmp_path, "config", "show", *mine)
@@ -126,6 +128,7 @@ def test_without_extras_router_plant_and_controller_run(bare: Environment, tmp_p
         ("simulate", "trainer,log"),
         ("trainer", "trainer"),
         ("record", "log"),
+        ("live", "live"),
         ("replay x.mcap", "log"),
         ("report x.mcap", "log"),
         ("recover x.mcap", "log"),

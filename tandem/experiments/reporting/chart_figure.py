@@ -23,18 +23,19 @@ def chart_figure(chart: Chart) -> Figure:
     """Draw a chart."""
     columns = 2 if max((len(line.legend) for line in chart.lines), default=0) <= LONG else 1
     made, (ax,) = figure(height=2.8 + 0.17 * -(-len(chart.lines) // columns))
-    for line in chart.lines:
-        _line(ax, line)
-    for level in chart.levels:
-        ax.axhline(level.y, color=GREY, linewidth=0.8, linestyle=(0, (6, 2)), zorder=0)
-    if chart.span is not None:
-        ax.axvspan(*chart.span, color=GREY, alpha=0.3, linewidth=0)
+    # The scale comes first: what is drawn sets the limits, with margins in the units of the scale.
     if chart.scale == "log":
         ax.set_yscale("log")
         ax.yaxis.set_major_formatter("{x:g}")
     elif chart.scale == "asinh":
         ax.set_yscale("symlog", linthresh=chart.linear_up_to, linscale=0.8)
         ax.minorticks_off()
+    for line in chart.lines:
+        _line(ax, line)
+    for level in chart.levels:
+        ax.axhline(level.y, color=GREY, linewidth=0.8, linestyle=(0, (6, 2)), zorder=0)
+    if chart.span is not None:
+        ax.axvspan(*chart.span, color=GREY, alpha=0.3, linewidth=0)
     if chart.ticks is not None:
         ax.set_yticks(chart.ticks, [f"{tick:g}" for tick in chart.ticks])
     if chart.bounds is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.config.reference import absolute, is_reference, load, loaded
+from node_runtime.config.reference import absolute, is_reference, load, loaded, sha256_of_imports
 from node_runtime.config.strict import ConfigError
 from tests.helpers.paths import ROOT
 
@@ -90,6 +90,20 @@ def test_file_imports_its_neighbours_after_installed_modules(here: Path, monkeyp
     assert sys.path[-1] == str(folder)
     # Only the file may import it, because it is not an installed package.
     assert "no package called 'neighbour_of_one' is installed" in message("neighbour_of_one:LENGTH")
+
+
+def test_imports_from_the_folder_of_a_file_are_found_without_running_them(here: Path):
+    (here / "tanks.py").write_text(
+        "import numpy, pipes_of_it.parts\n\ndef late():\n    from valve import V\n"
+    )
+    (here / "valve.py").write_text("import tanks, gone\nraise SystemExit('was run')\n")
+    (here / "other.py").write_text("X = 1\n")
+    (here / "pipes_of_it").mkdir()
+    (here / "pipes_of_it" / "parts.py").write_text("not Python\n")
+    found = sha256_of_imports(f"{here}/tanks.py:TANKS")
+    assert sorted(found) == ["pipes_of_it/parts.py", "valve.py"]
+    assert found["valve.py"] == hashlib.sha256((here / "valve.py").read_bytes()).hexdigest()
+    assert sha256_of_imports("tandem.loop:Loop") == sha256_of_imports("gone.py:TANKS") == {}
 
 
 def test_object_of_an_installed_package(

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from tandem.experiments import experiment
-from tandem.experiments.reporting.charts import Chart, Line, of_runs, reduced, to_page
+from tandem.experiments.reporting.chart_figure import chart_figure
+from tandem.experiments.reporting.charts import Chart, Level, Line, of_runs, reduced, to_page
 from tandem.experiments.reporting.page import page
 from tandem.experiments.study.declaration import load
 from tandem.experiments.study.results import CaseResult
@@ -169,6 +170,19 @@ def test_lines_of_two_periods_share_an_axis() -> None:
     assert told["x"] == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert [line["y"] for line in told["lines"]] == [[5.0] * 5, [3.0, None, 3.0, None, 3.0]]
     assert told["lines"][0]["dash"] == [10.0, 3.0]
+
+
+def test_a_picture_of_regrets_ends_near_its_data() -> None:
+    x = np.array([1.0, 2.0])
+    lines = [
+        Line("a", {"color": "C0"}, x, np.array([90.0, 90.0])),
+        Line("b", {"color": "C1"}, x, np.array([8.0, 1.0])),
+    ]
+    drawn = chart_figure(
+        Chart("t", "x", "y", lines, scale="asinh", linear_up_to=2.0, levels=(Level(0.0, "zero"),))
+    )
+    low, _high = drawn.axes[0].get_ylim()
+    assert -0.6 < low < 0.0
 
 
 def test_zero_has_no_place_on_a_logarithmic_axis() -> None:

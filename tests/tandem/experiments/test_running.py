@@ -207,6 +207,20 @@ def test_code_that_makes_a_record_is_part_of_its_key(made_by: object) -> None:
     assert any(f"/{part}/" in file or file.endswith(f"/{part}") for part in CODE)
 
 
+def test_another_module_beside_the_plant_file_is_another_run(tmp_path: Path) -> None:
+    path, truth, valve = tmp_path / "small.toml", tmp_path / "truth.py", tmp_path / "valve.py"
+    path.write_text(SMALL)
+    truth.write_text("from valve import TRUE\n")
+    job = next(iter(rows(cases(path)))).job
+    plant = msgspec.structs.replace(job.config.plant, truth=f"{truth}:TRUE")
+    job = msgspec.structs.replace(job, config=msgspec.structs.replace(job.config, plant=plant))
+    keys = []
+    for content in ("TRUE = 1\n", "TRUE = 2\n", "TRUE = 1\n"):
+        valve.write_text(content)
+        keys.append(job.key)
+    assert keys[0] == keys[2] != keys[1]
+
+
 def test_other_certified_sets_in_the_same_file_are_another_run(tmp_path: Path) -> None:
     path, sets = tmp_path / "small.toml", tmp_path / "sets.npz"
     path.write_text(SMALL)
