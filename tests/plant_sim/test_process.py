@@ -28,13 +28,15 @@ def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
             second = Bus(config, "controller", "controller-b")
             second.open()
             wait_for(lambda: matched(bus, topics.COMMAND) and matched(second, topics.COMMAND))
-            for k in range(5):
+            for k in range(6):
+                # The foreign sender begins when the plant follows the first one: its command may be quicker.
                 ear.of(topics.PLANT_STATE)
-                state = ear.until(lambda message: isinstance(message, m.PlantState))
-                assert isinstance(state, m.PlantState)
-                answer = command(k, U + 0.01, [U] * 40, answers=state.seq, run_id=state.run_id)
+                seen = ear.until(_follows if k else _holds)
+                assert isinstance(seen, m.PlantState)
+                answer = command(k, U + 0.01, [U] * 40, answers=seen.seq, run_id=seen.run_id)
                 bus.publish(topics.COMMAND, answer)
-                second.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
+                if k:
+                    second.publish(topics.COMMAND, msgspec.structs.replace(answer, run_id="b", u=[9.0]))
             ear.until(health_of("plant", note="no fresh command and nothing left to follow: safe input"))
             foreign = "bad_controller_command_foreign"
             ear.until(lambda message: isinstance(message, m.Health) and message.counters.get(foreign) == 5)
@@ -54,6 +56,14 @@ def test_a_real_plant_continues_without_commands_and_ends_cleanly() -> None:
     assert all(U - 1e-9 <= u <= U + 0.01 + 1e-9 for u in applied)
     seqs = [state.seq for state in states]
     assert seqs == sorted(set(seqs))
+
+
+def _holds(message: m.Message) -> bool:
+    return isinstance(message, m.PlantState) and message.source == "hold"
+
+
+def _follows(message: m.Message) -> bool:
+    return isinstance(message, m.PlantState) and message.source != "hold"
 
 
 @pytest.mark.live
