@@ -22,6 +22,7 @@ SETTINGS = (
     "trainer.steps=20",
     "trainer.train_every=5",
     "plant.sensors.noise={z=1.4e-3, y=1.4e-3}",
+    "plant.x0=[0.4,1.6,1.1547,0]",
 )
 
 
