@@ -97,26 +97,25 @@ def sha256_of(reference: str) -> str | None:
 
 
 def sha256_of_imports(reference: str) -> dict[str, str]:
-    """Return the SHA-256 of the files that a file imports from its own folder, by path relative to that folder.
+    """Return the SHA-256 of the modules beside a file that it imports, by file name. Their imports count too.
 
-    Imports of these files count too. Nothing is run. References to packages have none.
+    Nothing is run. Packages in the folder do not count, nor do references to packages.
     """
     place, _name = _parts(reference)
     first = Path(os.path.expanduser(place))
-    found: dict[Path, str] = {}
+    found: dict[str, str] = {}
     todo = [first] if place.endswith(".py") else []
     while todo:
+        path = todo.pop()
         try:
-            source = todo.pop().read_bytes()
+            source = path.read_bytes()
         except (OSError, ValueError):
             continue
-        for name in _imports(source):
-            module, package = first.parent / f"{name}.py", first.parent / name
-            for path in [module] if module.is_file() else sorted(package.rglob("*.py")):
-                if path not in found and path != first:
-                    found[path] = hashlib.sha256(path.read_bytes()).hexdigest()
-                    todo.append(path)
-    return {str(path.relative_to(first.parent)): found[path] for path in sorted(found)}
+        found[path.name] = hashlib.sha256(source).hexdigest()
+        beside = {first.parent / f"{name}.py" for name in _imports(source)}
+        todo += [path for path in beside if path.name not in found and path not in todo]
+    found.pop(first.name, None)
+    return dict(sorted(found.items()))
 
 
 @lru_cache(maxsize=256)

@@ -93,15 +93,14 @@ def test_file_imports_its_neighbours_after_installed_modules(here: Path, monkeyp
 
 
 def test_imports_from_the_folder_of_a_file_are_found_without_running_them(here: Path):
-    (here / "tanks.py").write_text(
-        "import numpy, pipes_of_it.parts\n\ndef late():\n    from valve import V\n"
-    )
-    (here / "valve.py").write_text("import tanks, gone\nraise SystemExit('was run')\n")
+    (here / "tanks.py").write_text("import numpy, package.parts\n\ndef late():\n    from valve import V\n")
+    (here / "valve.py").write_text("import tanks, gone, wrong\nraise SystemExit('was run')\n")
     (here / "other.py").write_text("X = 1\n")
-    (here / "pipes_of_it").mkdir()
-    (here / "pipes_of_it" / "parts.py").write_text("not Python\n")
+    (here / "package").mkdir()
+    (here / "package" / "parts.py").write_text("X = 1\n")
+    (here / "wrong.py").write_text("not Python\n")
     found = sha256_of_imports(f"{here}/tanks.py:TANKS")
-    assert sorted(found) == ["pipes_of_it/parts.py", "valve.py"]
+    assert sorted(found) == ["valve.py", "wrong.py"]
     assert found["valve.py"] == hashlib.sha256((here / "valve.py").read_bytes()).hexdigest()
     assert sha256_of_imports("tandem.loop:Loop") == sha256_of_imports("gone.py:TANKS") == {}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lbmpc.sets.enclosures.interval import DomainError, Interval, matrix_product, up
-from tests.lbmpc.sets.enclosures import holds
+from tests.lbmpc.sets.enclosures.samples import holds
 
 
 def numbers(generator: np.random.Generator, n: int) -> np.ndarray:

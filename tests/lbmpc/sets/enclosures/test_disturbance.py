@@ -22,7 +22,7 @@ from lbmpc.sets.enclosures.disturbance import (
     given_box,
 )
 from tests.helpers.plants.pendulum import PENDULUM
-from tests.lbmpc.sets.enclosures import TRUTH, a_plant
+from tests.lbmpc.sets.enclosures.samples import TRUTH, a_plant
 
 SAMPLES = 2000
 VAN_DER_POL = a_plant(lambda x, u: [x[1], (1 - x[0] ** 2) * x[1] - x[0] + u[0]], "van_der_pol")

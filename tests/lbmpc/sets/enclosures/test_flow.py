@@ -12,7 +12,7 @@ import pytest
 from lbmpc.plants.truth import Truth
 from lbmpc.sets.enclosures.flow import Flow, FlowEnclosure
 from lbmpc.sets.enclosures.interval import Interval, up
-from tests.lbmpc.sets.enclosures import TRUTH, a_plant, holds
+from tests.lbmpc.sets.enclosures.samples import TRUTH, a_plant, holds
 
 
 def flow_of(rhs, d: int, m: int, period: float, steps: int = 1) -> Flow:
